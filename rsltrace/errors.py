@@ -1,0 +1,95 @@
+"""Every error rsltrace raises on purpose, in one tree, each with the exit status it ends with.
+
+    RsltraceError                    2  anything below; never raised itself
+    ├── JobError                     2  the job file cannot be used (file, line, column, what to do)
+    ├── SetupError                   2  the machine lacks something: rclpy, an interface package
+    ├── BagError                     2  a bag cannot be read or played
+    ├── TraceError                   2  a trace cannot be read or compared
+    │   └── TraceFormatError         2  not a trace, or one of another format version
+    ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
+    └── RunError                     3  the run itself went wrong; the trace up to there is complete
+        ├── NodeError                3  a node's constructor or callback raised
+        ├── LivelockError            3  events without end while simulated time stands still
+        ├── DeadlockError            3  something waits for what can never come
+        └── UnsupportedError         3  a node used a part of rclpy that a simulation does not have
+
+A job can end a run with an exit status of its own (see ``stop:``); these are for failures.
+An interrupted run (Ctrl-C, SIGTERM) exits with 130 or 143, as shells expect.
+"""
+
+from __future__ import annotations
+
+EXIT_USAGE = 2
+EXIT_RUN = 3
+
+
+class RsltraceError(Exception):
+    """Base of all errors a user can act on. ``str(error)`` is the whole message."""
+
+    exit_code: int = EXIT_USAGE
+
+
+class JobError(RsltraceError):
+    """A job that cannot be used.
+
+    ``where`` is ``file:line:column`` (or as much of it as is known); the message begins with it.
+    """
+
+    def __init__(self, message: str, *, where: str | None = None) -> None:
+        super().__init__(f"{where}: {message}" if where else message)
+        self.where = where
+
+
+class SetupError(RsltraceError):
+    """Something the run needs is not installed."""
+
+
+class BagError(RsltraceError):
+    """A rosbag2 recording that cannot be read or played."""
+
+
+class TraceError(RsltraceError):
+    """A trace that cannot be read or compared."""
+
+
+class TraceFormatError(TraceError):
+    """The file is not an rsltrace trace, or is one of a format this version cannot read."""
+
+
+class OutputError(RsltraceError):
+    """The trace cannot be written."""
+
+
+class RunError(RsltraceError):
+    """The run went wrong. What happened until then is in the trace."""
+
+    exit_code = EXIT_RUN
+
+
+class NodeError(RunError):
+    """User code raised: a constructor or a callback.
+
+    ``node`` and ``entity`` name it, ``stamp_ns`` is the simulated time, ``traceback_text`` the
+    user's traceback without rsltrace's own frames.
+    """
+
+    def __init__(
+        self, message: str, *, node: str, entity: str, stamp_ns: int, traceback_text: str
+    ) -> None:
+        super().__init__(message)
+        self.node = node
+        self.entity = entity
+        self.stamp_ns = stamp_ns
+        self.traceback_text = traceback_text
+
+
+class LivelockError(RunError):
+    """Events follow each other without end while simulated time stands still."""
+
+
+class DeadlockError(RunError):
+    """Something waits for what can never come."""
+
+
+class UnsupportedError(RunError):
+    """A node used a part of rclpy that the simulation does not offer."""

@@ -1,0 +1,1 @@
+"""Frozen values that every layer shares: times, entities, events. No behaviour, no imports."""

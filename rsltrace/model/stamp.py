@@ -1,0 +1,21 @@
+"""Simulated time is an integer number of nanoseconds; this module only reads and prints it."""
+
+from __future__ import annotations
+
+NS_PER_S = 1_000_000_000
+
+
+def format_seconds(stamp_ns: int) -> str:
+    """Return ``stamp_ns`` as seconds with nine decimals, exactly: ``-1500000000`` → ``-1.500000000``."""
+    sign = "-" if stamp_ns < 0 else ""
+    whole, fraction = divmod(abs(stamp_ns), NS_PER_S)
+    return f"{sign}{whole}.{fraction:09d}"
+
+
+def format_duration(duration_ns: int) -> str:
+    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``."""
+    size = abs(duration_ns)
+    for unit, scale in (("s", NS_PER_S), ("ms", 1_000_000), ("us", 1_000)):
+        if size >= scale:
+            return f"{duration_ns / scale:.6g} {unit}"
+    return f"{duration_ns} ns"

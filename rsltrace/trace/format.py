@@ -1,0 +1,151 @@
+"""Names, layouts and limits of the trace format. ``docs/trace-format.md`` is the prose of it.
+
+A trace is a ROS 2 MCAP file. Events and outputs are fixed-size CDR messages in chunks of their
+own, so that a reader can view a whole chunk as one numpy array without parsing it.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+FORMAT_VERSION = 1
+PROFILE = "ros2"
+
+TOPIC_EVENTS = "/rsltrace/events"
+TOPIC_OUTPUTS = "/rsltrace/outputs"
+TOPIC_ENTITIES = "/rsltrace/entities"
+TOPIC_DETAILS = "/rsltrace/details"
+TOPIC_ROSOUT = "/rosout"
+PREFIX_OWN = "/rsltrace/"
+PREFIX_REQUEST = "/rsltrace/request"
+PREFIX_RESPONSE = "/rsltrace/response"
+
+METADATA_JOB = "rsltrace:job"
+METADATA_ENVIRONMENT = "rsltrace:environment"
+METADATA_RESULT = "rsltrace:result"
+METADATA_ROSBAG2 = "rosbag2"
+ATTACHMENT_JOB = "job.yaml"
+ATTACHMENT_INDEX = "rsltrace/segments"
+
+EVENTS_PER_SEGMENT = 4096
+"""Events are written in segments of this many: small enough to lose little when a run is killed
+and to read little when a diff looks one up, large enough to compress well."""
+
+PAYLOAD_BYTES_PER_CHUNK = 1 << 20
+"""A payload chunk is closed once it holds at least this many bytes."""
+
+CDR_HEADER = b"\x00\x01\x00\x00"
+"""Encapsulation of plain little-endian CDR (XCDR version 1)."""
+
+SCHEMA_EVENT = "rsltrace_msgs/msg/CallbackEvent"
+SCHEMA_OUTPUT = "rsltrace_msgs/msg/CallbackOutput"
+SCHEMA_ENTITY = "rsltrace_msgs/msg/Entity"
+SCHEMA_DETAIL = "rsltrace_msgs/msg/Detail"
+
+SCHEMA_TEXT = {
+    SCHEMA_EVENT: """\
+uint64 chain_hash    # XXH3-64 of the rest of this message, seeded with the previous chain_hash
+uint64 index         # 0, 1, 2, ...
+uint64 stamp         # simulated time in nanoseconds
+uint64 cause_event   # index of the event that produced the input; 2^64-1: none
+uint64 input_hash
+uint64 output_hash
+uint64 state_hash    # 0: not hashed
+uint32 entity        # id in /rsltrace/entities
+uint32 cause_output  # which output of cause_event
+uint32 outputs       # how many outputs this event has
+uint8 kind
+uint8 flags
+""",
+    SCHEMA_OUTPUT: """\
+uint64 event         # index of the event
+uint64 hash          # of the content
+uint32 entity        # id in /rsltrace/entities
+uint32 kind
+uint32 sequence      # of the recorded payload in its channel; 2^32-1: not recorded
+""",
+    SCHEMA_ENTITY: """\
+uint32 id
+uint32 node          # id of the owning node; a node owns itself; 0: the run
+uint8 kind
+string name
+string type
+string detail        # JSON object
+""",
+    SCHEMA_DETAIL: """\
+uint64 event
+uint32 output        # which output of the event
+string text
+""",
+}
+
+EVENT_REST = struct.Struct("<QQQQQQIIIBB")
+"""A CallbackEvent after its chain hash: exactly the bytes the chain hash covers."""
+
+EVENT_REST_DTYPE = np.dtype(
+    [
+        ("index", "<u8"),
+        ("stamp", "<u8"),
+        ("cause_event", "<u8"),
+        ("input_hash", "<u8"),
+        ("output_hash", "<u8"),
+        ("state_hash", "<u8"),
+        ("entity", "<u4"),
+        ("cause_output", "<u4"),
+        ("outputs", "<u4"),
+        ("kind", "u1"),
+        ("flags", "u1"),
+    ]
+)
+EVENT_DTYPE = np.dtype([("chain_hash", "<u8"), *EVENT_REST_DTYPE.descr])
+
+OUTPUT = struct.Struct("<QQIII")
+OUTPUT_HASHED = slice(8, 24)
+"""The bytes of an output (hash, entity, kind) that the event's output hash covers. The sequence is
+left out so that an event with the same outputs hashes alike wherever it stands."""
+
+OUTPUT_DTYPE = np.dtype(
+    [
+        ("event", "<u8"),
+        ("hash", "<u8"),
+        ("entity", "<u4"),
+        ("kind", "<u4"),
+        ("sequence", "<u4"),
+    ]
+)
+
+MESSAGE_HEADER_DTYPE = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<u8"),
+        ("channel_id", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<u8"),
+        ("publish_time", "<u8"),
+    ]
+)
+"""An MCAP Message record up to its data."""
+
+EVENT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *EVENT_DTYPE.descr])
+OUTPUT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *OUTPUT_DTYPE.descr])
+
+SEGMENT_DTYPE = np.dtype(
+    [
+        ("first_event", "<u8"),
+        ("events", "<u8"),
+        ("first_output", "<u8"),
+        ("outputs", "<u8"),
+        ("chain_hash", "<u8"),
+        ("start_stamp", "<u8"),
+        ("end_stamp", "<u8"),
+        ("events_offset", "<u8"),
+        ("events_length", "<u8"),
+        ("outputs_offset", "<u8"),
+        ("outputs_length", "<u8"),
+    ]
+)
+"""One row per segment of the attachment ``rsltrace/segments``. ``first_output`` counts outputs from
+the start of the run; ``chain_hash`` is that of the segment's last event; offsets and lengths are
+those of the Chunk records in the file (0 and 0: no outputs in this segment)."""
