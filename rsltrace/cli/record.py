@@ -1,0 +1,171 @@
+"""``rsltrace record``: run a job and write its trace."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.errors import NodeError
+from rsltrace.model.stamp import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.job import Job
+    from rsltrace.loop.stop import Stop
+    from rsltrace.run import RunResult
+
+
+@click.command()
+@click.argument("job", type=click.Path(path_type=Path))
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    help="Trace to write (default: the job file's folder name or name, with .mcap, here).",
+)
+@click.option("--force", is_flag=True, help="Overwrite an existing trace.")
+@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
+@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
+def record(
+    job: Path,
+    output: Path | None,
+    force: bool,
+    seed: int | None,
+    until: str | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Run JOB (a job.yaml) deterministically and record its trace.
+
+    The nodes' log records go to stderr. The last line on stdout is
+    "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
+    The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
+    130 or 143 if interrupted.
+    """
+    from rsltrace.job import load_job
+    from rsltrace.run import Observer, run
+
+    loaded = _changed(load_job(job), seed=seed, until=until)
+    path = output or default_output(job)
+    with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
+        result = run(
+            loaded,
+            path,
+            force=force,
+            echo=not quiet,
+            observer=Observer(progress=on_progress, interrupt=on_interrupt),
+        )
+    _report(result, path, as_json=as_json)
+    sys.exit(result.exit_code)
+
+
+def default_output(job: Path) -> Path:
+    """Return the trace's name for a job file: ``demo/job.yaml`` → ``demo.mcap``, here."""
+    stem = job.resolve().parent.name if job.stem == "job" else job.stem
+    return Path(f"{stem or 'run'}.mcap")
+
+
+def _changed(job: Job, *, seed: int | None, until: str | None) -> Job:
+    """Return the job with the command line's values in place of its own."""
+    changes: dict[str, Any] = {}
+    if seed is not None:
+        changes["seed"] = seed
+    if until is not None:
+        from rsltrace.job import StopSpec
+
+        given = StopSpec(time=until)
+        changes["stop"] = job.stop.model_copy(update={"time_ns": given.time_ns})
+    return job.model_copy(update=changes) if changes else job
+
+
+def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
+    error = result.error
+    if error is not None:
+        if isinstance(error, NodeError) and error.traceback_text:
+            click.echo(error.traceback_text.rstrip(), err=True)
+        click.echo(f"rsltrace: error: {error}", err=True)
+    if as_json:
+        click.echo(
+            json.dumps(
+                {
+                    "path": str(path),
+                    "digest": result.digest,
+                    "events": result.events,
+                    "start_ns": result.start_ns,
+                    "end_ns": result.end_ns,
+                    "stop_reason": result.stop_reason,
+                    "exit_code": result.exit_code,
+                    "error": None if error is None else str(error),
+                }
+            )
+        )
+        return
+    click.echo(f"wrote {path}: {result.stop_reason}", err=True)
+    click.echo(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
+
+
+@contextmanager
+def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
+    """Turn the first SIGINT or SIGTERM into a proper end of the run; a second one interrupts
+    whatever callback is stuck."""
+    from rsltrace.loop.stop import Stop
+
+    ends: list[Callable[[Stop], None]] = []
+    old: dict[int, Any] = {}
+
+    def handle(number: int, frame: object) -> None:
+        if not ends:
+            raise KeyboardInterrupt
+        name = "interrupted" if number == signal.SIGINT else "terminated"
+        click.echo(f"\nrsltrace: {name}, closing the trace (once more to force)", err=True)
+        end = ends.pop()
+        end(Stop(name, 128 + number))
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        old[number] = signal.signal(number, handle)
+    try:
+        yield ends.append
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _progress(*, quiet: bool) -> Iterator[Callable[[int, int | None, int], None] | None]:
+    """Show a progress bar on a terminal, nothing elsewhere."""
+    if quiet or not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("recording"),
+        BarColumn(),
+        TextColumn("{task.fields[sim]} s simulated, {task.fields[events]} events"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=None, sim="0", events=0)
+        first: list[int] = []
+
+        def update(now_ns: int, end_ns: int | None, events: int) -> None:
+            if not first:
+                first.append(now_ns)
+            bar.update(
+                task,
+                total=None if end_ns is None else end_ns - first[0],
+                completed=now_ns - first[0],
+                sim=format_seconds(now_ns)[:-6],
+                events=events,
+            )
+
+        yield update

@@ -1,0 +1,196 @@
+"""The loop: what runs next, and when simulated time moves on.
+
+At simulated time t:
+
+1. release what was scheduled for t, in (time, order of scheduling; bag messages first);
+2. run ready events, first the tasks that the last event created, then the ready queue,
+   until none is left;
+3. run the due timer that is first in the timer queue, then go to 2;
+4. when nothing is due: ask the stop conditions, then advance to the next timer or release.
+
+The rules are RSLCPP's (measured, see ``docs/design.md``), except that tasks come first: that is
+what rclpy's executors do.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from heapq import heappop, heappush
+from typing import Protocol
+
+from rsltrace.errors import LivelockError
+from rsltrace.loop.stop import Progress, Stop, StopCondition
+from rsltrace.loop.timer import TimerState
+from rsltrace.loop.timer_queue import TimerQueue
+from rsltrace.model.stamp import format_seconds
+
+
+class Dispatchable(Protocol):
+    """Something the loop can run. ``dispatch`` must not raise for user errors: see ``stop``."""
+
+    def dispatch(self) -> None:
+        """Run one event, or none if there is nothing to do any more."""
+
+    def describe(self) -> str:
+        """Name it for an error message: ``/listener: subscription /chatter``."""
+
+
+class TimerOwner(Dispatchable, Protocol):
+    """What a due timer dispatches."""
+
+
+ORDER_BAG = 0
+ORDER_RELEASE = 1
+
+
+class EventLoop:
+    """The state of a simulation in time: clock, ready queue, timers, scheduled releases.
+
+    Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
+    (how many have run), ``activity_ns``.
+    """
+
+    def __init__(
+        self,
+        *,
+        start_ns: int,
+        timers: TimerQueue,
+        stop_conditions: tuple[StopCondition, ...] = (),
+        livelock_limit: int = 100_000,
+        between_steps: Callable[[], None] | None = None,
+    ) -> None:
+        self.now_ns = start_ns
+        self.start_ns = start_ns
+        self.events = 0
+        self.activity_ns = start_ns
+        self.ready: deque[Dispatchable] = deque()
+        self.tasks: deque[Dispatchable] = deque()
+        self.idle: list[Callable[[], bool]] = []
+        self.timers = timers
+        self.stopped: Stop | None = None
+        self._interrupt = False
+        self._conditions = stop_conditions
+        self._livelock_limit = livelock_limit
+        self._between_steps = between_steps
+        self._scheduled: list[tuple[int, int, int, Callable[[], None]]] = []
+        self._schedule_count = 0
+
+    def schedule(
+        self, time_ns: int, action: Callable[[], None], *, order: int = ORDER_RELEASE
+    ) -> None:
+        """Run ``action`` when simulated time reaches ``time_ns`` (at once if that is past)."""
+        self._schedule_count += 1
+        heappush(self._scheduled, (time_ns, order, self._schedule_count, action))
+
+    def stop(self, stop: Stop) -> None:
+        """End the run after the present event. The first call wins."""
+        if self.stopped is None:
+            self.stopped = stop
+        self._interrupt = True
+
+    def stop_after_step(self, stop: Stop) -> None:
+        """End the run once the present time step has run fully. The first call wins."""
+        if self.stopped is None:
+            self.stopped = stop
+
+    def jump(self, time_ns: int) -> None:
+        """Set the clock without running what lies between (from construct time to start)."""
+        self.now_ns = time_ns
+        self.start_ns = time_ns
+        self.activity_ns = max(self.activity_ns, time_ns)
+
+    def run(self) -> Stop:
+        """Run until something stops the run, and say what."""
+        while True:
+            self.run_step()
+            if self.stopped is not None:
+                return self.stopped
+            next_ns = self.next_ns()
+            stop = self._ask_conditions(next_ns)
+            if stop is not None:
+                self.stopped = stop
+                return stop
+            if next_ns is None:
+                self.stopped = Stop("nothing left to do")
+                return self.stopped
+            if self._between_steps is not None:
+                self._between_steps()
+                if self._interrupt and self.stopped is not None:
+                    return self.stopped
+            self.now_ns = max(next_ns, self.now_ns)
+
+    def next_ns(self) -> int | None:
+        """Return when the next timer or release is due, or None if there is neither."""
+        timer = self.timers.first()
+        scheduled = self._scheduled
+        if timer is None:
+            return scheduled[0][0] if scheduled else None
+        if scheduled and scheduled[0][0] < timer.deadline_ns:
+            return scheduled[0][0]
+        return timer.deadline_ns
+
+    def run_step(self) -> None:
+        """Run everything that is due at the present time."""
+        now_ns = self.now_ns
+        scheduled = self._scheduled
+        while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
+            heappop(scheduled)[3]()
+        tasks = self.tasks
+        ready = self.ready
+        timers = self.timers
+        limit = self.events + self._livelock_limit
+        while not self._interrupt:
+            if tasks:
+                tasks.popleft().dispatch()
+            elif ready:
+                ready.popleft().dispatch()
+            else:
+                timer = timers.first()
+                if timer is not None and timer.deadline_ns <= now_ns:
+                    owner: TimerOwner = timer.owner  # type: ignore[assignment]
+                    owner.dispatch()
+                elif not self._run_idle():
+                    break
+            if self.events >= limit:
+                self._livelock(now_ns)
+
+    def _run_idle(self) -> bool:
+        """Let those who poll have a look, now that nothing else is ready. True: go on."""
+        return any([poll() for poll in self.idle]) if self.idle else False
+
+    def _ask_conditions(self, next_ns: int | None) -> Stop | None:
+        if not self._conditions:
+            return None
+        progress = Progress(self.now_ns, next_ns, self.start_ns, self.events, self.activity_ns)
+        for condition in self._conditions:
+            stop = condition(progress)
+            if stop is not None:
+                return stop
+        return None
+
+    def _livelock(self, now_ns: int) -> None:
+        """Name those who keep each other going: watch who runs for a little longer."""
+        seen: dict[str, int] = {}
+        for _ in range(1000):
+            timer = self.timers.first()
+            if self.tasks:
+                item = self.tasks.popleft()
+            elif self.ready:
+                item = self.ready.popleft()
+            elif timer is not None and timer.deadline_ns <= now_ns:
+                item = timer.owner  # type: ignore[assignment]
+            else:
+                break
+            seen[item.describe()] = seen.get(item.describe(), 0) + 1
+            item.dispatch()
+        busiest = sorted(seen.items(), key=lambda pair: -pair[1])[:8]
+        cycle = "; ".join(name for name, _ in busiest) or "unknown"
+        raise LivelockError(
+            f"simulated time stands still at {format_seconds(now_ns)} s after "
+            f"{self._livelock_limit} events: these keep each other going: {cycle}. Give one of "
+            "them a timer or a delay, or raise livelock_limit in the job if this is meant to end"
+        )
+
+
+__all__ = ["ORDER_BAG", "ORDER_RELEASE", "Dispatchable", "EventLoop", "TimerState"]

@@ -1,0 +1,90 @@
+"""When a run ends. Conditions are looked at only between time steps, so the last step runs fully."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Why a run ended, in words for a person, and the exit status that follows from it."""
+
+    reason: str
+    exit_code: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """What a stop condition may look at: times in ns, and counts since the start of the run.
+
+    ``activity_ns`` is the last time at which anything was published, called or answered.
+    """
+
+    now_ns: int
+    next_ns: int | None
+    start_ns: int
+    events: int
+    activity_ns: int
+
+
+class StopCondition(Protocol):
+    """Asked after each time step; ``progress.next_ns`` is when the next one would be."""
+
+    def __call__(self, progress: Progress) -> Stop | None:
+        """Return why to stop now, or None to go on."""
+
+
+def stop_at(time_ns: int, reason: str) -> StopCondition:
+    """Run every step up to and including ``time_ns``."""
+
+    def condition(progress: Progress) -> Stop | None:
+        over = progress.now_ns >= time_ns or (
+            progress.next_ns is not None and progress.next_ns > time_ns
+        )
+        return Stop(reason) if over else None
+
+    return condition
+
+
+def stop_after_events(count: int) -> StopCondition:
+    """Stop after the step in which the number of events reaches ``count``."""
+
+    def condition(progress: Progress) -> Stop | None:
+        return Stop(f"{count} events") if progress.events >= count else None
+
+    return condition
+
+
+def stop_when_quiet(duration_ns: int, reason: str) -> StopCondition:
+    """Stop once nothing was published, called or answered for ``duration_ns``."""
+
+    def condition(progress: Progress) -> Stop | None:
+        quiet_since = max(progress.activity_ns, progress.start_ns)
+        next_ns = progress.now_ns if progress.next_ns is None else progress.next_ns
+        return Stop(reason) if next_ns - quiet_since > duration_ns else None
+
+    return condition
+
+
+def stop_when(function: Callable[[Progress], object], name: str) -> StopCondition:
+    """Stop when a user's function says so.
+
+    ``True`` stops with exit status 0, an integer other than a bool stops with that exit status,
+    anything false (``None``, ``False``) goes on; so the integer 0 stops with status 0, too.
+    """
+
+    def condition(progress: Progress) -> Stop | None:
+        answer = function(progress)
+        if answer is None or answer is False:
+            return None
+        code = 0 if answer is True else answer
+        if not isinstance(code, int):
+            raise TypeError(
+                f"the stop function {name} returned {answer!r}; "
+                "expected None, a bool or an integer exit status"
+            )
+        return Stop(f"function {name}", code)
+
+    return condition

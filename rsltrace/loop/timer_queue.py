@@ -1,0 +1,141 @@
+"""Which timer is next: two rules for timers with equal deadlines.
+
+``creation`` is ours: a total order, (deadline, creation order). ``heap`` gives the order in which
+rclcpp's TimersManager meets equal deadlines, which falls out of how libstdc++ sifts its binary
+heap; it exists to compare runs with RSLCPP, and is part of no other promise.
+"""
+
+from __future__ import annotations
+
+from heapq import heappop, heappush
+from typing import Protocol
+
+from rsltrace.loop.timer import TimerState
+
+
+class TimerQueue(Protocol):
+    """The timers that run. A cancelled timer is not in the queue."""
+
+    def add(self, timer: TimerState) -> None:
+        """Put a timer in, or back in after a cancel."""
+
+    def remove(self, timer: TimerState) -> None:
+        """Take a timer out; nothing happens if it is not in."""
+
+    def moved(self, timer: TimerState) -> None:
+        """Tell the queue that a timer's deadline has changed other than by having run."""
+
+    def ran(self, timer: TimerState) -> None:
+        """Tell the queue that ``timer``, which ``first`` gave, was called and has a new deadline."""
+
+    def first(self) -> TimerState | None:
+        """Return the timer that is due first, or None."""
+
+
+class CreationOrderQueue:
+    """Smallest (deadline, creation order) first. O(log n) for every change."""
+
+    def __init__(self) -> None:
+        # An entry is valid while its timer's ticket is that very entry: changes push a new one.
+        self._heap: list[tuple[int, int, TimerState]] = []
+
+    def add(self, timer: TimerState) -> None:
+        entry = (timer.deadline_ns, timer.order, timer)
+        timer.ticket = entry
+        heappush(self._heap, entry)
+
+    moved = add
+    ran = add
+
+    def remove(self, timer: TimerState) -> None:
+        timer.ticket = None
+
+    def first(self) -> TimerState | None:
+        heap = self._heap
+        while heap:
+            entry = heap[0]
+            if entry[2].ticket is entry:
+                return entry[2]
+            heappop(heap)
+        return None
+
+
+class HeapOrderQueue:
+    """Equal deadlines in the order of libstdc++'s heap algorithms, as rclcpp uses them.
+
+    rclcpp sifts up on insertion; after its root timer ran it appends the root again, pops the heap
+    and drops the last element; when a timer goes it makes a new heap of the others.
+    """
+
+    def __init__(self) -> None:
+        self._heap: list[TimerState] = []
+
+    def add(self, timer: TimerState) -> None:
+        if timer.ticket is self:
+            self.moved(timer)
+            return
+        timer.ticket = self
+        self._heap.append(timer)
+        self._sift_up(len(self._heap) - 1, 0, timer)
+
+    def remove(self, timer: TimerState) -> None:
+        if timer.ticket is self:
+            timer.ticket = None
+            self._heap.remove(timer)
+            self._make_heap()
+
+    def moved(self, timer: TimerState) -> None:
+        self._make_heap()
+
+    def ran(self, timer: TimerState) -> None:
+        heap = self._heap
+        if not heap or heap[0] is not timer:
+            self._make_heap()  # the callback changed the heap under its own timer
+            return
+        # push_back(front), pop_heap, pop_back: the copy at the end is what gets sifted in again.
+        if len(heap) > 1:
+            self._sift_down(0, len(heap), timer)
+
+    def first(self) -> TimerState | None:
+        return self._heap[0] if self._heap else None
+
+    def _sift_up(self, hole: int, top: int, timer: TimerState) -> None:
+        heap = self._heap
+        parent = (hole - 1) // 2
+        while hole > top and heap[parent].deadline_ns > timer.deadline_ns:
+            heap[hole] = heap[parent]
+            hole = parent
+            parent = (hole - 1) // 2
+        heap[hole] = timer
+
+    def _sift_down(self, top: int, length: int, timer: TimerState) -> None:
+        heap = self._heap
+        hole = child = top
+        while child < (length - 1) // 2:
+            child = 2 * (child + 1)
+            if heap[child].deadline_ns > heap[child - 1].deadline_ns:
+                child -= 1
+            heap[hole] = heap[child]
+            hole = child
+        if length % 2 == 0 and child == (length - 2) // 2:
+            child = 2 * (child + 1)
+            heap[hole] = heap[child - 1]
+            hole = child - 1
+        self._sift_up(hole, top, timer)
+
+    def _make_heap(self) -> None:
+        length = len(self._heap)
+        for parent in range((length - 2) // 2, -1, -1):
+            self._sift_down(parent, length, self._heap[parent])
+
+
+def timer_queue(ties: str) -> CreationOrderQueue | HeapOrderQueue:
+    """Return a queue for the tie rule ``creation`` or ``heap``.
+
+    :raises ValueError: for any other rule.
+    """
+    if ties == "creation":
+        return CreationOrderQueue()
+    if ties == "heap":
+        return HeapOrderQueue()
+    raise ValueError(f"unknown rule for timer ties: {ties!r} (creation or heap)")

@@ -1,0 +1,368 @@
+"""The object that stands where rclpy keeps its C extension, and how it gets there.
+
+``install`` exchanges the reference ``_rclpy`` in every loaded rclpy module and in
+``rclpy.impl.implementation_singleton`` (for modules that load later); ``uninstall`` puts everything
+back. What has no side effect on the machine is passed through to the real extension: enums,
+exceptions, name validation, QoS structures, time points, log levels.
+"""
+
+from __future__ import annotations
+
+import sys
+import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import SetupError, UnsupportedError
+from rsltrace.ros import graph as graph_queries
+from rsltrace.ros.arguments import InvalidArgumentsError
+from rsltrace.ros.clock import ClockEventHandle, ClockHandle
+from rsltrace.ros.codec import codec_for
+from rsltrace.ros.context import ContextHandle
+from rsltrace.ros.destroyable import Destroyable, set_invalid_handle
+from rsltrace.ros.guard_condition import GuardConditionHandle
+from rsltrace.ros.interfaces import type_hash
+from rsltrace.ros.node import NodeHandle
+from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.ros.qos_events import EventHandle, IncompatibleQosStatus, MatchedStatus
+from rsltrace.ros.services import (
+    ClientHandle,
+    RequestId,
+    ServiceHandle,
+    ServiceInfo,
+    TypeDescriptionServiceHandle,
+)
+from rsltrace.ros.timers import TimerHandle
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+_PASSED_THROUGH = (
+    # enums and structures
+    "ClockChange ClockType GoalEvent QoSCheckCompatibleResult QoSCompatibility "
+    "RCUTILS_LOG_SEVERITY SignalHandlerOptions TransitionCallbackReturnType rcl_duration_t "
+    "rcl_publisher_event_type_t rcl_subscription_event_type_t rcl_time_point_t "
+    "rmw_incompatible_type_status_t rmw_liveliness_changed_status_t rmw_liveliness_lost_status_t "
+    "rmw_message_lost_status_t rmw_offered_deadline_missed_status_t rmw_qos_policy_kind_t "
+    "rmw_qos_profile_t rmw_requested_deadline_missed_status_t service_introspection "
+    "RCL_DEFAULT_DOMAIN_ID RMW_DURATION_INFINITE RMW_QOS_DEADLINE_BEST_AVAILABLE "
+    "RMW_QOS_LIVELINESS_LEASE_DURATION_BEST_AVAILABLE "
+    # exceptions
+    "InvalidHandle NodeNameNonExistentError NotImplementedError RCLError RCLInvalidROSArgsError "
+    "RCUtilsError RMWError UnknownROSArgsError UnsupportedEventTypeError TimerCancelledError "
+    # pure functions
+    "rclpy_expand_topic_name rclpy_get_validation_error_for_full_topic_name "
+    "rclpy_get_validation_error_for_namespace rclpy_get_validation_error_for_node_name "
+    "rclpy_get_validation_error_for_topic_name rclpy_remove_ros_args rclpy_qos_check_compatible "
+    "rclpy_action_get_rmw_qos_profile "
+    # log levels (rcutils keeps them per process; a run starts with fresh ones)
+    "rclpy_logging_get_logger_effective_level rclpy_logging_get_logger_level "
+    "rclpy_logging_get_logging_directory rclpy_logging_get_separator_string "
+    "rclpy_logging_initialize rclpy_logging_logger_is_enabled_for "
+    "rclpy_logging_set_logger_level rclpy_logging_severity_level_from_string "
+    "rclpy_logging_shutdown"
+).split()
+
+_LATER = {
+    "ActionClient": "actions",
+    "ActionServer": "actions",
+    "ActionGoalHandle": "actions",
+    "LifecycleStateMachine": "lifecycle nodes",
+    "EventsExecutor": "rclpy's EventsExecutor",
+}
+
+
+class Boundary:
+    """Stands in for the module ``rclpy._rclpy_pybind11``; ``core`` is the world of the moment."""
+
+    def __init__(self, real: Any) -> None:
+        self.real = real
+        self._core: Core | None = None
+        self._last_now_ns = 0
+        self.ros_clocks: list[weakref.ref[ClockHandle]] = []
+        for name in _PASSED_THROUGH:
+            if hasattr(real, name):
+                setattr(self, name, getattr(real, name))
+        set_invalid_handle(real.InvalidHandle)
+        self.Destroyable = Destroyable
+        self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
+        self.ClockEvent = ClockEventHandle
+        self.rmw_request_id_t = RequestId
+        self.rmw_service_info_t = ServiceInfo
+        self.rmw_matched_status_t = MatchedStatus
+        self.rmw_requested_qos_incompatible_event_status_t = IncompatibleQosStatus
+        for name, feature in _LATER.items():
+            setattr(self, name, partial(_unsupported, feature))
+
+    # -- the world of the moment ---------------------------------------------------------------
+
+    @property
+    def core(self) -> Core:
+        """The world that new entities join.
+
+        :raises UnsupportedError: between runs.
+        """
+        if self._core is None:
+            raise UnsupportedError("no simulation is running in this process")
+        return self._core
+
+    def now_ns(self) -> int:
+        """Return simulated time, or the last one between runs."""
+        return self._last_now_ns if self._core is None else self._core.loop.now_ns
+
+    def enter(self, core: Core) -> None:
+        """Make ``core`` the world that new entities join."""
+        if self._core is not None:
+            raise UnsupportedError("another simulation is running in this process")
+        self._core = core
+
+    def leave(self) -> None:
+        """End the world of the moment."""
+        self._last_now_ns = self.now_ns()
+        self._core = None
+
+    def jump_clocks(self, delta_ns: int) -> None:
+        """Tell ROS clocks with jump callbacks that time has jumped."""
+        for reference in list(self.ros_clocks):
+            clock = reference()
+            if clock is None:
+                self.ros_clocks.remove(reference)
+            else:
+                clock.jumped(delta_ns)
+
+    # -- entities --------------------------------------------------------------------------------
+
+    def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
+        try:
+            context = ContextHandle(self.core, arguments, domain_id)
+        except InvalidArgumentsError as error:
+            raise self.real.RCLInvalidROSArgsError(str(error)) from error
+        if self.core.main_context is None:
+            self.core.main_context = context
+        return context
+
+    def Node(self, *arguments: Any) -> NodeHandle:  # noqa: N802
+        name, namespace, context, cli_args, use_global, rosout = arguments
+        return NodeHandle(
+            self, self.core, name, namespace, context, cli_args, use_global, rosout
+        )
+
+    def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
+        return PublisherHandle(node.core, node, *arguments)
+
+    def Subscription(self, node: NodeHandle, *arguments: Any) -> SubscriptionHandle:  # noqa: N802
+        return SubscriptionHandle(node.core, node, *arguments)
+
+    def Client(self, node: NodeHandle, *arguments: Any) -> ClientHandle:  # noqa: N802
+        return ClientHandle(node.core, node, *arguments)
+
+    def Service(self, node: NodeHandle, *arguments: Any) -> ServiceHandle:  # noqa: N802
+        return ServiceHandle(node.core, node, *arguments)
+
+    def TypeDescriptionService(self, node: NodeHandle) -> TypeDescriptionServiceHandle:  # noqa: N802
+        return TypeDescriptionServiceHandle(node.core, node)
+
+    def Timer(  # noqa: N802
+        self, clock: Any, context: ContextHandle, period_ns: int, autostart: bool = True
+    ) -> TimerHandle:
+        return TimerHandle(self, context.core, clock, period_ns, autostart)
+
+    def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
+        return GuardConditionHandle(context.core)
+
+    def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
+        return EventHandle(parent.core, parent, event_type)
+
+    def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
+        from rsltrace.ros.executor import WaitSetHandle
+
+        return WaitSetHandle(*arguments)
+
+    # -- names and graph -------------------------------------------------------------------------
+
+    def rclpy_resolve_name(
+        self, node: NodeHandle, name: str, only_expand: bool, is_service: bool
+    ) -> str:
+        return node.resolve(name, service=is_service, only_expand=only_expand)
+
+    def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
+        return node.resolve(topic, service=False)
+
+    def _node_named(self, name: str, namespace: str) -> NodeHandle:
+        full = (namespace if namespace.endswith("/") else namespace + "/") + name
+        node = self.core.graph.node_named(full)
+        if node is None:
+            raise self.real.NodeNameNonExistentError(f"cannot find node {full}")
+        return node
+
+    def _by_node(self, ends: Any, name_of: str, node: NodeHandle) -> list[tuple[str, list[str]]]:
+        return graph_queries.names_and_types(
+            [
+                (getattr(end, name_of), end.type_name)
+                for group in ends.values()
+                for end in group
+                if end.node is node
+            ]
+        )
+
+    def rclpy_get_publisher_names_and_types_by_node(
+        self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        target = self._node_named(name, namespace)
+        return self._by_node(self.core.graph._publishers, "topic", target)
+
+    def rclpy_get_subscriber_names_and_types_by_node(
+        self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        target = self._node_named(name, namespace)
+        return self._by_node(self.core.graph._subscriptions, "topic", target)
+
+    def rclpy_get_service_names_and_types_by_node(
+        self, node: NodeHandle, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        target = self._node_named(name, namespace)
+        return self._by_node(self.core.graph._services, "service", target)
+
+    def rclpy_get_client_names_and_types_by_node(
+        self, node: NodeHandle, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        target = self._node_named(name, namespace)
+        return self._by_node(self.core.graph._clients, "service", target)
+
+    def rclpy_get_topic_names_and_types(
+        self, node: NodeHandle, no_demangle: bool
+    ) -> list[tuple[str, list[str]]]:
+        return self.core.graph.topic_names_and_types()
+
+    def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
+        return self.core.graph.service_names_and_types()
+
+    def rclpy_get_publishers_info_by_topic(
+        self, node: NodeHandle, topic: str, no_mangle: bool
+    ) -> list[dict[str, Any]]:
+        return [_endpoint_info(p, 1, p._msg_type) for p in self.core.graph.publishers(topic)]
+
+    def rclpy_get_subscriptions_info_by_topic(
+        self, node: NodeHandle, topic: str, no_mangle: bool
+    ) -> list[dict[str, Any]]:
+        return [_endpoint_info(s, 2, s._msg_type) for s in self.core.graph.subscriptions(topic)]
+
+    # -- messages ----------------------------------------------------------------------------------
+
+    def rclpy_serialize(self, message: Any, message_type: Any) -> bytes:
+        return codec_for(message_type).serialize(message)
+
+    def rclpy_deserialize(self, data: bytes, message_type: Any) -> Any:
+        return codec_for(message_type).deserialize(bytes(data))
+
+    def rclpy_assert_liveliness(self, publisher: Any) -> None:
+        pass
+
+    def rclpy_get_rmw_implementation_identifier(self) -> str:
+        return "rmw_rsltrace"
+
+    # -- logging -----------------------------------------------------------------------------------
+
+    def rclpy_logging_configure(self, context: Any) -> None:
+        """Do nothing: rcl's would open a log file below the home folder."""
+
+    def rclpy_logging_fini(self) -> None:
+        pass
+
+    def rclpy_logging_rosout_add_sublogger(self, name: str, child: str) -> bool:
+        return self._core is not None and self._core.logs.add_sublogger(name, child)
+
+    def rclpy_logging_rosout_remove_sublogger(self, name: str, child: str) -> None:
+        pass
+
+    def rclpy_logging_rcutils_log(
+        self, severity: int, name: str, message: str, function: str, file: str, line: int
+    ) -> None:
+        if self._core is not None:
+            self._core.logs.log(severity, name, message, function, file, line)
+
+    # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
+
+    def install_signal_handlers(self, options: Any) -> None:
+        pass
+
+    def uninstall_signal_handlers(self) -> None:
+        pass
+
+    def get_current_signal_handlers_options(self) -> Any:
+        return self.real.SignalHandlerOptions.NO
+
+    def register_sigint_guard_condition(self, guard: Any) -> None:
+        pass
+
+    def unregister_sigint_guard_condition(self, guard: Any) -> None:
+        pass
+
+
+def _unsupported(feature: str, *arguments: Any, **kwargs: Any) -> Any:
+    raise UnsupportedError(f"{feature} cannot be simulated by this version of rsltrace")
+
+
+def _endpoint_info(endpoint: Any, endpoint_type: int, message_type: Any) -> dict[str, Any]:
+    text = type_hash(message_type) or ""
+    value = bytes.fromhex(text.removeprefix("RIHS01_")) if text.startswith("RIHS01_") else b""
+    return {
+        "node_name": endpoint.node.name,
+        "node_namespace": endpoint.node.namespace,
+        "topic_type": endpoint.type_name,
+        "topic_type_hash": {"version": 1 if value else 0, "value": value or bytes(32)},
+        "endpoint_type": endpoint_type,
+        "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
+        "qos_profile": endpoint.qos.to_dict(),
+    }
+
+
+_installed: Boundary | None = None
+
+
+def boundary() -> Boundary:
+    """Return the boundary, loading rclpy's extension (but no rclpy module that binds it).
+
+    :raises SetupError: if rclpy is not installed or cannot be loaded.
+    """
+    global _installed
+    if _installed is None:
+        try:
+            from rclpy.impl import implementation_singleton as singleton
+        except ImportError as error:
+            raise SetupError(
+                "rclpy is not installed for this Python: install the ROS wheels with "
+                "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
+                f"({error})"
+            ) from error
+        _installed = Boundary(singleton.rclpy_implementation)
+    return _installed
+
+
+@contextmanager
+def installed() -> Iterator[Boundary]:
+    """Have rclpy use the simulated middleware within the ``with`` block."""
+    ours = boundary()
+    _exchange(ours.real, ours)
+    try:
+        yield ours
+    finally:
+        _exchange(ours, ours.real)
+
+
+def _exchange(old: Any, new: Any) -> None:
+    for module in list(sys.modules.values()):
+        names = getattr(module, "__dict__", None)
+        if not isinstance(names, dict) or module is sys.modules[__name__]:
+            continue
+        for name in ("_rclpy", "rclpy_implementation"):
+            if names.get(name) is old:
+                names[name] = new
+    logger = sys.modules.get("rclpy.impl.rcutils_logger")
+    if logger is not None:
+        # The default clock of throttled logging was made when the module was loaded.
+        from rclpy.clock import Clock
+
+        logger.Throttle.params["throttle_time_source_type"] = Clock()

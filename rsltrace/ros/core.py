@@ -1,0 +1,267 @@
+"""One simulated ROS world: what its handles share, and how a callback is run.
+
+``Core.execute`` is the middle of everything: each event of a run passes through it once. Keep it
+small; what only some events need belongs elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import struct
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import NodeError, OutputError, RsltraceError, RunError
+from rsltrace.loop.loop import Dispatchable, EventLoop
+from rsltrace.loop.stop import Stop
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.recorder import Recorder
+
+if TYPE_CHECKING:
+    from rsltrace.ros.context import ContextHandle
+    from rsltrace.ros.entity_handle import EntityHandle
+    from rsltrace.ros.executor import SimExecutor
+    from rsltrace.ros.graph import Graph
+    from rsltrace.ros.logs import Logs
+    from rsltrace.ros.node import NodeHandle
+    from rsltrace.ros.tasks import TaskRun
+
+_RAISED = int(EventFlag.RAISED)
+_PACKAGE = str(Path(__file__).resolve().parent.parent)
+_pack_value = struct.Struct("<Bq").pack
+
+
+class Core:
+    """The state of one simulated ROS world.
+
+    ``recorder`` is None in a run that records nothing. ``current_*`` describe the event under way.
+    """
+
+    def __init__(self, loop: EventLoop, recorder: Recorder | None, *, base_dir: Path) -> None:
+        self.loop = loop
+        self.recorder = recorder
+        self.base_dir = base_dir
+        self.graph: Graph
+        self.executor: SimExecutor
+        self.current_node: NodeHandle | None = None
+        self.current_entity = 0
+        self.input_hash = 0
+        self.flags = 0
+        self.error: RunError | None = None
+        self.logs: Logs
+        self.main_context: ContextHandle | None = None
+        self.node_arguments: list[str] = []
+        self.suspended: dict[TaskRun, None] = {}
+        self.polled: list[TaskRun] = []
+        self.polls = 0
+        self.poll_stage: tuple[int, int] | None = None
+        self.pending: list[EntityHandle] = []
+        self.unowned: list[EntityHandle] = []
+        self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
+        self._entity_count = 0
+        self._parked: dict[object, list[Callable[[], None]]] = {}
+        self._channels: dict[str, int] = {}
+
+    # -- the hot path ------------------------------------------------------------------------
+
+    def execute(
+        self,
+        handle: Dispatchable,
+        entity: int,
+        node: NodeHandle | None,
+        kind: int,
+        callback: Callable[..., object],
+        args: tuple[Any, ...],
+        cause_event: int,
+        cause_output: int,
+        input_hash: int,
+    ) -> None:
+        """Run one event: call ``callback(*args)`` and record what came of it."""
+        self.current_entity = entity
+        self.current_node = node
+        self.input_hash = input_hash
+        try:
+            callback(*args)
+        except BaseException as error:
+            self._failed(error, handle)
+        if self.pending:
+            self.settle()
+        loop = self.loop
+        recorder = self.recorder
+        if recorder is not None:
+            recorder.end_event(
+                loop.now_ns, kind, self.flags, entity, cause_event, cause_output, input_hash
+            )
+        loop.events += 1
+        self.flags = 0
+
+    # -- entities ----------------------------------------------------------------------------
+
+    def new_entity_id(self) -> int:
+        """Return the next entity id; 0 is the run itself."""
+        self._entity_count += 1
+        return self._entity_count
+
+    def settle(self) -> None:
+        """Write down the entities created in this event, now that their owners are known."""
+        waiting = self.unowned
+        self.unowned = []
+        created, self.pending = self.pending, []
+        for handle in [*waiting, *created]:
+            if handle.settle():
+                if self.recorder is not None:
+                    self.recorder.entity(handle.entity())
+            else:
+                self.unowned.append(handle)
+
+    def watch(self, topic: str, watcher: Callable[[Any, bytes], None]) -> None:
+        """Call ``watcher(message class, canonical bytes)`` for every message on a topic."""
+        self.watchers[topic] = watcher
+
+    def activate_node(self, node: NodeHandle) -> None:
+        """Run the callbacks of a node from now on: an executor of this run has it."""
+        for lists in ("subscriptions", "timers", "clients", "services", "guards", "waitables"):
+            for wrapper in getattr(node.wrapper, lists):
+                handle = getattr(wrapper, "handle", None) or getattr(
+                    wrapper, "_EventHandler__event", None
+                )
+                if handle is not None and handle.wrapper is None:
+                    handle.node = handle.node or node
+                    handle.find_wrapper()
+
+    def deactivate_node(self, node: NodeHandle) -> None:
+        """Stop running the callbacks of a node; what it has received stays in its queues."""
+        for lists in ("subscriptions", "timers", "clients", "services", "guards", "waitables"):
+            for wrapper in getattr(node.wrapper, lists):
+                handle = getattr(wrapper, "handle", None) or getattr(
+                    wrapper, "_EventHandler__event", None
+                )
+                if handle is not None:
+                    handle.deactivate()
+        node.wrapper = None
+
+    def channel(self, topic: str, type_name: str, schema: Callable[[], tuple[str, str]],
+                qos_yaml: str) -> int:
+        """Return the trace's channel for a topic, or -1 if its payloads are not kept.
+
+        ``schema`` gives the schema text and the type hash when a channel has to be made.
+        """
+        recorder = self.recorder
+        if recorder is None or not recorder.keep_payload(topic):
+            return -1
+        channel = self._channels.get(topic)
+        if channel is None:
+            text, type_hash = schema()
+            channel = recorder.writer.add_channel(
+                topic, type_name, text, qos_yaml=qos_yaml, type_hash=type_hash
+            )
+            self._channels[topic] = channel
+        return channel
+
+    # -- outputs other than messages -----------------------------------------------------------
+
+    def note(self, kind: OutputKind, entity: int, operation: int = 0, value: int = 0) -> int:
+        """Add a small output (a timer changed, a task was made); return its position."""
+        if self.recorder is None:
+            return 0
+        return self.recorder.output(kind, entity, hash64(_pack_value(operation, value)))
+
+    def graph_name_of_future(self, future: object) -> str:
+        """Say what would complete a future: the service it is a request to, if it is one."""
+        if future is None:
+            return "something that is not an rclpy Future"
+        for client in self.graph.all_clients():
+            if client.wrapper is not None and future in client.wrapper._pending_requests.values():
+                servers = len(self.graph.services(client.service))
+                return f"the response of {client.service} ({servers} servers)"
+        return "a Future that nobody completes"
+
+    # -- callback groups -----------------------------------------------------------------------
+
+    def park(self, group: object, retry: Callable[[], None]) -> None:
+        """Keep an event whose callback group is busy; ``retry`` runs when the group is free."""
+        self._parked.setdefault(group, []).append(retry)
+
+    def group_freed(self, group: object) -> None:
+        """Let the events run that waited for ``group``, before anything else that is ready."""
+        waiting = self._parked.pop(group, None)
+        if waiting:
+            for retry in reversed(waiting):
+                retry()
+
+    # -- failures ------------------------------------------------------------------------------
+
+    def _failed(self, error: BaseException, handle: Dispatchable) -> None:
+        if isinstance(error, OutputError):
+            raise error  # the trace cannot be written: no event may be lost quietly
+        self.flags |= _RAISED
+        name = self.current_node.fully_qualified_name if self.current_node else ""
+        label = handle.describe()
+        stamp_ns = self.loop.now_ns
+        text = user_traceback(error)
+        if self.recorder is not None:
+            content = f"{type(error).__qualname__}\0{error}"
+            self.recorder.detail(
+                OutputKind.EXCEPTION, self.current_entity, stamp_ns, text, hash64(content.encode())
+            )
+        if isinstance(error, SystemExit):
+            self.loop.stop(Stop(f"{label} raised SystemExit", _exit_status(error)))
+            return
+        if isinstance(error, KeyboardInterrupt):
+            self.loop.stop(Stop("interrupted", 130))
+            return
+        where = f"{label}, at simulated time {format_seconds(stamp_ns)} s"
+        if isinstance(error, RsltraceError):
+            # Raised by the middleware itself: the message says what to do, this says where.
+            failure = type(error).__new__(type(error))
+            Exception.__init__(failure, f"{error}\n  in {where}")
+            self.error = failure if isinstance(failure, RunError) else RunError(str(failure))
+        else:
+            self.error = NodeError(
+                f"{where} raised {type(error).__qualname__}: {error}",
+                node=name,
+                entity=label,
+                stamp_ns=stamp_ns,
+                traceback_text=text,
+            )
+        self.error.__cause__ = error
+        self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
+
+    def run_outside(
+        self, describe: Callable[[], str], kind: EventKind, entity: int, node: NodeHandle | None,
+        callback: Callable[[], object],
+    ) -> None:
+        """Run an event that is no entity's callback: construction, shutdown, a clock jump."""
+        self.execute(_Outside(describe), entity, node, kind, callback, (), NO_EVENT, 0, 0)
+
+
+class _Outside:
+    """A nameable stand-in for an entity in ``run_outside``."""
+
+    def __init__(self, describe: Callable[[], str]) -> None:
+        self.describe = describe
+
+    def dispatch(self) -> None:
+        raise AssertionError("never in a queue")
+
+
+def _exit_status(error: SystemExit) -> int:
+    if error.code is None:
+        return 0
+    return error.code if isinstance(error.code, int) else 1
+
+
+def user_traceback(error: BaseException) -> str:
+    """Return the traceback without the frames of rsltrace that lead to the user's code."""
+    tb = error.__traceback__
+    while tb is not None and tb.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+        tb = tb.tb_next
+    if tb is None:
+        tb = error.__traceback__
+    with contextlib.suppress(Exception):
+        return "".join(traceback.format_exception(type(error), error, tb))
+    return f"{type(error).__qualname__} (its text could not be made)"

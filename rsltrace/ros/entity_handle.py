@@ -1,0 +1,108 @@
+"""What publishers, subscriptions, timers, clients, services and guard conditions have in common."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.ros.destroyable import Destroyable
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+    from rsltrace.ros.node import NodeHandle
+
+
+class EntityHandle(Destroyable):
+    """A handle that has an id in the trace and, once rclpy has made it, a wrapper object.
+
+    rclpy creates the handle first and wraps it afterwards, so the wrapper (which holds callback
+    and callback group) is looked up in the node's lists when it is first needed. Timers and guard
+    conditions are made without a node; until one lists them they do not run.
+    """
+
+    kind: EntityKind
+    lists: str
+    """Name of the rclpy Node attribute that lists the wrappers."""
+
+    def __init__(self, core: Core, node: NodeHandle | None) -> None:
+        super().__init__()
+        self.core = core
+        self.node = node
+        self.entity_id = core.new_entity_id()
+        self.created_ns = core.loop.now_ns
+        self.wrapper: Any = None
+        core.pending.append(self)
+
+    def settle(self) -> bool:
+        """Find owner and wrapper; return whether the owner is known."""
+        self.find_wrapper()
+        return self.node is not None
+
+    def find_wrapper(self) -> Any:
+        """Return the rclpy object around this handle, or None if its node is not being run."""
+        if self.wrapper is None:
+            for node in self._candidates():
+                for wrapper in getattr(node.wrapper, self.lists):
+                    if wrapper.handle is self:
+                        self.wrapper = wrapper
+                        self.node = node
+                        self.activate()
+                        return wrapper
+        return self.wrapper
+
+    def activate(self) -> None:
+        """Start to run, or to deliver what has arrived: owner and callback are known now."""
+
+    def deactivate(self) -> None:
+        """Stop running: the node was taken from its executor."""
+        self.wrapper = None
+
+    def _candidates(self) -> list[NodeHandle]:
+        if self.node is not None:
+            return [self.node] if self.node.wrapper is not None else []
+        nodes = self.core.graph.nodes
+        hint = self.core.current_node
+        ordered = [n for n in nodes if n is hint] + [n for n in nodes if n is not hint]
+        return [n for n in ordered if n.wrapper is not None]
+
+    def entity(self) -> Entity:
+        """Return the entity as the trace describes it."""
+        return Entity(
+            id=self.entity_id,
+            node=self.node.entity_id if self.node is not None else 0,
+            kind=self.kind,
+            name=self.trace_name(),
+            type=self.trace_type(),
+            created_ns=self.created_ns,
+            detail=self.trace_detail(),
+        )
+
+    def trace_name(self) -> str:
+        """Return the topic, service or callback name."""
+        return callback_name(getattr(self.wrapper, "callback", None))
+
+    def trace_type(self) -> str:
+        """Return the interface type, or an empty string."""
+        return ""
+
+    def trace_detail(self) -> dict[str, object]:
+        """Return what only this kind of entity has."""
+        return {}
+
+    def describe(self) -> str:
+        """Name the entity for people: ``/listener: subscription /chatter``."""
+        node = self.node.fully_qualified_name if self.node is not None else "(no node)"
+        return f"{node}: {self.kind.label} {self.trace_name()}"
+
+
+def callback_name(callback: Any) -> str:
+    """Name a callback as in ``Talker.on_timer``; never with an address in it."""
+    if callback is None:
+        return ""
+    name = getattr(callback, "__qualname__", None)
+    if isinstance(name, str):
+        return name
+    inner = getattr(callback, "func", None)  # functools.partial
+    if inner is not None:
+        return f"partial({callback_name(inner)})"
+    return type(callback).__qualname__

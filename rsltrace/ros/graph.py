@@ -1,0 +1,152 @@
+"""Who is there and who is connected to whom.
+
+Everything is in creation order, so that fan-out is the same on every machine (in DDS it depends on
+hashes of addresses).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rsltrace.errors import UnsupportedError
+from rsltrace.ros.qos import incompatible_policy
+
+if TYPE_CHECKING:
+    from rsltrace.ros.node import NodeHandle
+    from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
+    from rsltrace.ros.services import ClientHandle, ServiceHandle
+
+
+class Graph:
+    """The nodes and endpoints of one world."""
+
+    def __init__(self) -> None:
+        self.nodes: list[NodeHandle] = []
+        self._publishers: dict[str, list[PublisherHandle]] = {}
+        self._subscriptions: dict[str, list[SubscriptionHandle]] = {}
+        self._clients: dict[str, list[ClientHandle]] = {}
+        self._services: dict[str, list[ServiceHandle]] = {}
+
+    def node_named(self, fully_qualified_name: str) -> NodeHandle | None:
+        """Return the node of that name, or None."""
+        for node in self.nodes:
+            if node.fully_qualified_name == fully_qualified_name:
+                return node
+        return None
+
+    def publishers(self, topic: str) -> list[PublisherHandle]:
+        """Return the publishers of a topic in creation order."""
+        return self._publishers.get(topic, [])
+
+    def subscriptions(self, topic: str) -> list[SubscriptionHandle]:
+        """Return the subscriptions of a topic in creation order."""
+        return self._subscriptions.get(topic, [])
+
+    def clients(self, service: str) -> list[ClientHandle]:
+        """Return the clients of a service in creation order."""
+        return self._clients.get(service, [])
+
+    def all_clients(self) -> list[ClientHandle]:
+        """Return every client."""
+        return [client for clients in self._clients.values() for client in clients]
+
+    def services(self, service: str) -> list[ServiceHandle]:
+        """Return the servers of a service in creation order."""
+        return self._services.get(service, [])
+
+    # -- joining and leaving -------------------------------------------------------------------
+
+    def add_publisher(self, publisher: PublisherHandle) -> None:
+        """Connect a new publisher with the subscriptions that are there."""
+        self._check_type(publisher)
+        self._publishers.setdefault(publisher.topic, []).append(publisher)
+        for subscription in self.subscriptions(publisher.topic):
+            self._connect(publisher, subscription)
+
+    def add_subscription(self, subscription: SubscriptionHandle) -> None:
+        """Connect a new subscription; it gets what transient-local publishers kept for it."""
+        self._check_type(subscription)
+        self._subscriptions.setdefault(subscription.topic, []).append(subscription)
+        for publisher in self.publishers(subscription.topic):
+            self._connect(publisher, subscription)
+
+    def remove_publisher(self, publisher: PublisherHandle) -> None:
+        """Disconnect a publisher."""
+        self._publishers[publisher.topic].remove(publisher)
+        for subscription in publisher.subscriptions:
+            subscription.publishers.remove(publisher)
+            subscription.events.matched(-1)
+        publisher.subscriptions = []
+
+    def remove_subscription(self, subscription: SubscriptionHandle) -> None:
+        """Disconnect a subscription."""
+        self._subscriptions[subscription.topic].remove(subscription)
+        for publisher in subscription.publishers:
+            publisher.subscriptions.remove(subscription)
+            publisher.events.matched(-1)
+        subscription.publishers = []
+
+    def add_client(self, client: ClientHandle) -> None:
+        """Make a client known."""
+        self._clients.setdefault(client.service, []).append(client)
+
+    def remove_client(self, client: ClientHandle) -> None:
+        """Forget a client."""
+        self._clients[client.service].remove(client)
+
+    def add_service(self, service: ServiceHandle) -> None:
+        """Make a server known."""
+        self._services.setdefault(service.service, []).append(service)
+
+    def remove_service(self, service: ServiceHandle) -> None:
+        """Forget a server."""
+        self._services[service.service].remove(service)
+
+    def _connect(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> None:
+        policy = incompatible_policy(publisher.qos, subscription.qos)
+        if policy is not None:
+            publisher.events.incompatible(policy)
+            subscription.events.incompatible(policy)
+            return
+        # Keep fan-out in the creation order of the subscriptions.
+        publisher.subscriptions.append(subscription)
+        publisher.subscriptions.sort(key=lambda s: s.entity_id)
+        subscription.publishers.append(publisher)
+        publisher.events.matched(+1)
+        subscription.events.matched(+1)
+        publisher.send_history(subscription)
+
+    def _check_type(self, endpoint: PublisherHandle | SubscriptionHandle) -> None:
+        for other in [*self.publishers(endpoint.topic), *self.subscriptions(endpoint.topic)]:
+            if other.type_name != endpoint.type_name:
+                raise UnsupportedError(
+                    f"topic {endpoint.topic} has two types: {other.describe()} is "
+                    f"{other.type_name}, {endpoint.describe()} is {endpoint.type_name}. They "
+                    "would never hear each other; rename or remap one of them"
+                )
+
+    # -- queries ---------------------------------------------------------------------------------
+
+    def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return every topic with its type, sorted by name."""
+        topics: dict[str, str] = {}
+        for endpoints in [*self._publishers.values(), *self._subscriptions.values()]:
+            for endpoint in endpoints:
+                topics[endpoint.topic] = endpoint.type_name
+        return [(topic, [topics[topic]]) for topic in sorted(topics)]
+
+    def service_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return every service that has a server or a client, sorted by name."""
+        services: dict[str, set[str]] = {}
+        for ends in [*self._services.values(), *self._clients.values()]:
+            for end in ends:
+                services.setdefault(end.service, set()).add(end.type_name)
+        return [(name, sorted(services[name])) for name in sorted(services)]
+
+
+def names_and_types(endpoints: list[tuple[str, str]]) -> list[tuple[str, list[str]]]:
+    """Group (name, type) pairs as rclpy's ``…_by_node`` queries return them."""
+    grouped: dict[str, set[str]] = {}
+    for name, type_name in endpoints:
+        grouped.setdefault(name, set()).add(type_name)
+    return [(name, sorted(grouped[name])) for name in sorted(grouped)]

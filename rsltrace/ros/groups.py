@@ -1,0 +1,33 @@
+"""Callback groups: rclpy's two own kinds are looked at directly, others through their methods.
+
+A plain callback runs to its end before the loop does anything else, so only a suspended coroutine
+ever keeps a mutually exclusive group busy.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+
+def is_busy(group: Any, wrapper: Any) -> bool:
+    """Return whether ``group`` forbids to run ``wrapper``'s callback now."""
+    try:
+        return group._active_entity is not None
+    except AttributeError:
+        return group is not None and not group.can_execute(wrapper)
+
+
+def begin(group: Any, wrapper: Any) -> None:
+    """Mark that a callback is under way that may be suspended."""
+    if group is not None:
+        group.beginning_execution(wrapper)
+
+
+def end(core: Core, group: Any, wrapper: Any) -> None:
+    """Mark its end, and let those run who waited."""
+    if group is not None:
+        group.ending_execution(wrapper)
+        core.group_freed(group)

@@ -1,0 +1,67 @@
+"""The handle of ``rclpy.GuardCondition``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.ros.entity_handle import EntityHandle
+from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+_GUARD = int(EventKind.GUARD_CONDITION)
+
+
+class GuardConditionHandle(EntityHandle):
+    """Stands in for ``_rclpy.GuardCondition``.
+
+    A trigger that comes before the last one was handled is merged with it. Executors make guard
+    conditions, too, to wake themselves; no node lists those and nothing comes of their triggers.
+    """
+
+    kind = EntityKind.GUARD_CONDITION
+    lists = "guards"
+
+    def __init__(self, core: Core) -> None:
+        super().__init__(core, None)
+        self._triggered = False
+        self._cause = (0, 0)
+
+    def trigger_guard_condition(self) -> None:
+        """Make the callback ready."""
+        if self._triggered:
+            return
+        self._triggered = True
+        core = self.core
+        if self.wrapper is not None:
+            self._cause = (core.loop.events, core.note(OutputKind.GUARD, self.entity_id))
+            core.loop.ready.append(self)
+
+    def activate(self) -> None:
+        if self._triggered:
+            self._cause = (self.core.loop.events, 0)
+            self.core.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Run the callback once for all triggers until now."""
+        wrapper = self.wrapper
+        if not self._triggered or wrapper is None or self._destroyed:
+            return
+        core = self.core
+        group = wrapper.callback_group
+        if is_busy(group, wrapper):
+            core.park(group, lambda: core.loop.ready.appendleft(self))
+            return
+        self._triggered = False
+        callback = wrapper.callback
+        if is_coroutine_function(callback):
+            begin(group, wrapper)
+            start_coroutine(core, self, _GUARD, callback, (), *self._cause, 0)
+        else:
+            core.execute(
+                self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0
+            )

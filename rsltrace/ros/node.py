@@ -1,0 +1,187 @@
+"""The handle of ``rclpy.Node``: names, arguments, parameters, graph counts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import NodeError
+from rsltrace.model.entity import EntityKind
+from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.ros.entity_handle import EntityHandle
+
+if TYPE_CHECKING:
+    from rsltrace.ros.boundary import Boundary
+    from rsltrace.ros.context import ContextHandle
+    from rsltrace.ros.core import Core
+    from rsltrace.ros.pubsub import PublisherHandle
+
+
+class NodeHandle(EntityHandle):
+    """Stands in for ``_rclpy.Node``.
+
+    ``wrapper`` is the ``rclpy.Node`` once an executor of this run has it; only then do its
+    callbacks run. The rules for names are those of ``rcl_node_init``.
+    """
+
+    kind = EntityKind.NODE
+
+    def __init__(
+        self,
+        boundary: Boundary,
+        core: Core,
+        node_name: str,
+        namespace: str,
+        context: ContextHandle,
+        cli_args: Sequence[str] | None,
+        use_global_arguments: bool,
+        enable_rosout: bool,
+    ) -> None:
+        real = boundary.real
+        if real.rclpy_get_validation_error_for_node_name(node_name) is not None:
+            raise ValueError(f"invalid node name: {node_name}")
+        if not namespace.startswith("/"):
+            namespace = "/" + namespace
+        if real.rclpy_get_validation_error_for_namespace(namespace) is not None:
+            raise ValueError(f"invalid node namespace: {namespace}")
+        try:
+            self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
+        except InvalidArgumentsError as error:
+            raise real.RCLInvalidROSArgsError(str(error)) from error
+        self.global_arguments = context.arguments if use_global_arguments else None
+        self.job_arguments = RosArguments(core.node_arguments) if use_global_arguments else None
+        self.boundary = boundary
+        self._context = context
+        name, namespace = self._renamed(node_name, namespace)
+        self.name = name
+        self.namespace = namespace
+        self.fully_qualified_name = (namespace if namespace.endswith("/") else namespace + "/") + name
+        if core.graph.node_named(self.fully_qualified_name) is not None:
+            raise _duplicate(core, self.fully_qualified_name)
+        super().__init__(core, None)
+        self.node = self
+        self.rosout: PublisherHandle | None = None
+        core.graph.nodes.append(self)
+        core.current_node = self
+        if enable_rosout:
+            core.logs.attach(self)
+
+    def _layers(self) -> list[tuple[RosArguments, RosArguments | None]]:
+        """Argument lists in rcl's precedence: the node's own, then the process's.
+
+        The job's arguments for this node are the process's arguments of ``ros2 run``.
+        """
+        if self.job_arguments is not None and self.job_arguments.arguments:
+            return [(self.arguments, self.job_arguments)]
+        return [(self.arguments, self.global_arguments)]
+
+    def _renamed(self, name: str, namespace: str) -> tuple[str, str]:
+        for arguments, outer in self._layers():
+            name = arguments.remap_node_name(name, outer)
+            namespace = arguments.remap_namespace(namespace, name, outer)
+        return name, namespace
+
+    def resolve(self, name: str, *, service: bool, only_expand: bool = False) -> str:
+        """Return a topic or service name fully qualified and remapped.
+
+        :raises RuntimeError: (rclpy's RCLError) if the name is not valid.
+        """
+        real = self.boundary.real
+        expanded: str = real.rclpy_expand_topic_name(name, self.name, self.namespace)
+        if not only_expand:
+            for arguments, outer in self._layers():
+                expanded = arguments.remap_topic(
+                    expanded, self.name, self.namespace, outer, service=service
+                )
+        if real.rclpy_get_validation_error_for_full_topic_name(expanded) is not None:
+            raise real.RCLError(f"topic name is invalid: {expanded}")
+        return expanded
+
+    # -- what rclpy calls ----------------------------------------------------------------------
+
+    def get_node_name(self) -> str:
+        """Return the node's name after remapping."""
+        return self.name
+
+    def get_namespace(self) -> str:
+        """Return the node's namespace after remapping."""
+        return self.namespace
+
+    def get_fully_qualified_name(self) -> str:
+        """Return namespace and name."""
+        return self.fully_qualified_name
+
+    def logger_name(self) -> str:
+        """Return the name rcl gives the node's logger: the FQN with dots."""
+        return self.fully_qualified_name.strip("/").replace("/", ".")
+
+    def get_parameters(self, parameter_class: Any) -> dict[str, Any]:
+        """Return the parameter overrides for this node as rclpy Parameters by name."""
+        values: dict[str, Any] = {}
+        outer: list[RosArguments | None] = [self.job_arguments, self.global_arguments]
+        if self.job_arguments is not None and self.job_arguments.arguments:
+            outer = [self.job_arguments]
+        for arguments in [*outer, self.arguments]:
+            if arguments is not None:
+                values.update(arguments.parameters(self.fully_qualified_name))
+        return {name: parameter_class(name, value=value) for name, value in values.items()}
+
+    def get_count_publishers(self, topic: str) -> int:
+        """Count the publishers of a fully qualified topic."""
+        return len(self.core.graph.publishers(topic))
+
+    def get_count_subscribers(self, topic: str) -> int:
+        """Count the subscriptions of a fully qualified topic."""
+        return len(self.core.graph.subscriptions(topic))
+
+    def get_count_clients(self, service: str) -> int:
+        """Count the clients of a fully qualified service."""
+        return len(self.core.graph.clients(service))
+
+    def get_count_services(self, service: str) -> int:
+        """Count the servers of a fully qualified service."""
+        return len(self.core.graph.services(service))
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Return every node of the graph, in creation order."""
+        return [(node.name, node.namespace) for node in self.core.graph.nodes]
+
+    def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
+        """Return every node of the graph with its enclave (always the root one)."""
+        return [(node.name, node.namespace, "/") for node in self.core.graph.nodes]
+
+    # -- the trace -----------------------------------------------------------------------------
+
+    def settle(self) -> bool:
+        return True
+
+    def trace_name(self) -> str:
+        return self.fully_qualified_name
+
+    def trace_type(self) -> str:
+        return "" if self.wrapper is None else class_name(type(self.wrapper))
+
+    def describe(self) -> str:
+        return self.fully_qualified_name
+
+    def _destroy(self) -> None:
+        self.core.graph.nodes.remove(self)
+        self.core.logs.detach(self)
+        if self.rosout is not None and not self.rosout._destroyed:
+            self.rosout.destroy_when_not_in_use()
+
+
+def class_name(cls: type) -> str:
+    """Return ``module:Class`` of a node's class."""
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _duplicate(core: Core, name: str) -> NodeError:
+    return NodeError(
+        f"there is already a node named {name}; give one of them another name or namespace "
+        "(name: or namespace: in the job)",
+        node=name,
+        entity=name,
+        stamp_ns=core.loop.now_ns,
+        traceback_text="",
+    )

@@ -1,0 +1,272 @@
+"""Publishers and subscriptions: a publication is serialized once and delivered in this process."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.ros.codec import codec_for
+from rsltrace.ros.entity_handle import EntityHandle, callback_name
+from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.interfaces import schema_text, type_hash
+from rsltrace.ros.qos import Durability, Qos
+from rsltrace.ros.qos_events import EndpointEvents
+from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
+from rsltrace.trace.chain import hash64
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+    from rsltrace.ros.node import NodeHandle
+
+_SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
+_MESSAGE = int(OutputKind.MESSAGE)
+
+# A message on its way: canonical CDR, index of the publishing event, which of its outputs,
+# content hash, publication stamp (ns), publication number, reception stamp (ns).
+Delivery = tuple[bytes, int, int, int, int, int, int]
+
+
+class PublisherHandle(EntityHandle):
+    """Stands in for ``_rclpy.Publisher``.
+
+    ``subscriptions`` are the connected ones in creation order.
+    """
+
+    kind = EntityKind.PUBLISHER
+    lists = "publishers"
+    output_kind = _MESSAGE
+
+    def __init__(self, core: Core, node: NodeHandle, msg_type: Any, topic: str, qos: Any) -> None:
+        self.topic = node.resolve(topic, service=False)
+        codec = codec_for(msg_type)
+        self.type_name = codec.type_name
+        self._msg_type = msg_type
+        self._serialize = codec.serialize
+        self._canonical = codec.canonical
+        peers = [s.qos for s in core.graph.subscriptions(self.topic)]
+        profile = qos if isinstance(qos, Qos) else Qos.from_rmw(qos)
+        self.qos = profile.resolved(publisher=True, peers=peers)
+        super().__init__(core, node)
+        self.subscriptions: list[SubscriptionHandle] = []
+        self.events = EndpointEvents(core, self)
+        self._count = 0
+        self._channel: int | None = None
+        self._watcher = core.watchers.get(self.topic)
+        self._history: deque[Delivery] | None = None
+        if self.qos.durability is Durability.TRANSIENT_LOCAL:
+            self._history = deque(maxlen=self.qos.keep)
+        core.graph.add_publisher(self)
+
+    def publish(self, msg: Any) -> None:
+        """Publish a message: a snapshot of it goes to every connected subscription."""
+        self.send(self._serialize(msg))
+
+    def publish_raw(self, data: bytes) -> None:
+        """Publish a serialized message, in canonical form.
+
+        :raises ValueError: if the bytes are not a message of this topic's type.
+        """
+        self.send(self._canonical(data))
+
+    def send(self, data: bytes, content_hash: int | None = None) -> None:
+        """Deliver canonical CDR bytes; ``content_hash`` if not all of them are content."""
+        core = self.core
+        loop = core.loop
+        now_ns = loop.now_ns
+        self._count += 1
+        recorder = core.recorder
+        if recorder is None:
+            digest = position = 0
+        else:
+            digest = hash64(data) if content_hash is None else content_hash
+            channel = self._channel
+            if channel is None:
+                channel = self._open_channel()
+            position = recorder.message(
+                self.output_kind, self.entity_id, channel, now_ns, data, digest
+            )
+        delivery = (data, loop.events, position, digest, now_ns, self._count, now_ns)
+        loop.activity_ns = now_ns
+        ready = loop.ready
+        for subscription in self.subscriptions:
+            subscription.queue.append(delivery)
+            if subscription.wrapper is not None:
+                ready.append(subscription)
+            else:
+                subscription.find_wrapper()
+        if self._history is not None:
+            self._history.append(delivery)
+        if self._watcher is not None:
+            self._watcher(self._msg_type, data)
+
+    def send_history(self, subscription: SubscriptionHandle) -> None:
+        """Give a late joiner what it asks for and this publisher kept."""
+        if self._history and subscription.qos.durability is Durability.TRANSIENT_LOCAL:
+            kept = list(self._history)
+            for delivery in kept[-subscription.qos.keep :] if subscription.qos.keep else kept:
+                subscription.deliver(delivery)
+
+    def _open_channel(self) -> int:
+        self._channel = self.core.channel(
+            self.topic,
+            self.type_name,
+            lambda: (schema_text(self._msg_type), type_hash(self._msg_type) or ""),
+            self.qos.to_yaml(),
+        )
+        return self._channel
+
+    def get_logger_name(self) -> str:
+        """Return the node's logger name."""
+        assert self.node is not None
+        return self.node.logger_name()
+
+    def get_topic_name(self) -> str:
+        """Return the resolved topic."""
+        return self.topic
+
+    def get_subscription_count(self) -> int:
+        """Count the connected subscriptions."""
+        return len(self.subscriptions)
+
+    def wait_for_all_acked(self, timeout: Any) -> bool:
+        """Return True: delivery within a process is acknowledged at once."""
+        return True
+
+    def settle(self) -> bool:
+        return True
+
+    def trace_name(self) -> str:
+        return self.topic
+
+    def trace_type(self) -> str:
+        return self.type_name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"qos": self.qos.summary()}
+
+    def _destroy(self) -> None:
+        self.core.graph.remove_publisher(self)
+
+
+class SubscriptionHandle(EntityHandle):
+    """Stands in for ``_rclpy.Subscription``.
+
+    One entry in the loop's ready queue stands for one delivery. A full queue drops its oldest
+    message; the entry that is left over then finds nothing to do.
+    """
+
+    kind = EntityKind.SUBSCRIPTION
+    lists = "subscriptions"
+
+    def __init__(self, core: Core, node: NodeHandle, msg_type: Any, topic: str, qos: Any) -> None:
+        self.topic = node.resolve(topic, service=False)
+        codec = codec_for(msg_type)
+        self.type_name = codec.type_name
+        self._msg_type = msg_type
+        self._deserialize = codec.deserialize
+        peers = [p.qos for p in core.graph.publishers(self.topic)]
+        self.qos = Qos.from_rmw(qos).resolved(publisher=False, peers=peers)
+        super().__init__(core, node)
+        self.queue: deque[Delivery] = deque(maxlen=self.qos.keep)
+        self.publishers: list[PublisherHandle] = []
+        self.events = EndpointEvents(core, self)
+        self._callback: Any = None
+        self._coroutine = False
+        self._with_info = False
+        core.graph.add_subscription(self)
+
+    def deliver(self, delivery: Delivery) -> None:
+        """Queue a message; it is dispatched once the node is being run."""
+        self.queue.append(delivery)
+        if self.wrapper is not None:
+            self.core.loop.ready.append(self)
+        else:
+            self.find_wrapper()
+
+    def activate(self) -> None:
+        self.core.loop.ready.extend([self] * len(self.queue))
+
+    def dispatch(self) -> None:
+        """Take the oldest message and run the callback with a copy of its own."""
+        queue = self.queue
+        if not queue:
+            return
+        wrapper = self.wrapper
+        if wrapper is None or self._destroyed:
+            return
+        group = wrapper.callback_group
+        if is_busy(group, wrapper):
+            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
+            return
+        data, event, position, digest, *_ = delivery = queue.popleft()
+        callback = wrapper._callback
+        if callback is not self._callback:
+            self._learn(wrapper)
+        message = data if wrapper.raw else self._deserialize(data)
+        args = (message, _message_info(delivery)) if self._with_info else (message,)
+        core = self.core
+        if self._coroutine:
+            begin(group, wrapper)
+            start_coroutine(core, self, _SUBSCRIPTION, callback, args, event, position, digest)
+            return
+        core.execute(
+            self, self.entity_id, self.node, _SUBSCRIPTION, callback, args, event, position, digest
+        )
+
+    def _learn(self, wrapper: Any) -> None:
+        """Look at a callback once, when it is new; users may exchange it."""
+        self._callback = wrapper._callback
+        self._coroutine = is_coroutine_function(wrapper._callback)
+        self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
+
+    def take_message(self, msg_type: Any, raw: bool) -> Any:
+        """Take a message by hand, as a wait set would; None if there is none."""
+        if not self.queue:
+            return None
+        delivery = self.queue.popleft()
+        data = delivery[0]
+        message = data if raw else codec_for(msg_type).deserialize(data)
+        return message, _message_info(delivery)
+
+    def get_logger_name(self) -> str:
+        """Return the node's logger name."""
+        assert self.node is not None
+        return self.node.logger_name()
+
+    def get_topic_name(self) -> str:
+        """Return the resolved topic."""
+        return self.topic
+
+    def get_publisher_count(self) -> int:
+        """Count the connected publishers."""
+        return len(self.publishers)
+
+    def settle(self) -> bool:
+        self.find_wrapper()
+        return True
+
+    def trace_name(self) -> str:
+        return self.topic
+
+    def trace_type(self) -> str:
+        return self.type_name
+
+    def trace_detail(self) -> dict[str, object]:
+        callback = callback_name(getattr(self.wrapper, "callback", None))
+        return {"callback": callback, "qos": self.qos.summary()}
+
+    def _destroy(self) -> None:
+        self.core.graph.remove_subscription(self)
+        self.queue.clear()
+
+
+def _message_info(delivery: Delivery) -> dict[str, int | None]:
+    """Return the MessageInfo dictionary that rclpy 7 passes to callbacks."""
+    return {
+        "source_timestamp": delivery[4],
+        "received_timestamp": delivery[6],
+        "publication_sequence_number": delivery[5],
+        "reception_sequence_number": None,
+    }

@@ -1,0 +1,203 @@
+"""QoS as this middleware uses it, and who connects to whom.
+
+The compatibility rules are DDS's "requested versus offered" ones, as documented in
+https://docs.ros.org/en/jazzy/Concepts/Intermediate/About-Quality-of-Service-Settings.html
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any
+
+
+class Reliability(IntEnum):
+    SYSTEM_DEFAULT = 0
+    RELIABLE = 1
+    BEST_EFFORT = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class Durability(IntEnum):
+    SYSTEM_DEFAULT = 0
+    TRANSIENT_LOCAL = 1
+    VOLATILE = 2
+    UNKNOWN = 3
+    BEST_AVAILABLE = 4
+
+
+class History(IntEnum):
+    SYSTEM_DEFAULT = 0
+    KEEP_LAST = 1
+    KEEP_ALL = 2
+    UNKNOWN = 3
+
+
+class Liveliness(IntEnum):
+    SYSTEM_DEFAULT = 0
+    AUTOMATIC = 1
+    MANUAL_BY_TOPIC = 3
+    UNKNOWN = 4
+    BEST_AVAILABLE = 5
+
+
+class PolicyKind(IntEnum):
+    """Numbers of ``rmw_qos_policy_kind_t``."""
+
+    INVALID = 1
+    DURABILITY = 2
+    DEADLINE = 4
+    LIVELINESS = 8
+    RELIABILITY = 16
+    LIVELINESS_LEASE_DURATION = 512
+
+
+INFINITE_NS = 2**63 - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Qos:
+    """A QoS profile; durations in nanoseconds, 0 or ``INFINITE_NS`` meaning no limit."""
+
+    history: History
+    depth: int
+    reliability: Reliability
+    durability: Durability
+    deadline_ns: int
+    lifespan_ns: int
+    liveliness: Liveliness
+    lease_ns: int
+    avoid_ros_namespace_conventions: bool = False
+
+    @classmethod
+    def from_rmw(cls, profile: Any) -> Qos:
+        """Read an ``rmw_qos_profile_t`` of rclpy."""
+        values = profile.to_dict()
+        return cls(
+            history=History(int(values["history"])),
+            depth=int(values["depth"]),
+            reliability=Reliability(int(values["reliability"])),
+            durability=Durability(int(values["durability"])),
+            deadline_ns=_limit(values["deadline"].nanoseconds),
+            lifespan_ns=_limit(values["lifespan"].nanoseconds),
+            liveliness=Liveliness(int(values["liveliness"])),
+            lease_ns=_limit(values["liveliness_lease_duration"].nanoseconds),
+            avoid_ros_namespace_conventions=bool(values["avoid_ros_namespace_conventions"]),
+        )
+
+    def resolved(self, *, publisher: bool, peers: list[Qos]) -> Qos:
+        """Replace system defaults and "best available" by what the middleware settles on.
+
+        System defaults are Fast DDS's: writers are reliable, readers best effort, both volatile,
+        keep last 1. "Best available" for a subscription is the strongest policy that every
+        present publisher offers; a publisher simply offers the strongest.
+        """
+        history, depth = self.history, self.depth
+        if history in (History.SYSTEM_DEFAULT, History.UNKNOWN):
+            history = History.KEEP_LAST
+        if history is History.KEEP_LAST and depth == 0:
+            depth = 1
+        reliability = self.reliability
+        if reliability in (Reliability.SYSTEM_DEFAULT, Reliability.UNKNOWN):
+            reliability = Reliability.RELIABLE if publisher else Reliability.BEST_EFFORT
+        elif reliability is Reliability.BEST_AVAILABLE:
+            strong = publisher or all(p.reliability is Reliability.RELIABLE for p in peers)
+            reliability = Reliability.RELIABLE if strong else Reliability.BEST_EFFORT
+        durability = self.durability
+        if durability in (Durability.SYSTEM_DEFAULT, Durability.UNKNOWN):
+            durability = Durability.VOLATILE
+        elif durability is Durability.BEST_AVAILABLE:
+            strong = publisher or all(p.durability is Durability.TRANSIENT_LOCAL for p in peers)
+            durability = Durability.TRANSIENT_LOCAL if strong else Durability.VOLATILE
+        liveliness = self.liveliness
+        if liveliness is not Liveliness.MANUAL_BY_TOPIC:
+            liveliness = Liveliness.AUTOMATIC
+        return replace(
+            self,
+            history=history,
+            depth=depth,
+            reliability=reliability,
+            durability=durability,
+            liveliness=liveliness,
+        )
+
+    @property
+    def keep(self) -> int | None:
+        """How many messages a queue holds; None: all."""
+        return None if self.history is History.KEEP_ALL else max(self.depth, 1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what ``TopicEndpointInfo`` takes for a QoS profile."""
+        from rclpy.duration import Duration
+
+        return {
+            "history": int(self.history),
+            "depth": self.depth,
+            "reliability": int(self.reliability),
+            "durability": int(self.durability),
+            "lifespan": Duration(nanoseconds=self.lifespan_ns or INFINITE_NS),
+            "deadline": Duration(nanoseconds=self.deadline_ns or INFINITE_NS),
+            "liveliness": int(self.liveliness),
+            "liveliness_lease_duration": Duration(nanoseconds=self.lease_ns or INFINITE_NS),
+            "avoid_ros_namespace_conventions": self.avoid_ros_namespace_conventions,
+        }
+
+    def to_yaml(self) -> str:
+        """Return the one-element YAML list that rosbag2 keeps as ``offered_qos_profiles``."""
+        lines = [
+            f"- history: {self.history.name.lower()}",
+            f"  depth: {self.depth}",
+            f"  reliability: {self.reliability.name.lower()}",
+            f"  durability: {self.durability.name.lower()}",
+            *_yaml_duration("deadline", self.deadline_ns),
+            *_yaml_duration("lifespan", self.lifespan_ns),
+            f"  liveliness: {self.liveliness.name.lower()}",
+            *_yaml_duration("liveliness_lease_duration", self.lease_ns),
+            "  avoid_ros_namespace_conventions: "
+            + ("true" if self.avoid_ros_namespace_conventions else "false"),
+        ]
+        return "\n".join(lines)
+
+    def summary(self) -> dict[str, object]:
+        """Return the few policies worth showing for an entity."""
+        return {
+            "history": self.history.name.lower(),
+            "depth": self.depth,
+            "reliability": self.reliability.name.lower(),
+            "durability": self.durability.name.lower(),
+        }
+
+
+def incompatible_policy(offered: Qos, requested: Qos) -> PolicyKind | None:
+    """Return the policy that keeps a publisher and a subscription apart, or None if they match."""
+    if (
+        offered.reliability is Reliability.BEST_EFFORT
+        and requested.reliability is Reliability.RELIABLE
+    ):
+        return PolicyKind.RELIABILITY
+    if (
+        offered.durability is Durability.VOLATILE
+        and requested.durability is Durability.TRANSIENT_LOCAL
+    ):
+        return PolicyKind.DURABILITY
+    if (offered.deadline_ns or INFINITE_NS) > (requested.deadline_ns or INFINITE_NS):
+        return PolicyKind.DEADLINE
+    if (
+        offered.liveliness is Liveliness.AUTOMATIC
+        and requested.liveliness is Liveliness.MANUAL_BY_TOPIC
+    ):
+        return PolicyKind.LIVELINESS
+    if (offered.lease_ns or INFINITE_NS) > (requested.lease_ns or INFINITE_NS):
+        return PolicyKind.LIVELINESS_LEASE_DURATION
+    return None
+
+
+def _limit(duration_ns: int) -> int:
+    return 0 if duration_ns >= INFINITE_NS else int(duration_ns)
+
+
+def _yaml_duration(key: str, duration_ns: int) -> list[str]:
+    # rosbag2 writes "infinite" as the largest pair that its duration type holds.
+    sec, nsec = divmod(duration_ns or INFINITE_NS, 1_000_000_000)
+    return [f"  {key}:", f"    sec: {sec}", f"    nsec: {nsec}"]

@@ -1,0 +1,48 @@
+"""Ending a run by a message: the job's ``stop: topic:``, RSLCPP's ``/rslcpp/error_code``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rsltrace.errors import JobError
+from rsltrace.loop.stop import Stop
+from rsltrace.ros.codec import codec_for
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+
+class _TopicStop(Protocol):
+    @property
+    def name(self) -> str: ...
+    @property
+    def exit_code(self) -> str | None: ...
+
+
+def watch_exit_code(core: Core, spec: _TopicStop) -> Callable[[Any, bytes], None]:
+    """Return a watcher that ends the run after the time step of the first message.
+
+    With ``spec.exit_code`` (a dotted field path) the message's field is the exit status.
+    """
+
+    def watch(msg_type: Any, data: bytes) -> None:
+        code = 0
+        if spec.exit_code is not None:
+            value: Any = codec_for(msg_type).deserialize(data)
+            for name in spec.exit_code.split("."):
+                if not hasattr(value, "get_fields_and_field_types") or not hasattr(value, name):
+                    raise JobError(
+                        f"stop.topic.exit_code: {spec.name} has no field {spec.exit_code!r} "
+                        f"(it is a {msg_type.__qualname__})"
+                    )
+                value = getattr(value, name)
+            if not isinstance(value, int):
+                raise JobError(
+                    f"stop.topic.exit_code: {spec.exit_code!r} of {spec.name} is "
+                    f"{value!r}, not an integer"
+                )
+            code = int(value)
+        core.loop.stop_after_step(Stop(f"message on {spec.name}", code))
+
+    return watch

@@ -1,0 +1,248 @@
+"""A simulated ROS world from its first node to its last: construction, the jump to the start, the
+run, and the destruction of the nodes."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+from rsltrace.errors import DeadlockError, JobError, RunError
+from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.stop import Stop
+from rsltrace.model.event import EventKind
+from rsltrace.ros.boundary import Boundary, installed
+from rsltrace.ros.core import Core
+from rsltrace.ros.graph import Graph
+from rsltrace.ros.logs import Logs
+from rsltrace.ros.tasks import poll
+from rsltrace.trace.recorder import Recorder
+
+
+class World:
+    """Nodes in a loop. Use as a context manager: within it, rclpy is simulated.
+
+    :param base_dir: the job's folder; source paths in logs are relative to it.
+    :param echo: print log records on stderr.
+    """
+
+    def __init__(
+        self, loop: EventLoop, recorder: Recorder | None, *, base_dir: Path, echo: bool = True
+    ) -> None:
+        self.core = Core(loop, recorder, base_dir=base_dir)
+        self.core.graph = Graph()
+        self.core.logs = Logs(self.core, echo=echo)
+        loop.idle.append(lambda: poll(self.core))
+        self._boundary: Boundary
+        self._stack = ExitStack()
+        self.nodes: list[Any] = []
+
+    def __enter__(self) -> World:
+        with ExitStack() as stack:
+            self._boundary = stack.enter_context(installed())
+            stack.enter_context(_fresh_rclpy(self._boundary))
+            self._boundary.enter(self.core)
+            stack.callback(self._boundary.leave)
+            import rclpy
+
+            from rsltrace.ros.executor import SimExecutor
+
+            rclpy.init(args=[])
+            self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
+            stack.callback(self._close)
+            self.core.pending.clear()  # the executor's own guard conditions are no entities
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stack.close()
+
+    def _close(self) -> None:
+        import rclpy
+
+        self.core.main_context = None  # from here on a shutdown is ours
+        self.core.executor.shutdown()
+        rclpy.try_shutdown()
+
+    # -- the stages of a run ---------------------------------------------------------------------
+
+    def construct(self, name: str, make: Callable[[], Any], arguments: list[str]) -> bool:
+        """Construct one entry of the job as one event; return False if that ended the run.
+
+        ``make`` returns a node or a list of nodes; ``arguments`` are its ``--ros-args``.
+        """
+        core = self.core
+
+        def build() -> None:
+            made = make()
+            for node in made if isinstance(made, (list, tuple)) else [made]:
+                self._adopt(node, name)
+
+        core.node_arguments = arguments
+        core.run_outside(lambda: f"constructing {name}", EventKind.CONSTRUCT, 0, None, build)
+        core.node_arguments = []
+        return core.loop.stopped is None
+
+    def _adopt(self, node: Any, name: str) -> None:
+        from rclpy.node import Node
+
+        if not isinstance(node, Node):
+            raise JobError(
+                f"{name} gave a {type(node).__qualname__}, not an rclpy Node: name a Node subclass "
+                "or a function that returns a node (or a list of nodes)"
+            )
+        self.nodes.append(node)
+        self.core.executor.add_node(node)
+
+    def keep(self, node: Any) -> None:
+        """Destroy ``node`` with the others at the end, although it is not run."""
+        self.nodes.append(node)
+
+    def jump(self, time_ns: int) -> None:
+        """Move from construct time to the start of the run, telling clocks of the jump."""
+        delta_ns = time_ns - self.core.loop.now_ns
+        self.core.loop.jump(time_ns)
+        if delta_ns:
+            self.core.run_outside(
+                lambda: "the jump to the start",
+                EventKind.CLOCK_JUMP,
+                0,
+                None,
+                lambda: self._boundary.jump_clocks(delta_ns),
+            )
+
+    def run(self) -> Stop:
+        """Run the loop to its end; a quiet end with somebody still waiting is a deadlock."""
+        core = self.core
+        stop = core.loop.run()
+        waiting = list(core.suspended)
+        if stop.reason == "nothing left to do" and waiting and core.error is None:
+            lines = "\n".join(f"  {run.waits_for()}" for run in waiting[:20])
+            core.error = DeadlockError(f"nothing can happen any more, but somebody waits:\n{lines}")
+        return stop
+
+    def destroy(self) -> None:
+        """Destroy the nodes in creation order, each as one event."""
+        core = self.core
+        for node in self.nodes:
+            handle = node.handle
+            if handle._destroyed or core.error is not None:
+                continue
+            core.run_outside(
+                handle.describe, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node
+            )
+
+    @property
+    def error(self) -> RunError | None:
+        """What went wrong, if anything did."""
+        return self.core.error
+
+
+@contextmanager
+def _fresh_rclpy(boundary: Boundary) -> Iterator[None]:
+    """Give rclpy's module globals their first values for a run, and their old ones afterwards."""
+    import rclpy
+    import rclpy.context
+    import rclpy.utilities
+
+    saved = [
+        (rclpy.utilities, "g_default_context", None),
+        (rclpy.context, "g_logging_ref_count", 0),
+        (rclpy, "__executor", None),
+    ]
+    saved = [(m, n, v, getattr(m, n, None)) for m, n, v in saved]  # type: ignore[misc]
+    for module, name, first, _ in saved:  # type: ignore[misc]
+        setattr(module, name, first)
+    boundary.ros_clocks.clear()
+    boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
+    boundary.real.rclpy_logging_initialize()
+    try:
+        yield
+    finally:
+        for module, name, _, old in saved:  # type: ignore[misc]
+            setattr(module, name, old)
+
+
+def load_target(target: str, *, where: str) -> Any:
+    """Import ``module:attribute``.
+
+    :raises JobError: if there is no such module or attribute, or it cannot be called.
+    """
+    module_name, _, attribute = target.partition(":")
+    try:
+        value: Any = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        if error.name is not None and (module_name + ".").startswith(error.name + "."):
+            raise JobError(
+                f"there is no module {module_name!r} (looked in search_path and in Python's own "
+                "path); check the name, or add its folder to search_path",
+                where=where,
+            ) from error
+        raise JobError(
+            f"module {module_name!r} cannot be imported: it needs {error.name!r}", where=where
+        ) from error
+    for part in attribute.split("."):
+        try:
+            value = getattr(value, part)
+        except AttributeError as error:
+            near = [name for name in dir(value) if not name.startswith("_")]
+            import difflib
+
+            guess = difflib.get_close_matches(part, near, n=1)
+            hint = f"; did you mean {guess[0]!r}?" if guess else ""
+            raise JobError(
+                f"module {module_name!r} has no {attribute!r}{hint}", where=where
+            ) from error
+    if not callable(value):
+        raise JobError(f"{target} is a {type(value).__qualname__}, not callable", where=where)
+    return value
+
+
+def ros_arguments(
+    *,
+    name: str | None,
+    namespace: str | None,
+    parameters: dict[str, Any],
+    parameter_files: Sequence[Path],
+    remappings: dict[str, str],
+) -> list[str]:
+    """Return what ``ros2 run`` would be given for a node of a job; empty if nothing is set."""
+    arguments: list[str] = []
+    if name is not None:
+        arguments += ["-r", f"__node:={name}"]
+    if namespace is not None:
+        arguments += ["-r", f"__ns:={namespace}"]
+    for old, new in remappings.items():
+        arguments += ["-r", f"{old}:={new}"]
+    for path in parameter_files:
+        arguments += ["--params-file", str(path)]
+    for key, value in parameters.items():
+        arguments += ["-p", f"{key}:={_yaml_value(value)}"]
+    return ["--ros-args", *arguments] if arguments else []
+
+
+def _yaml_value(value: Any) -> str:
+    """Write a parameter so that rcl's YAML parser reads the same value and type again."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(int(value))
+    if isinstance(value, float):
+        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(repr(float(value)), _float(value))
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+        return '"' + escaped.replace("\t", "\\t").replace("\r", "\\r") + '"'
+    return "[" + ", ".join(_yaml_value(item) for item in value) + "]"
+
+
+def _float(value: float) -> str:
+    text = repr(float(value))
+    mantissa, _, exponent = text.partition("e")
+    if "." not in mantissa:
+        mantissa += ".0"
+    return mantissa + (f"e{exponent}" if exponent else "")
+
+
+__all__ = ["World", "load_target", "ros_arguments"]

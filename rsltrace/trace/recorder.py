@@ -1,0 +1,108 @@
+"""Turn what happens in a run into the records of a trace: hashes, numbers, links.
+
+This is the part of recording that runs on every callback; it does no more than pack and hash. The
+writer decides what becomes of the bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.format import EVENT_REST, OUTPUT
+from rsltrace.trace.writer import TraceWriter
+
+_pack_event = EVENT_REST.pack
+_pack_output = OUTPUT.pack
+
+
+class Recorder:
+    """The event under way, and the hash chain so far.
+
+    ``outputs`` and ``output_hash`` belong to the event under way; ``end_event`` closes it.
+    """
+
+    def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
+        self.writer = writer
+        self.keep_payload = keep_payload
+        self.index = 0
+        self.chain_hash = 0
+        self.outputs = 0
+        self.output_hash = 0
+        self._add_event = writer.add_event
+        self._add_output = writer.add_output
+        self._add_payload = writer.add_payload
+
+    @property
+    def digest(self) -> str:
+        """The run so far as 16 hex digits: the chain hash of the last event."""
+        return f"{self.chain_hash:016x}"
+
+    def output(self, kind: int, entity: int, content_hash: int, sequence: int = NO_SEQUENCE) -> int:
+        """Add an output to the event under way; return which of its outputs it is."""
+        packed = _pack_output(self.index, content_hash, entity, kind, sequence)
+        self.output_hash = hash64(packed[8:24], self.output_hash)
+        self._add_output(packed)
+        position = self.outputs
+        self.outputs = position + 1
+        return position
+
+    def message(
+        self, kind: int, entity: int, channel: int, stamp_ns: int, data: bytes, content_hash: int
+    ) -> int:
+        """Add an output whose payload goes to ``channel`` (negative: hash only)."""
+        if channel >= 0:
+            sequence = self._add_payload(channel, stamp_ns, data)
+        else:
+            sequence = NO_SEQUENCE
+        packed = _pack_output(self.index, content_hash, entity, kind, sequence)
+        self.output_hash = hash64(packed[8:24], self.output_hash)
+        self._add_output(packed)
+        position = self.outputs
+        self.outputs = position + 1
+        return position
+
+    def detail(
+        self, kind: OutputKind, entity: int, stamp_ns: int, text: str, content_hash: int
+    ) -> int:
+        """Add an output that is described by a text (which itself is not hashed)."""
+        sequence = self.writer.add_detail(self.index, self.outputs, stamp_ns, text)
+        return self.output(kind, entity, content_hash, sequence)
+
+    def entity(self, entity: Entity) -> None:
+        """Write down an entity. Its content is part of the event that created it."""
+        self.writer.add_entity(entity)
+        identity = f"{entity.node}\0{int(entity.kind)}\0{entity.name}\0{entity.type}"
+        self.output(OutputKind.ENTITY, entity.id, hash64(identity.encode()))
+
+    def end_event(
+        self,
+        stamp_ns: int,
+        kind: int,
+        flags: int,
+        entity: int,
+        cause_event: int,
+        cause_output: int,
+        input_hash: int,
+    ) -> None:
+        """Close the event under way and move the hash chain on."""
+        rest = _pack_event(
+            self.index,
+            stamp_ns,
+            cause_event,
+            input_hash,
+            self.output_hash,
+            0,
+            entity,
+            cause_output,
+            self.outputs,
+            kind,
+            flags,
+        )
+        self.chain_hash = chain_hash = hash64(rest, self.chain_hash)
+        self._add_event(rest, chain_hash)
+        self.index += 1
+        self.outputs = 0
+        self.output_hash = 0
