@@ -168,7 +168,9 @@ def _run_world(world: World, job: Job, bags: list[Bag], start_ns: int) -> Stop:
         core.watch(job.stop.topic.name, watch_exit_code(core, job.stop.topic))
     try:
         for index, spec in enumerate(job.nodes):
-            if not world.construct(*_construction(job, index, spec)):
+            where = f"{job.source_name}: nodes[{index}]"
+            name, make, arguments = _construction(job, spec, where)
+            if not world.construct(name, make, arguments, where=where):
                 break
         if loop.stopped is None:
             _start_players(world, job, bags)
@@ -188,11 +190,10 @@ def _run_world(world: World, job: Job, bags: list[Bag], start_ns: int) -> Stop:
 
 
 def _construction(
-    job: Job, index: int, spec: NodeSpec
-) -> tuple[str, Callable[[], Any], list[str]]:
+    job: Job, spec: NodeSpec, where: str
+) -> tuple[str, Callable[[], Any], list[list[str]]]:
     from rsltrace.ros.world import load_target, ros_arguments
 
-    where = f"{job.source_name}: nodes[{index}].node"
     make = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
     arguments = ros_arguments(
         name=spec.name,

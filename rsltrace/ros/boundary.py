@@ -185,7 +185,10 @@ class Boundary:
     def rclpy_resolve_name(
         self, node: NodeHandle, name: str, only_expand: bool, is_service: bool
     ) -> str:
-        return node.resolve(name, service=is_service, only_expand=only_expand)
+        try:
+            return node.resolve(name, service=is_service, only_expand=only_expand)
+        except ValueError as error:
+            raise self.real.RCLError(str(error)) from error
 
     def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
         return node.resolve(topic, service=False)

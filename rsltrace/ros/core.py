@@ -22,6 +22,7 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
 if TYPE_CHECKING:
+    from rsltrace.ros.arguments import RosArguments
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.entity_handle import EntityHandle
     from rsltrace.ros.executor import SimExecutor
@@ -54,7 +55,7 @@ class Core:
         self.error: RunError | None = None
         self.logs: Logs
         self.main_context: ContextHandle | None = None
-        self.node_arguments: list[str] = []
+        self.node_arguments: list[RosArguments] = []
         self.suspended: dict[TaskRun, None] = {}
         self.polled: list[TaskRun] = []
         self.polls = 0
@@ -176,6 +177,12 @@ class Core:
             return "something that is not an rclpy Future"
         for client in self.graph.all_clients():
             if client.wrapper is not None and future in client.wrapper._pending_requests.values():
+                if client.queue:
+                    return (
+                        f"the response of {client.service}, which has arrived, but its client "
+                        "shares a mutually exclusive callback group with this callback, which "
+                        "keeps the group busy; give the client a callback group of its own"
+                    )
                 servers = len(self.graph.services(client.service))
                 return f"the response of {client.service} ({servers} servers)"
         return "a Future that nobody completes"

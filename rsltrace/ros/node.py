@@ -48,8 +48,8 @@ class NodeHandle(EntityHandle):
             self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
         except InvalidArgumentsError as error:
             raise real.RCLInvalidROSArgsError(str(error)) from error
-        self.global_arguments = context.arguments if use_global_arguments else None
-        self.job_arguments = RosArguments(core.node_arguments) if use_global_arguments else None
+        # The job's arguments for this node are the process's arguments of ``ros2 run``.
+        self._outer = [context.arguments, *core.node_arguments] if use_global_arguments else []
         self.boundary = boundary
         self._context = context
         name, namespace = self._renamed(node_name, namespace)
@@ -66,35 +66,28 @@ class NodeHandle(EntityHandle):
         if enable_rosout:
             core.logs.attach(self)
 
-    def _layers(self) -> list[tuple[RosArguments, RosArguments | None]]:
-        """Argument lists in rcl's precedence: the node's own, then the process's.
-
-        The job's arguments for this node are the process's arguments of ``ros2 run``.
-        """
-        if self.job_arguments is not None and self.job_arguments.arguments:
-            return [(self.arguments, self.job_arguments)]
-        return [(self.arguments, self.global_arguments)]
-
     def _renamed(self, name: str, namespace: str) -> tuple[str, str]:
-        for arguments, outer in self._layers():
-            name = arguments.remap_node_name(name, outer)
-            namespace = arguments.remap_namespace(namespace, name, outer)
-        return name, namespace
+        outer = self._outer_names()
+        name = self.arguments.remap_node_name(name, outer)
+        return name, self.arguments.remap_namespace(namespace, name, outer)
+
+    def _outer_names(self) -> RosArguments | None:
+        """Return the process-wide arguments that rename things: the job's, or the context's."""
+        return self._outer[min(1, len(self._outer) - 1)] if self._outer else None
 
     def resolve(self, name: str, *, service: bool, only_expand: bool = False) -> str:
         """Return a topic or service name fully qualified and remapped.
 
-        :raises RuntimeError: (rclpy's RCLError) if the name is not valid.
+        :raises ValueError: if the name is not valid.
         """
         real = self.boundary.real
         expanded: str = real.rclpy_expand_topic_name(name, self.name, self.namespace)
         if not only_expand:
-            for arguments, outer in self._layers():
-                expanded = arguments.remap_topic(
-                    expanded, self.name, self.namespace, outer, service=service
-                )
+            expanded = self.arguments.remap_topic(
+                expanded, self.name, self.namespace, self._outer_names(), service=service
+            )
         if real.rclpy_get_validation_error_for_full_topic_name(expanded) is not None:
-            raise real.RCLError(f"topic name is invalid: {expanded}")
+            raise ValueError(f"topic name is invalid: {expanded}")
         return expanded
 
     # -- what rclpy calls ----------------------------------------------------------------------
@@ -118,12 +111,8 @@ class NodeHandle(EntityHandle):
     def get_parameters(self, parameter_class: Any) -> dict[str, Any]:
         """Return the parameter overrides for this node as rclpy Parameters by name."""
         values: dict[str, Any] = {}
-        outer: list[RosArguments | None] = [self.job_arguments, self.global_arguments]
-        if self.job_arguments is not None and self.job_arguments.arguments:
-            outer = [self.job_arguments]
-        for arguments in [*outer, self.arguments]:
-            if arguments is not None:
-                values.update(arguments.parameters(self.fully_qualified_name))
+        for arguments in [*self._outer, self.arguments]:
+            values.update(arguments.parameters(self.fully_qualified_name))
         return {name: parameter_class(name, value=value) for name, value in values.items()}
 
     def get_count_publishers(self, topic: str) -> int:

@@ -13,6 +13,7 @@ from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import EventKind
+from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.boundary import Boundary, installed
 from rsltrace.ros.core import Core
 from rsltrace.ros.graph import Graph
@@ -68,10 +69,15 @@ class World:
 
     # -- the stages of a run ---------------------------------------------------------------------
 
-    def construct(self, name: str, make: Callable[[], Any], arguments: list[str]) -> bool:
+    def construct(
+        self, name: str, make: Callable[[], Any], arguments: list[list[str]], *, where: str
+    ) -> bool:
         """Construct one entry of the job as one event; return False if that ended the run.
 
-        ``make`` returns a node or a list of nodes; ``arguments`` are its ``--ros-args``.
+        ``make`` returns a node or a list of nodes; ``arguments`` are its ``--ros-args``, in lists
+        of which later ones have the last word on parameters.
+
+        :raises JobError: if rcl refuses the arguments (a broken parameter file).
         """
         core = self.core
 
@@ -80,7 +86,10 @@ class World:
             for node in made if isinstance(made, (list, tuple)) else [made]:
                 self._adopt(node, name)
 
-        core.node_arguments = arguments
+        try:
+            core.node_arguments = [RosArguments(part) for part in arguments]
+        except InvalidArgumentsError as error:
+            raise JobError(str(error), where=where) from error
         core.run_outside(lambda: f"constructing {name}", EventKind.CONSTRUCT, 0, None, build)
         core.node_arguments = []
         return core.loop.stopped is None
@@ -207,8 +216,12 @@ def ros_arguments(
     parameters: dict[str, Any],
     parameter_files: Sequence[Path],
     remappings: dict[str, str],
-) -> list[str]:
-    """Return what ``ros2 run`` would be given for a node of a job; empty if nothing is set."""
+) -> list[list[str]]:
+    """Return what ``ros2 run`` would be given for a node of a job, as two argument lists.
+
+    The job's own parameters are a list of their own: rcl would let a file's entry for one node
+    win over a parameter given for all.
+    """
     arguments: list[str] = []
     if name is not None:
         arguments += ["-r", f"__node:={name}"]
@@ -218,9 +231,10 @@ def ros_arguments(
         arguments += ["-r", f"{old}:={new}"]
     for path in parameter_files:
         arguments += ["--params-file", str(path)]
+    own: list[str] = []
     for key, value in parameters.items():
-        arguments += ["-p", f"{key}:={_yaml_value(value)}"]
-    return ["--ros-args", *arguments] if arguments else []
+        own += ["-p", f"{key}:={_yaml_value(value)}"]
+    return [["--ros-args", *arguments], ["--ros-args", *own]]
 
 
 def _yaml_value(value: Any) -> str:

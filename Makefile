@@ -1,0 +1,50 @@
+# Two commands do everything on a fresh machine, set-up included:
+#   make demo   record the sample job twice and compare
+#   make test   lint, types, architecture and tests
+# Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+OUT ?= out
+
+.PHONY: demo test lint types architecture unit setup bench clean
+
+setup: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 10) <= sys.version_info < (3, 14))' \
+		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
+	@echo "setting up $(VENV) (once, about a minute)"
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,dev]'
+	@touch $@
+
+demo: $(INSTALLED)
+	@mkdir -p $(OUT)
+	$(BIN)/rsltrace record examples/rslcpp_determinism/job.yaml -o $(OUT)/run1.mcap --force --quiet
+	$(BIN)/rsltrace record examples/rslcpp_determinism/job.yaml -o $(OUT)/run2.mcap --force --quiet
+	@cmp $(OUT)/run1.mcap $(OUT)/run2.mcap && echo "the two runs are identical, byte for byte"
+	$(BIN)/rsltrace info $(OUT)/run1.mcap
+
+test: lint types architecture unit
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)
+	$(BIN)/mypy
+
+architecture: $(INSTALLED)
+	$(BIN)/lint-imports
+
+unit: $(INSTALLED)
+	$(BIN)/python -m pytest -n auto
+
+bench: $(INSTALLED)
+	$(BIN)/python benchmarks/throughput.py
+
+clean:
+	rm -rf $(VENV) $(OUT)
