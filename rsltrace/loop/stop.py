@@ -6,6 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+from rsltrace.errors import RunError
+
 
 @dataclass(frozen=True, slots=True)
 class Stop:
@@ -72,16 +74,23 @@ def stop_when(function: Callable[[Progress], object], name: str) -> StopConditio
     """Stop when a user's function says so.
 
     ``True`` stops with exit status 0, an integer other than a bool stops with that exit status,
-    anything false (``None``, ``False``) goes on; so the integer 0 stops with status 0, too.
+    ``None`` and ``False`` go on; so the integer 0 stops with status 0, too.
+
+    :raises RunError: if the function raises, or returns anything else.
     """
 
     def condition(progress: Progress) -> Stop | None:
-        answer = function(progress)
+        try:
+            answer = function(progress)
+        except Exception as error:
+            raise RunError(
+                f"the stop function {name} raised {type(error).__qualname__}: {error}"
+            ) from error
         if answer is None or answer is False:
             return None
         code = 0 if answer is True else answer
         if not isinstance(code, int):
-            raise TypeError(
+            raise RunError(
                 f"the stop function {name} returned {answer!r}; "
                 "expected None, a bool or an integer exit status"
             )

@@ -173,7 +173,8 @@ class RosArguments:
             return fallback
         text: bytes = self._rcl.rcutils_get_error_string().text
         self._rcl.rcutils_reset_error()
-        return text.decode(errors="replace")
+        # rcl appends where in its own sources the error was raised.
+        return re.sub(r", at \S+:\d+", "", text.decode(errors="replace"))
 
     def parameters(self, node_fqn: str) -> dict[str, Any]:
         """Return the parameter overrides for a node, later ones over earlier ones.

@@ -9,8 +9,7 @@ are also several times as fast, which matters because a simulation does little e
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 from rsltrace.ros.codec_layout import HEADER_PART, HEADER_PLACE, fixed_parts, lay_out
@@ -20,25 +19,42 @@ from rsltrace.ros.codec_spec import HEADER_VALUE, Message, message_spec
 from rsltrace.ros.codec_write import make_serializer
 
 
-@dataclass(frozen=True, slots=True)
 class Codec:
-    """How messages of one class are written and read.
+    """How messages of one class are written and read. ``type_name`` is ``std_msgs/msg/UInt64``.
 
-    ``serialize(message)`` returns CDR bytes with their 4-byte header. It raises TypeError or
-    ValueError naming the field when one holds what rclpy cannot serialize either.
-
-    ``deserialize(raw)`` returns a new message that shares no memory with ``raw`` (bytes; any
-    bytes-like object works). It raises ValueError naming the type and the offset when ``raw`` is
-    not a whole message of this type in plain CDR, of either byte order.
-
-    ``canonical(raw)`` returns ``serialize(deserialize(raw))``: the same message, little-endian,
-    with zeros for padding. It raises what those do.
+    Each function is generated when it is first asked for (most nodes never use most of their
+    parameter services); whoever calls one often should keep it.
     """
 
-    type_name: str
-    serialize: Callable[[Any], bytes]
-    deserialize: Callable[[bytes], Any]
-    canonical: Callable[[bytes], bytes]
+    def __init__(self, spec: Message) -> None:
+        self._spec = spec
+        self.type_name: str = spec.type_name
+
+    @cached_property
+    def serialize(self) -> Callable[[Any], bytes]:
+        """From a message to its canonical CDR bytes, 4-byte header included.
+
+        It raises TypeError or ValueError naming the field when one holds what rclpy cannot
+        serialize either.
+        """
+        return make_serializer(self._spec)
+
+    @cached_property
+    def deserialize(self) -> Callable[[bytes], Any]:
+        """From CDR bytes (or any bytes-like object) to a new message that shares no memory with it.
+
+        It raises ValueError naming the type and the offset when the bytes are not a whole message
+        of this type in plain CDR, of either byte order. As in rclpy, what is not UTF-8 in strings
+        is replaced, and the bounds of bounded types are not checked.
+        """
+        return make_deserializer(self._spec)
+
+    @cached_property
+    def canonical(self) -> Callable[[bytes], bytes]:
+        """From CDR bytes to those of ``serialize(deserialize(raw))``: the same message,
+        little-endian, with zeros for padding. It raises what those do.
+        """
+        return _make_canonical(self._spec, self)
 
 
 @cache
@@ -48,22 +64,12 @@ def codec_for(message_class: type) -> Codec:
     Raises TypeError if rosidl did not generate the class or it holds a type that rclpy cannot
     convert, and SetupError if the package of a nested message is missing.
     """
-    spec = message_spec(message_class)
-    serialize = make_serializer(spec)
-    deserialize = make_deserializer(spec)
-    return Codec(
-        type_name=spec.type_name,
-        serialize=serialize,
-        deserialize=deserialize,
-        canonical=_make_canonical(spec, serialize, deserialize),
-    )
+    return Codec(message_spec(message_class))
 
 
-def _make_canonical(
-    spec: Message, serialize: Callable[[Any], bytes], deserialize: Callable[[bytes], Any]
-) -> Callable[[bytes], bytes]:
+def _make_canonical(spec: Message, codec: Codec) -> Callable[[bytes], bytes]:
     def by_message(raw: bytes) -> bytes:
-        return serialize(deserialize(raw))
+        return codec.serialize(codec.deserialize(raw))
 
     parts = fixed_parts(spec)
     if parts is None or any(part.code == "c" for part in parts):
