@@ -255,7 +255,12 @@ def test_no_thread_socket_or_participant_is_started(rsltrace: Any, job_file: Any
     code = """
 import os
 import rclpy
-AT_IMPORT = len(os.listdir('/proc/self/task'))
+
+def sockets():
+    files = [f'/proc/self/fd/{n}' for n in os.listdir('/proc/self/fd')]
+    return {os.readlink(f) for f in files if os.path.lexists(f) and 'socket' in os.readlink(f)}
+
+THREADS, SOCKETS = len(os.listdir('/proc/self/task')), sockets()
 
 class Look(Node):
     def __init__(self):
@@ -263,10 +268,8 @@ class Look(Node):
         self.create_timer(1.0, self.tick)
 
     def tick(self):
-        files = [f'/proc/self/fd/{n}' for n in os.listdir('/proc/self/fd')]
-        sockets = [f for f in files if os.path.lexists(f) and 'socket' in os.readlink(f)]
-        threads = len(os.listdir('/proc/self/task')) - AT_IMPORT
-        self.get_logger().info(f'SOCKETS {len(sockets)} THREADS {threads}')
+        threads = len(os.listdir('/proc/self/task')) - THREADS
+        self.get_logger().info(f'SOCKETS {len(sockets() - SOCKETS)} THREADS {threads}')
 """
     job_file("nodes: [{node: nodes_under_test:Look}]\nstop: {duration: 1s}\n", code)
     done = rsltrace("record", "job.yaml")
