@@ -9,7 +9,7 @@ from __future__ import annotations
 import array
 import struct
 import sys
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -41,9 +41,9 @@ _OTHER_ENCODINGS = {
 def decode(spec: Message, raw: bytes) -> Any:
     """Return the message that CDR bytes hold, with the Python types that rclpy gives.
 
-    Up to three bytes after the end are taken as padding to a multiple of 4. A type of bounded size
-    may be followed by as many bytes as its largest message would take, since that many are what
-    rclpy's ``serialize_message`` returns for it.
+    Up to three bytes after the end are taken as padding to a multiple of 4. More are read over only
+    where rclpy's ``serialize_message`` returns more, and bags written from Python hold them: it
+    allots some messages more bytes than it then writes.
 
     Raises ValueError naming the type and the offset (in bytes from the start of ``raw``) for
     another encoding than plain CDR, truncated or over-long bytes, and wstrings that are not UTF-16.
@@ -61,6 +61,7 @@ class _Decoder:
         self.spec = spec
         self.raw = raw
         self.position = 0
+        self.allotted = 0  # where rclpy's estimate of the size has got to; never less
         self.end = len(raw) - len(HEADER)
         if self.end < 0:
             raise self.wrong(f"{len(raw)} bytes are too short for a CDR message; is it empty?")
@@ -71,15 +72,14 @@ class _Decoder:
                 f"encapsulation 0x{raw[0]:02x}{kind:02x}{f' ({name})' if name else ''} "
                 "is not supported; only plain CDR (0x0000 or 0x0001) is"
             )
-        self.order = "<" if kind else ">"
+        self.order: Literal["<", ">"] = "<" if kind else ">"
 
     def finish(self) -> None:
         """Raise ValueError if more follows the message than may."""
-        if self.end == self.position:
+        if self.end in (self.position, self.allotted):
             return
-        limit: int | None = self.position
-        if self.end > self.position + 3:
-            limit = greatest_end(self.spec, 0)
+        # rmw allots every message of a bounded type what the greatest one takes.
+        limit = greatest_end(self.spec, 0) if self.end > self.position + 3 else self.position
         if limit is None or self.end > limit + 3 & -4 or self.end % 4:
             raise self.wrong(
                 f"the message ends at offset {self.position + 4}, but there are "
@@ -87,7 +87,7 @@ class _Decoder:
             )
 
     def message(self, spec: Message, path: str) -> Any:
-        message = object.__new__(spec.cls)
+        message: Any = object.__new__(spec.cls)
         if spec.check_fields is not None:
             setattr(message, CHECK_SLOT, spec.check_fields)
         if not spec.fields:
@@ -113,6 +113,7 @@ class _Decoder:
 
     def align(self, size: int) -> None:
         self.position += -self.position % size
+        self.allotted += -self.allotted % size
 
     def take(self, size: int, path: str) -> bytes:
         left = self.end - self.position
@@ -123,6 +124,7 @@ class _Decoder:
             )
         start = self.position + len(HEADER)
         self.position += size
+        self.allotted += size
         return self.raw[start : start + size]
 
     def count(self, path: str) -> int:
@@ -144,6 +146,7 @@ class _Decoder:
             # As rclpy: up to the first NUL, and what is not UTF-8 is replaced.
             return self.take(number, path).split(b"\0", 1)[0].decode("utf-8", "replace")
         start = self.position + len(HEADER)
+        self.allotted += 4  # for a terminator that wstrings do not have
         try:
             return unpack_wide(self.take(4 * number, path), self.order)
         except (UnicodeDecodeError, OverflowError) as error:
@@ -165,6 +168,8 @@ class _Decoder:
         item = type_.item
         if number and isinstance(item, Primitive):
             self.align(item.size)
+        elif isinstance(item, Primitive):
+            self.allotted += -self.allotted % item.size  # an empty sequence is not, in fact, aligned
         self.plausible(item, number, start, path)
         if isinstance(item, Primitive) and item.typecode:
             values = array.array(item.typecode, self.take(number * item.size, path))

@@ -114,7 +114,7 @@ class Core:
         created, self.pending = self.pending, []
         for handle in [*waiting, *created]:
             if handle.settle():
-                if self.recorder is not None:
+                if self.recorder is not None and handle.announced:
                     self.recorder.entity(handle.entity())
             else:
                 self.unowned.append(handle)

@@ -23,6 +23,8 @@ class EntityHandle(Destroyable):
     kind: EntityKind
     lists: str
     """Name of the rclpy Node attribute that lists the wrappers."""
+    announced = True
+    """Whether the trace is told of the entity when it is created."""
 
     def __init__(self, core: Core, node: NodeHandle | None) -> None:
         super().__init__()

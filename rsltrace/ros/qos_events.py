@@ -73,20 +73,24 @@ class EndpointEvents:
         if handle is not None:
             handle.trigger()
 
+    def news(self, name: str) -> bool:
+        """Return whether there is something to take."""
+        if name == "matched":
+            return bool(self.match.total_count_change or self.match.current_count_change)
+        return name == "incompatible" and bool(self.mismatch.total_count_change)
+
     def take(self, name: str) -> Any:
         """Return the status and forget its changes; None if there is nothing new."""
-        if name == "matched" and (
-            self.match.total_count_change or self.match.current_count_change
-        ):
+        if not self.news(name):
+            return None
+        if name == "matched":
             match = self.match
             taken = MatchedStatus(**vars(match))
             match.total_count_change = match.current_count_change = 0
             return taken
-        if name == "incompatible" and self.mismatch.total_count_change:
-            taken_mismatch = IncompatibleQosStatus(**vars(self.mismatch))
-            self.mismatch.total_count_change = 0
-            return taken_mismatch
-        return None
+        taken_mismatch = IncompatibleQosStatus(**vars(self.mismatch))
+        self.mismatch.total_count_change = 0
+        return taken_mismatch
 
 
 def _event_name(event_type: Any) -> str:
@@ -108,6 +112,8 @@ class EventHandle(EntityHandle):
         self, core: Core, parent: PublisherHandle | SubscriptionHandle, event_type: Any
     ) -> None:
         super().__init__(core, parent.node)
+        # rclpy makes a handle or two for every endpoint; only those that fire are worth a record.
+        self.announced = False
         self._events = parent.events
         self._parent = parent
         self._name = _event_name(event_type)
@@ -128,8 +134,11 @@ class EventHandle(EntityHandle):
 
     def trigger(self) -> None:
         """Make the callback ready."""
-        if not self._queued and self.wrapper is not None:
+        if not self._queued and self.wrapper is not None and self._events.news(self._name):
             self._queued = True
+            if not self.announced:
+                self.announced = True
+                self.core.pending.append(self)
             self._cause = (self.core.loop.events, 0)
             self.core.loop.ready.append(self)
 

@@ -16,7 +16,7 @@ from std_msgs.msg import String, UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
-from rsltrace.errors import NodeError, RunError
+from rsltrace.errors import JobError, NodeError, RunError
 
 pytestmark = pytest.mark.ros
 
@@ -91,7 +91,7 @@ def test_name_namespace_remappings_and_parameters_as_ros2_run_gives_them(
 
 def test_a_broken_parameter_file_is_named(simulate: Any, tmp_path: Path) -> None:
     (tmp_path / "broken.yaml").write_text("/**:\n  ros__parameters: [1, 2\n")
-    with pytest.raises(RunError, match=r"broken\.yaml"):
+    with pytest.raises(JobError, match=r"nodes\[0\].*broken\.yaml"):
         simulate(NodeSpec(node=Parametrized, parameter_files=["broken.yaml"]), duration=1)
 
 
@@ -240,19 +240,23 @@ def test_matched_events_reach_their_callbacks(simulate: Any) -> None:
             callbacks = PublisherEventCallbacks(
                 matched=lambda s: seen.append((s.current_count, s.current_count_change))
             )
-            self.create_publisher(UInt64, "n", 1, event_callbacks=callbacks)
             self.sub: Any = None
+            self.pub: Any = None
+            self.callbacks = callbacks
             self.create_timer(1.0, self.toggle)
 
         def toggle(self) -> None:
-            if self.sub is None:
+            if self.pub is None:
+                self.create_subscription(UInt64, "n", print, 1)
+                self.pub = self.create_publisher(UInt64, "n", 1, event_callbacks=self.callbacks)
+            elif self.sub is None:
                 self.sub = self.create_subscription(UInt64, "n", print, 1)
             else:
                 self.destroy_subscription(self.sub)
                 self.sub = None
 
-    simulate(Watcher, duration=2)
-    assert seen == [(1, 1), (0, -1)]
+    simulate(Watcher, duration=3)
+    assert seen == [(1, 1), (2, 1), (1, -1)]
 
 
 def test_invalid_names_raise_what_rclpy_raises(simulate: Any) -> None:
