@@ -13,12 +13,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace._version import __version__
 from rsltrace.errors import JobError, OutputError, RsltraceError, RunError
-from rsltrace.job import BagSpec, Job, NodeSpec
+from rsltrace.job import BagSpec, Job
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import (
     Stop,
@@ -42,7 +43,7 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.bag import Bag
-    from rsltrace.ros.world import World
+    from rsltrace.ros.world import Entry, World
 
 _GC_EVERY_EVENTS = 10_000
 _PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
@@ -112,28 +113,27 @@ def run(
         bags = [stack.enter_context(_open_bag(job, bag)) for bag in job.bags]
         start_ns = _start_ns(job, bags)
         stack.enter_context(_search_path(job))
-        writer = None
-        if output is not None:
-            writer = stack.enter_context(TraceWriter(Path(output), force=force))
-        recorder = Recorder(writer, keep_payload=_payload_filter(job)) if writer else None
-        end_ns = _end_ns(job, start_ns)
         loop = EventLoop(
             start_ns=start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
-            stop_conditions=tuple(_stop_conditions(job, start_ns)),
             livelock_limit=job.livelock_limit,
-            between_steps=_housekeeping(lambda: loop, observer, end_ns),
+            between_steps=_housekeeping(lambda: loop, observer, _end_ns(job, start_ns)),
         )
-        world = stack.enter_context(
-            World(loop, recorder, base_dir=job.base_dir, echo=echo)
-        )
-        if writer is not None:
+        world = stack.enter_context(World(loop, base_dir=job.base_dir, echo=echo))
+        # Whatever can be known to be wrong is found before a file is made.
+        loop.stop_conditions = tuple(_stop_conditions(job, start_ns))
+        entries = _prepare(job)
+        _check_bag_types(job, bags)
+        writer = None
+        if output is not None:
+            writer = stack.enter_context(TraceWriter(Path(output), force=force))
+            world.core.recorder = Recorder(writer, keep_payload=_payload_filter(job))
             _write_job(writer, job)
             writer.add_metadata(METADATA_ENVIRONMENT, environment())
         if observer.interrupt is not None:
             observer.interrupt(loop.stop)
         stack.enter_context(_quiet_gc())
-        stop = _run_world(world, job, bags, start_ns)
+        stop = _run_world(world, job, entries, bags, start_ns)
         error = world.error
         exit_code = error.exit_code if error is not None else stop.exit_code
         if writer is not None:
@@ -145,6 +145,7 @@ def run(
                     "exit_code": str(exit_code),
                 }
             )
+        recorder = world.core.recorder
         return RunResult(
             path=None if output is None else Path(output),
             digest=recorder.digest if recorder is not None else "",
@@ -157,7 +158,9 @@ def run(
         )
 
 
-def _run_world(world: World, job: Job, bags: list[Bag], start_ns: int) -> Stop:
+def _run_world(
+    world: World, job: Job, entries: list[Entry], bags: list[Bag], start_ns: int
+) -> Stop:
     """Go through the stages: construct, jump to the start, run, destroy."""
     core = world.core
     loop = core.loop
@@ -167,10 +170,8 @@ def _run_world(world: World, job: Job, bags: list[Bag], start_ns: int) -> Stop:
 
         core.watch(job.stop.topic.name, watch_exit_code(core, job.stop.topic))
     try:
-        for index, spec in enumerate(job.nodes):
-            where = f"{job.source_name}: nodes[{index}]"
-            name, make, arguments = _construction(job, spec, where)
-            if not world.construct(name, make, arguments, where=where):
+        for entry in entries:
+            if not world.construct(entry):
                 break
         if loop.stopped is None:
             _start_players(world, job, bags)
@@ -179,30 +180,32 @@ def _run_world(world: World, job: Job, bags: list[Bag], start_ns: int) -> Stop:
             stop = world.run()
         else:
             stop = loop.stopped
-    except OutputError:
-        raise
     except RunError as error:
         # Raised by the loop itself (a livelock), not by a callback.
-        world.core.error = error
+        core.error = error
         stop = Stop(str(error).splitlines()[0], error.exit_code)
     world.destroy()
     return stop
 
 
-def _construction(
-    job: Job, spec: NodeSpec, where: str
-) -> tuple[str, Callable[[], Any], list[list[str]]]:
-    from rsltrace.ros.world import load_target, ros_arguments
+def _prepare(job: Job) -> list[Entry]:
+    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
+    from rsltrace.ros.world import Entry, load_target, ros_arguments
 
-    make = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
-    arguments = ros_arguments(
-        name=spec.name,
-        namespace=spec.namespace,
-        parameters=spec.parameters,
-        parameter_files=[job.resolve(path) for path in spec.parameter_files],
-        remappings=spec.remappings,
-    )
-    return spec.target, lambda: make(**spec.arguments), arguments
+    entries = []
+    for index, spec in enumerate(job.nodes):
+        where = f"{job.source_name}: nodes[{index}]"
+        make: Any = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
+        arguments = ros_arguments(
+            name=spec.name,
+            namespace=spec.namespace,
+            parameters=spec.parameters,
+            parameter_files=[job.resolve(path) for path in spec.parameter_files],
+            remappings=spec.remappings,
+            where=where,
+        )
+        entries.append(Entry(spec.target, partial(make, **spec.arguments), arguments))
+    return entries
 
 
 # -- bags ------------------------------------------------------------------------------------------
@@ -223,6 +226,14 @@ def _start_ns(job: Job, bags: list[Bag]) -> int:
     if job.start_ns is not None:
         return job.start_ns
     return min((bag.start_ns for bag in bags), default=0)
+
+
+def _check_bag_types(job: Job, bags: list[Bag]) -> None:
+    from rsltrace.ros.player import check_type
+
+    for spec, bag in zip(job.bags, bags, strict=True):
+        for topic in bag.topics:
+            check_type(bag=spec.path, topic=topic.name, type_name=topic.type_name)
 
 
 def _start_players(world: World, job: Job, bags: list[Bag]) -> None:

@@ -81,7 +81,7 @@ def _changed(job: Job, *, seed: int | None, until: str | None) -> Job:
     if until is not None:
         from rsltrace.job import StopSpec
 
-        given = StopSpec(time=until)
+        given = StopSpec(time=f"{until}s" if until[-1:].isdigit() else until)
         changes["stop"] = job.stop.model_copy(update={"time_ns": given.time_ns})
     return job.model_copy(update=changes) if changes else job
 

@@ -68,9 +68,9 @@ class EventLoop:
         self.tasks: deque[Dispatchable] = deque()
         self.idle: list[Callable[[], bool]] = []
         self.timers = timers
+        self.stop_conditions = stop_conditions
         self.stopped: Stop | None = None
         self._interrupt = False
-        self._conditions = stop_conditions
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
         self._scheduled: list[tuple[int, int, int, Callable[[], None]]] = []
@@ -160,10 +160,10 @@ class EventLoop:
         return any([poll() for poll in self.idle]) if self.idle else False
 
     def _ask_conditions(self, next_ns: int | None) -> Stop | None:
-        if not self._conditions:
+        if not self.stop_conditions:
             return None
         progress = Progress(self.now_ns, next_ns, self.start_ns, self.events, self.activity_ns)
-        for condition in self._conditions:
+        for condition in self.stop_conditions:
             stop = condition(progress)
             if stop is not None:
                 return stop

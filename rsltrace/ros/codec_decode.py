@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from rsltrace.ros.codec_layout import greatest_end, least_size
+from rsltrace.ros.codec_layout import least_size
 from rsltrace.ros.codec_spec import (
     CHECK_SLOT,
     HEADER,
@@ -41,9 +41,9 @@ _OTHER_ENCODINGS = {
 def decode(spec: Message, raw: bytes) -> Any:
     """Return the message that CDR bytes hold, with the Python types that rclpy gives.
 
-    Up to three bytes after the end are taken as padding to a multiple of 4. More are read over only
-    where rclpy's ``serialize_message`` returns more, and bags written from Python hold them: it
-    allots some messages more bytes than it then writes.
+    Bytes after the end are ignored if they pad to a multiple of 4, or are those that rclpy's
+    ``serialize_message`` returns too many (and that bags written from Python hold): it allots as
+    many as it estimates, which for empty sequences and wstrings is more than it then writes.
 
     Raises ValueError naming the type and the offset (in bytes from the start of ``raw``) for
     another encoding than plain CDR, truncated or over-long bytes, and wstrings that are not UTF-16.
@@ -61,7 +61,7 @@ class _Decoder:
         self.spec = spec
         self.raw = raw
         self.position = 0
-        self.allotted = 0  # where rclpy's estimate of the size has got to; never less
+        self.allotted = 0  # where rclpy's estimate of the size has got to: as far, or further
         self.end = len(raw) - len(HEADER)
         if self.end < 0:
             raise self.wrong(f"{len(raw)} bytes are too short for a CDR message; is it empty?")
@@ -76,11 +76,7 @@ class _Decoder:
 
     def finish(self) -> None:
         """Raise ValueError if more follows the message than may."""
-        if self.end in (self.position, self.allotted):
-            return
-        # rmw allots every message of a bounded type what the greatest one takes.
-        limit = greatest_end(self.spec, 0) if self.end > self.position + 3 else self.position
-        if limit is None or self.end > limit + 3 & -4 or self.end % 4:
+        if self.end not in (self.position, self.position + 3 & -4, self.allotted):
             raise self.wrong(
                 f"the message ends at offset {self.position + 4}, but there are "
                 f"{len(self.raw)} bytes; they are of another type or of another version of it"
@@ -169,7 +165,8 @@ class _Decoder:
         if number and isinstance(item, Primitive):
             self.align(item.size)
         elif isinstance(item, Primitive):
-            self.allotted += -self.allotted % item.size  # an empty sequence is not, in fact, aligned
+            # The estimate aligns an empty sequence, though no item is written.
+            self.allotted += -self.allotted % item.size
         self.plausible(item, number, start, path)
         if isinstance(item, Primitive) and item.typecode:
             values = array.array(item.typecode, self.take(number * item.size, path))

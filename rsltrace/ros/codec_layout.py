@@ -154,34 +154,3 @@ def least_size(type_: FieldType) -> int:
     if isinstance(type_, Array):
         return type_.length * least_size(type_.item)
     return 4
-
-
-def greatest_end(type_: FieldType, position: int) -> int | None:
-    """Return where a value that begins at ``position`` ends at the latest; None if unbounded."""
-    if isinstance(type_, Primitive):
-        return position + -position % type_.size + type_.size
-    if isinstance(type_, Text):
-        if type_.bound is None:
-            return None
-        return position + -position % 4 + 4 + (type_.bound + 1) * (4 if type_.wide else 1)
-    if isinstance(type_, Message):
-        ends: int | None = position if type_.fields else position + 1
-        for field in type_.fields:
-            ends = None if ends is None else greatest_end(field.type, ends)
-        return ends
-    if isinstance(type_, Array):
-        return _greatest_end_of(type_.item, type_.length, position)
-    if type_.bound is None:
-        return None
-    return _greatest_end_of(type_.item, type_.bound, position + -position % 4 + 4)
-
-
-def _greatest_end_of(item: FieldType, number: int, position: int) -> int | None:
-    if isinstance(item, Primitive) and number:
-        return position + -position % item.size + number * item.size
-    end: int | None = position
-    for _ in range(number):
-        if end is None:
-            return None
-        end = greatest_end(item, end)
-    return end

@@ -42,9 +42,9 @@ class Core:
     ``recorder`` is None in a run that records nothing. ``current_*`` describe the event under way.
     """
 
-    def __init__(self, loop: EventLoop, recorder: Recorder | None, *, base_dir: Path) -> None:
+    def __init__(self, loop: EventLoop, *, base_dir: Path) -> None:
         self.loop = loop
-        self.recorder = recorder
+        self.recorder: Recorder | None = None
         self.base_dir = base_dir
         self.graph: Graph
         self.executor: SimExecutor

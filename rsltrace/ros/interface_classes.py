@@ -94,13 +94,19 @@ def _import_kind(name: str, package: str, kind: str) -> Any:
                 f"{name} needs the package {package}, which this Python cannot import. "
                 f"Source the ROS 2 workspace that holds it, or: pip install {_wheel(package)}"
             )
-        return import_module(f"{package}.{kind}")
+        module = import_module(f"{package}.{kind}")
     except ModuleNotFoundError as error:
         if error.name == f"{package}.{kind}":
             raise SetupError(f"{name} does not exist: package {package} has no {kind}") from error
         raise SetupError(_broken(name, package, error)) from error
     except ImportError as error:
         raise SetupError(_broken(name, package, error)) from error
+    if getattr(module, "__file__", None) is None:
+        raise SetupError(
+            f"{name}: {next(iter(module.__path__))} is a folder of sources, "
+            "not a built package. Build its workspace and source it"
+        )
+    return module
 
 
 def _broken(name: str, package: str, error: ImportError) -> str:

@@ -19,7 +19,7 @@ _SECTIONS = {
     "srv": {"Request": 0, "Response": 1},
     "action": {"Goal": 0, "Result": 1, "Feedback": 2},
 }
-"""Which section of its file holds a part. Parts not listed are made by rosidl, not by the author."""
+"""Which section of its file holds a part. Parts not listed are made by rosidl, not the author."""
 
 
 def installed_definition(name: str) -> str | None:
@@ -45,7 +45,7 @@ def installed_definition(name: str) -> str | None:
 
 
 def installed_type_hash(name: str) -> str | None:
-    """Return the ``RIHS01_...`` hash of an interface by its full name; None if none is installed."""
+    """Return the ``RIHS01_...`` hash of an interface by its full name, or None."""
     package, kind, type_ = name.split("/")
     path = _installed_file(package, kind, f"{type_.partition('_')[0]}.json")
     if path is None:

@@ -1,7 +1,7 @@
 """The message definition a trace carries for each topic, so that it can be read without ROS.
 
-It is what rosbag2 and the ``ros2msg`` encoding of MCAP call a concatenated definition: the message's
-own text, then that of every message in it, each after a line of 80 ``=`` and ``MSG: package/Type``.
+It is what rosbag2 and the ``ros2msg`` encoding of MCAP call a concatenated definition: the text of
+the message, then of every message in it, each after a line of 80 ``=`` and ``MSG: package/Type``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rsltrace.ros.interface_classes import type_name
 from rsltrace.ros.interface_files import installed_definition, installed_type_hash
 
 _RULE = "=" * 80
-_FIELD = re.compile(r"\s*[^\s#]+\s+(?P<name>[a-zA-Z]\w*)\s*(?P<constant>=)?", re.ASCII)
+_FIELD = re.compile(r"\s*(?P<type>[^\s#]+)\s+(?P<name>[a-zA-Z]\w*)\s*(?P<constant>=)?", re.ASCII)
 _TEXT_NAMES = {"boolean": "bool", "octet": "byte", "float": "float32", "double": "float64"}
 
 
@@ -55,8 +55,30 @@ def _definition(spec: Message) -> str:
     text = installed_definition(spec.type_name)
     # A file of another version than the class would make every reader misread the messages.
     if text is not None and _field_names(text) == [field.name for field in spec.fields]:
-        return text
+        return text if "/msg/" in spec.type_name else _with_full_types(text, spec)
     return "\n".join(f"{_written(field.type)} {field.name}" for field in spec.fields)
+
+
+def _with_full_types(text: str, spec: Message) -> str:
+    """Write out the package of types that stand there without one.
+
+    In a ``.srv`` or ``.action`` file these are messages of the same package, but readers that know
+    of messages only take them for parts of the same service or action.
+    """
+    packages = {
+        field.name: _short_name(item).rpartition("/")[0] + "/"
+        for field in spec.fields
+        if isinstance(item := getattr(field.type, "item", field.type), Message)
+    }
+
+    def full(line: str) -> str:
+        match = _FIELD.match(line)
+        if match is None or match["constant"] or "/" in match["type"]:
+            return line
+        start = match.start("type")
+        return line[:start] + packages.get(match["name"], "") + line[start:]
+
+    return "\n".join(map(full, text.splitlines()))
 
 
 def _field_names(text: str) -> list[str]:

@@ -82,20 +82,25 @@ class BagPublisher(PublisherHandle):
         raise AssertionError("never in a queue")
 
 
-def make_publisher(
-    core: Core, node: NodeHandle, *, bag: str, topic: str, type_name: str, qos: dict[str, Any]
-) -> BagPublisher:
-    """Create the publisher of a recorded topic.
+def check_type(*, bag: str, topic: str, type_name: str) -> type:
+    """Return the message class of a recorded topic.
 
     :raises BagError: if its type is not installed.
     """
     try:
-        message_class = get_message_class(type_name)
+        return get_message_class(type_name)
     except SetupError as error:
         raise BagError(
             f"{bag}: topic {topic} has type {type_name}, which is not installed here. Install its "
             f"package, or leave the topic out (exclude: [{topic}])\n  {error}"
         ) from error
+
+
+def make_publisher(
+    core: Core, node: NodeHandle, *, bag: str, topic: str, type_name: str, qos: dict[str, Any]
+) -> BagPublisher:
+    """Create the publisher of a recorded topic."""
+    message_class = check_type(bag=bag, topic=topic, type_name=type_name)
     return BagPublisher(core, node, message_class, topic, recorded_qos(qos))
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,19 @@ from rsltrace.ros.core import Core
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.tasks import poll
-from rsltrace.trace.recorder import Recorder
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One entry of a job, ready to be constructed.
+
+    ``make`` returns a node or a list of nodes; ``arguments`` are what ``ros2 run`` would give
+    them, in lists of which later ones have the last word on parameters.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    arguments: list[RosArguments]
 
 
 class World:
@@ -29,10 +42,8 @@ class World:
     :param echo: print log records on stderr.
     """
 
-    def __init__(
-        self, loop: EventLoop, recorder: Recorder | None, *, base_dir: Path, echo: bool = True
-    ) -> None:
-        self.core = Core(loop, recorder, base_dir=base_dir)
+    def __init__(self, loop: EventLoop, *, base_dir: Path, echo: bool = True) -> None:
+        self.core = Core(loop, base_dir=base_dir)
         self.core.graph = Graph()
         self.core.logs = Logs(self.core, echo=echo)
         loop.idle.append(lambda: poll(self.core))
@@ -69,28 +80,17 @@ class World:
 
     # -- the stages of a run ---------------------------------------------------------------------
 
-    def construct(
-        self, name: str, make: Callable[[], Any], arguments: list[list[str]], *, where: str
-    ) -> bool:
-        """Construct one entry of the job as one event; return False if that ended the run.
-
-        ``make`` returns a node or a list of nodes; ``arguments`` are its ``--ros-args``, in lists
-        of which later ones have the last word on parameters.
-
-        :raises JobError: if rcl refuses the arguments (a broken parameter file).
-        """
+    def construct(self, entry: Entry) -> bool:
+        """Construct one entry of the job as one event; return False if that ended the run."""
         core = self.core
 
         def build() -> None:
-            made = make()
+            made = entry.make()
             for node in made if isinstance(made, (list, tuple)) else [made]:
-                self._adopt(node, name)
+                self._adopt(node, entry.name)
 
-        try:
-            core.node_arguments = [RosArguments(part) for part in arguments]
-        except InvalidArgumentsError as error:
-            raise JobError(str(error), where=where) from error
-        core.run_outside(lambda: f"constructing {name}", EventKind.CONSTRUCT, 0, None, build)
+        core.node_arguments = entry.arguments
+        core.run_outside(lambda: f"constructing {entry.name}", EventKind.CONSTRUCT, 0, None, build)
         core.node_arguments = []
         return core.loop.stopped is None
 
@@ -216,11 +216,14 @@ def ros_arguments(
     parameters: dict[str, Any],
     parameter_files: Sequence[Path],
     remappings: dict[str, str],
-) -> list[list[str]]:
+    where: str,
+) -> list[RosArguments]:
     """Return what ``ros2 run`` would be given for a node of a job, as two argument lists.
 
     The job's own parameters are a list of their own: rcl would let a file's entry for one node
     win over a parameter given for all.
+
+    :raises JobError: if rcl refuses them (a broken parameter file); it begins with ``where``.
     """
     arguments: list[str] = []
     if name is not None:
@@ -234,7 +237,10 @@ def ros_arguments(
     own: list[str] = []
     for key, value in parameters.items():
         own += ["-p", f"{key}:={_yaml_value(value)}"]
-    return [["--ros-args", *arguments], ["--ros-args", *own]]
+    try:
+        return [RosArguments(["--ros-args", *part]) for part in (arguments, own)]
+    except InvalidArgumentsError as error:
+        raise JobError(str(error), where=where) from error
 
 
 def _yaml_value(value: Any) -> str:
@@ -259,4 +265,4 @@ def _float(value: float) -> str:
     return mantissa + (f"e{exponent}" if exponent else "")
 
 
-__all__ = ["World", "load_target", "ros_arguments"]
+__all__ = ["Entry", "World", "load_target", "ros_arguments"]

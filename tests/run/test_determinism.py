@@ -86,7 +86,7 @@ def perturbed(index: int, job: Path, out: Path) -> str:
     if index % 3 == 0 and shutil.which("setarch"):
         command = ["setarch", "-R", *command]
     if index % 4 == 1 and shutil.which("nice"):
-        command = ["nice", "-n", str(chance.randrange(1, 19)), *command]
+        command = ["nice", "-n", str(chance.randrange(1, 6)), *command]
     done = subprocess.run(
         [*command, "--quiet"],
         cwd=folder,

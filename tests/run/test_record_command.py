@@ -1,0 +1,235 @@
+"""``rsltrace record`` as a user runs it: output, exit status, bad input, signals, full disks."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace import Trace
+
+pytestmark = pytest.mark.ros
+
+BOTH = (
+    "nodes: [{node: nodes_under_test:Talker}, {node: nodes_under_test:Listener}]\n"
+    "stop: {duration: 3s}\n"
+)
+LAST_LINE = re.compile(r"digest [0-9a-f]{16}  events \d+  sim \d+\.\d{9}")
+
+
+def test_the_last_line_of_stdout_is_for_scripts(rsltrace: Any, job_file: Any) -> None:
+    job_file(BOTH)
+    done = rsltrace("record", "job.yaml", "-o", "out.mcap")
+    assert done.returncode == 0, done.stderr
+    assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
+    assert "[INFO] [1.000000000] [listener]: total 1" in done.stderr
+    quiet = rsltrace("record", "job.yaml", "-o", "quiet.mcap", "--quiet")
+    assert quiet.stdout == done.stdout
+    assert "listener" not in quiet.stderr
+
+
+def test_json_output(rsltrace: Any, job_file: Any, tmp_path: Path) -> None:
+    job_file(BOTH)
+    done = rsltrace("record", "job.yaml", "--json", "-o", "out.mcap")
+    values = json.loads(done.stdout)
+    assert values["stop_reason"] == "duration of 3.000000000 s"
+    assert values["end_ns"] == 3 * 10**9
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert (values["digest"], values["events"]) == (trace.digest, trace.event_count)
+
+
+def test_seed_and_until_replace_the_jobs_own(rsltrace: Any, job_file: Any) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Dice}]\nstop: {duration: 100s}\nseed: 1\n",
+        "import random\n"
+        "class Dice(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('dice')\n"
+        "        self.get_logger().info(f'drew {random.random()}')\n"
+        "        self.create_timer(1.0, lambda: None)\n",
+    )
+    lines = {}
+    for arguments in ((), ("--seed", "1"), ("--seed", "2"), ("--until", "4.5"), ("--until", "9s")):
+        done = rsltrace("record", "job.yaml", "--force", *arguments)
+        assert done.returncode == 0, done.stderr
+        lines[arguments] = done.stdout
+    assert lines[()] == lines["--seed", "1"] != lines["--seed", "2"]
+    assert lines["--until", "4.5"].endswith("sim 4.000000000\n")
+    assert lines["--until", "9s"].endswith("sim 9.000000000\n")
+
+
+def test_an_existing_file_is_kept_without_force(
+    rsltrace: Any, job_file: Any, tmp_path: Path
+) -> None:
+    job_file(BOTH)
+    (tmp_path / "out.mcap").write_text("precious")
+    done = rsltrace("record", "job.yaml", "-o", "out.mcap")
+    assert done.returncode == 2
+    assert "out.mcap" in done.stderr
+    assert "--force" in done.stderr
+    assert (tmp_path / "out.mcap").read_text() == "precious"
+    assert rsltrace("record", "job.yaml", "-o", "out.mcap", "--force").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("yaml", "words"),
+    [
+        ("nodes: [{node: nodes_under_test:Talker", ["job.yaml:1"]),
+        ("nodes: [{node: nodes_under_test:Talker}]\nsead: 1\n", ["job.yaml:2:1", "sead", "seed"]),
+        ("nodes: [{node: nodes_under_test:Talker}]\nseed: one\n", ["job.yaml:2:7", "integer"]),
+        ("nodes: [{node: nodes:Talker}]\n", ["nodes[0]", "no module 'nodes'", "job.yaml"]),
+        ("nodes: [{node: nodes_under_test:Walker}]\n", ["nodes[0]", "has no 'Walker'"]),
+    ],
+)
+def test_bad_jobs_are_explained(rsltrace: Any, job_file: Any, yaml: str, words: list[str]) -> None:
+    job_file(yaml)
+    done = rsltrace("record", "job.yaml")
+    assert done.returncode == 2, done.stderr
+    assert done.stdout == ""
+    assert done.stderr.startswith("rsltrace: error: ")
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in done.stderr
+
+
+def test_a_job_that_cannot_start_leaves_no_trace_behind(
+    rsltrace: Any, job_file: Any, tmp_path: Path
+) -> None:
+    job_file("nodes: [{node: nodes:Talker}]\n")
+    assert rsltrace("record", "job.yaml", "-o", "out.mcap").returncode == 2
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_a_missing_job_says_so(rsltrace: Any) -> None:
+    done = rsltrace("record", "nothing.yaml")
+    assert done.returncode == 2
+    assert "nothing.yaml" in done.stderr
+
+
+def test_outputs_that_cannot_be_written(rsltrace: Any, job_file: Any, tmp_path: Path) -> None:
+    job_file(BOTH)
+    (tmp_path / "folder").mkdir()
+    for output in ("no/such/folder/out.mcap", "folder", "/proc/out.mcap"):
+        done = rsltrace("record", "job.yaml", "-o", output)
+        assert done.returncode == 2, done.stderr
+        assert output in done.stderr
+        assert "Traceback" not in done.stderr
+
+
+def test_an_exception_shows_the_users_traceback_and_exits_3(
+    rsltrace: Any, job_file: Any, tmp_path: Path
+) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Faulty}]\n",
+        "class Faulty(Talker):\n    def tick(self):\n        raise KeyError('wheel')\n",
+    )
+    done = rsltrace("record", "job.yaml", "-o", "out.mcap")
+    assert done.returncode == 3
+    assert "raise KeyError('wheel')" in done.stderr
+    assert "/talker: timer Faulty.tick" in done.stderr
+    assert "rsltrace/ros" not in done.stderr
+    assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
+
+
+ENDLESS = "nodes: [{node: nodes_under_test:Talker, arguments: {period: 0.0001}}]\n"
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_closes_its_file_and_says_so(
+    job_file: Any, tmp_path: Path, number: int, code: int
+) -> None:
+    job_file(ENDLESS)
+    process = _start(tmp_path)
+    _wait_for_bytes(tmp_path / "out.mcap", 300_000)
+    process.send_signal(number)
+    stdout, stderr = process.communicate(timeout=60)
+    assert process.returncode == code, stderr
+    assert "closing the trace" in stderr
+    assert LAST_LINE.fullmatch(stdout.splitlines()[-1])
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert trace.complete
+        assert trace.digest in stdout
+
+
+def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) -> None:
+    job_file(ENDLESS)
+    process = _start(tmp_path)
+    _wait_for_bytes(tmp_path / "out.mcap", 300_000)
+    process.kill()
+    process.communicate(timeout=60)
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert not trace.complete
+        assert trace.event_count >= 4096
+        assert trace.event(4095).index == 4095
+
+
+def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_path: Path) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Stuck}]\n",
+        "class Stuck(Talker):\n"
+        "    def tick(self):\n"
+        "        print('stuck', flush=True)\n"
+        "        while True: pass\n",
+    )
+    process = _start(tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "stuck\n"
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    assert process.poll() is None
+    process.send_signal(signal.SIGINT)
+    process.communicate(timeout=60)
+    assert process.returncode == 130
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert trace.complete
+
+
+def test_a_full_disk_ends_the_run_with_a_readable_file(job_file: Any, tmp_path: Path) -> None:
+    job_file(ENDLESS)
+    code = (
+        "import resource, runpy, signal, sys\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, 1_000_000))\n"
+        "sys.argv = ['rsltrace', 'record', 'job.yaml', '-o', 'out.mcap', '-q']\n"
+        "runpy.run_module('rsltrace', run_name='__main__')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2, done.stderr
+    assert "out.mcap" in done.stderr
+    assert "Traceback" not in done.stderr
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert not trace.complete
+        assert trace.event_count >= 4096
+
+
+def _start(folder: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "out.mcap"],
+        cwd=folder,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+def _wait_for_bytes(path: Path, size: int) -> None:
+    deadline = time.monotonic() + 60
+    while not path.exists() or path.stat().st_size < size:
+        assert time.monotonic() < deadline, "the run wrote nothing"
+        time.sleep(0.05)
