@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace._version import __version__
 from rsltrace.errors import JobError, OutputError, RsltraceError, RunError
-from rsltrace.job import BagSpec, Job
+from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import (
     Stop,
@@ -194,7 +194,7 @@ def _prepare(job: Job) -> list[Entry]:
 
     entries = []
     for index, spec in enumerate(job.nodes):
-        where = f"{job.source_name}: nodes[{index}]"
+        where = locate(job, ("nodes", index, "node"))
         make: Any = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
         arguments = ros_arguments(
             name=spec.name,
@@ -326,7 +326,7 @@ def _stop_conditions(job: Job, start_ns: int) -> Iterator[StopCondition]:
         if isinstance(function, str):
             from rsltrace.ros.world import load_target
 
-            function = load_target(function, where=f"{job.source_name}: stop.function")
+            function = load_target(function, where=locate(job, ("stop", "function")))
         else:
             name = f"{function.__module__}:{function.__qualname__}"
         yield stop_when(function, name)

@@ -85,8 +85,8 @@ def test_an_existing_file_is_kept_without_force(
         ("nodes: [{node: nodes_under_test:Talker", ["job.yaml:1"]),
         ("nodes: [{node: nodes_under_test:Talker}]\nsead: 1\n", ["job.yaml:2:1", "sead", "seed"]),
         ("nodes: [{node: nodes_under_test:Talker}]\nseed: one\n", ["job.yaml:2:7", "integer"]),
-        ("nodes: [{node: nodes:Talker}]\n", ["nodes[0]", "no module 'nodes'", "job.yaml"]),
-        ("nodes: [{node: nodes_under_test:Walker}]\n", ["nodes[0]", "has no 'Walker'"]),
+        ("nodes: [{node: nodes:Talker}]\n", ["job.yaml:1:16: ", "no module 'nodes'"]),
+        ("nodes: [{node: nodes_under_test:Walker}]\n", ["job.yaml:1:16: ", "has no 'Walker'"]),
     ],
 )
 def test_bad_jobs_are_explained(rsltrace: Any, job_file: Any, yaml: str, words: list[str]) -> None:

@@ -144,8 +144,8 @@ def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
 @pytest.mark.parametrize(
     ("target", "words"),
     [
-        ("no_such_module:Talker", ["nodes[0]", "no module 'no_such_module'", "search_path"]),
-        ("nodes_under_test:Tolker", ["nodes[0]", "has no 'Tolker'", "did you mean 'Talker'"]),
+        ("no_such_module:Talker", ["job.yaml:1:16: ", "no module 'no_such_module'", "search_path"]),
+        ("nodes_under_test:Tolker", ["job.yaml:1:16: ", "has no 'Tolker'", "did you mean 'Talker'"]),
         ("nodes_under_test:TALL", ["not callable"]),
         ("nodes_under_test:something", ["gave a int, not an rclpy Node"]),
     ],

@@ -1,0 +1,105 @@
+"""A job as plain values again: as YAML for people and for the trace, or complete as JSON values."""
+
+from __future__ import annotations
+
+import math
+import os
+from io import StringIO
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.job.node import NodeSpec, target_text
+from rsltrace.job.part import Part
+from rsltrace.job.times import format_time
+
+if TYPE_CHECKING:
+    from rsltrace.job.job import Job
+
+
+def job_yaml(job: Job) -> str:
+    """Return a job file with every key that differs from its default."""
+    from ruamel.yaml import YAML
+
+    yaml = YAML()
+    yaml.width = 2**20  # Folding long text would make it hard to read and to search.
+    yaml.indent(mapping=2, sequence=4, offset=2)
+    stream = StringIO()
+    yaml.dump(_quoted(_explicit(job)), stream)
+    return stream.getvalue()
+
+
+def _quoted(value: Any) -> Any:
+    """Ask for quotes around text with invisible characters; ruamel would change some of them."""
+    from ruamel.yaml.scalarstring import DoubleQuotedScalarString
+
+    if isinstance(value, dict):
+        return {_quoted(key): _quoted(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_quoted(item) for item in value]
+    if isinstance(value, str) and not value.isprintable():
+        return DoubleQuotedScalarString(value)
+    return value
+
+
+def job_resolved(job: Job) -> dict[str, Any]:
+    """Return the complete job as JSON-compatible values, the same on every machine."""
+    values = _complete(job)
+    values["search_path"] = [_relative(job, path) for path in job.search_path]
+    for node, spec in zip(values["nodes"], job.nodes, strict=True):
+        node["parameter_files"] = [_relative(job, path) for path in spec.parameter_files]
+    for bag, bag_spec in zip(values["bags"], job.bags, strict=True):
+        bag["path"] = _relative(job, bag_spec.path)
+    return values
+
+
+def _relative(job: Job, path: str) -> str:
+    return os.path.relpath(job.resolve(path), job.base_dir).replace(os.sep, "/")
+
+
+def _explicit(part: Part) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, field in type(part).model_fields.items():
+        value = getattr(part, name)
+        if field.exclude or value == field.get_default(call_default_factory=True):
+            continue
+        key = field.alias or name
+        values[key] = format_time(value) if key in part.TIMES else _plain(value, _explicit)
+    if isinstance(part, NodeSpec):
+        values["node"] = part.target
+    return values
+
+
+def _complete(part: Part) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, field in type(part).model_fields.items():
+        if not field.exclude:
+            values[name] = _json(_plain(getattr(part, name), _complete))
+    if isinstance(part, NodeSpec):
+        values["node"] = part.target
+    return values
+
+
+def _plain(value: Any, part_values: Any) -> Any:
+    if isinstance(value, Part):
+        return part_values(value)
+    if isinstance(value, dict):
+        return {str(key): _plain(item, part_values) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item, part_values) for item in value]
+    # Subclasses (numpy's float64, an enum of integers) are written as what they are.
+    for kind in (bool, int, float, str):
+        if isinstance(value, kind):
+            return kind(value)
+    if value is None:
+        return None
+    return target_text(value)
+
+
+def _json(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _json(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_json(item) for item in value]
+    # JSON has no such numbers; YAML's spelling is kept as text.
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else ".inf" if value > 0 else "-.inf"
+    return value

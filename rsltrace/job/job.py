@@ -1,0 +1,175 @@
+"""The whole of a job: everything that determines a run, checked before anything is constructed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.node import NodeSpec, check_path
+from rsltrace.job.part import Part, check, items, one_of, parts, text, whole
+from rsltrace.job.problems import Problem, Problems
+from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TimeLike
+from rsltrace.job.times import format_time, parse_time
+
+SEED_MAX = 2**64 - 1
+LIVELOCK_LIMIT = 100_000
+
+
+def _folder(value: object) -> Path:
+    return Path(os.path.abspath(check_path(value)))
+
+
+class Job(Part):
+    """A job, from ``load_job`` or built in Python. Frozen; raises ``JobError`` when wrong.
+
+    Times are integer nanoseconds of simulated time; ``start_ns`` and ``construct_time_ns`` are
+    ``None`` where the run decides (first bag message or 0; the start). Paths in it are relative to
+    ``base_dir`` (an absolute path; the current folder when built in Python): see ``resolve``.
+    """
+
+    TIMES: ClassVar[dict[str, str]] = {"start": "start_ns", "construct_time": "construct_time_ns"}
+
+    nodes: Annotated[tuple[NodeSpec, ...], parts()] = ()
+    search_path: Annotated[tuple[str, ...], check(items(check_path))] = (".",)
+    start_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None, alias="start"
+    )
+    construct_time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None, alias="construct_time"
+    )
+    stop: StopSpec = StopSpec()
+    seed: Annotated[int, check(whole(0, SEED_MAX))] = 0
+    timer_ties: Annotated[Literal["creation", "heap"], check(one_of("creation", "heap"))] = (
+        "creation"
+    )
+    livelock_limit: Annotated[int, check(whole(1))] = LIVELOCK_LIMIT
+    bags: Annotated[tuple[BagSpec, ...], parts("path")] = ()
+    record: RecordSpec = RecordSpec()
+
+    # Not keys of a job file, hence ``exclude``: where the job came from.
+    base_dir: Annotated[Path, check(_folder)] = Field(
+        default_factory=Path.cwd, exclude=True, repr=False
+    )
+    source_name: Annotated[str, check(text())] = Field(default="<python>", exclude=True, repr=False)
+    given_text: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None, alias="source_text", exclude=True, repr=False
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            nodes: Sequence[NodeSpec | dict[str, Any]] = (),
+            search_path: Sequence[str | os.PathLike[str]] = (".",),
+            start: TimeLike | None = None,
+            start_ns: int | None = None,
+            construct_time: TimeLike | None = None,
+            construct_time_ns: int | None = None,
+            stop: StopSpec | dict[str, Any] = ...,
+            seed: int = 0,
+            timer_ties: Literal["creation", "heap"] = "creation",
+            livelock_limit: int = LIVELOCK_LIMIT,
+            bags: Sequence[BagSpec | dict[str, Any] | str] = (),
+            record: RecordSpec | dict[str, Any] = ...,
+            base_dir: str | os.PathLike[str] = ...,
+            source_name: str = "<python>",
+            source_text: str | None = None,
+        ) -> None: ...
+
+    @property
+    def source_text(self) -> str:
+        """The YAML text the job was read from; of a job built in Python, ``to_yaml()``."""
+        return self.to_yaml() if self.given_text is None else self.given_text
+
+    def resolve(self, path: str) -> Path:
+        """Return a path of the job as an absolute path."""
+        return Path(os.path.normpath(self.base_dir / path))
+
+    def to_yaml(self) -> str:
+        """Return a job file that loads as this job (from ``base_dir``).
+
+        Classes and functions appear as ``module:qualname``, other Python objects among
+        ``arguments`` by the name of their class; a job with local ones does not load again.
+        """
+        from rsltrace.job.dump import job_yaml
+
+        return job_yaml(self)
+
+    def resolved(self) -> dict[str, Any]:
+        """Return the job as JSON-compatible values with every default filled in.
+
+        Times are in nanoseconds under the fields' names, paths relative to ``base_dir``, so that
+        the result is the same on every machine.
+        """
+        from rsltrace.job.dump import job_resolved
+
+        return job_resolved(self)
+
+    @model_validator(mode="after")
+    def _check_whole(self) -> Job:
+        problems = [
+            *self._something_to_run(),
+            *self._times_in_order(),
+            *self._distinct_names(),
+            *self._paths_exist(),
+        ]
+        if problems:
+            raise Problems(problems)
+        return self
+
+    def _something_to_run(self) -> Iterator[Problem]:
+        if not self.nodes and not self.bags:
+            place = ("nodes",) if "nodes" in self.model_fields_set else ()
+            yield Problem("a job needs at least one node (nodes:) or bag (bags:)", place)
+
+    def _times_in_order(self) -> Iterator[Problem]:
+        start_ns, construct_ns, stop_ns = self.start_ns, self.construct_time_ns, self.stop.time_ns
+        if start_ns is None:
+            return
+        if construct_ns is not None and construct_ns > start_ns:
+            yield Problem(
+                f"{format_time(construct_ns)} is after the start "
+                f"({format_time(start_ns)}): nodes are constructed before the run starts",
+                ("construct_time",),
+            )
+        if stop_ns is not None and stop_ns < start_ns:
+            yield Problem(
+                f"{format_time(stop_ns)} is before the start ({format_time(start_ns)})",
+                ("stop", "time"),
+            )
+
+    def _distinct_names(self) -> Iterator[Problem]:
+        first: dict[tuple[str, str], int] = {}
+        for index, node in enumerate(self.nodes):
+            if node.name is None:
+                continue
+            key = (node.namespace or "/", node.name)
+            if key in first:
+                full_name = f"{key[0].rstrip('/')}/{node.name}"
+                yield Problem(
+                    f"{full_name} is already the name of nodes[{first[key]}]: give one of them "
+                    "another name or namespace",
+                    ("nodes", index, "name"),
+                )
+            first.setdefault(key, index)
+
+    def _paths_exist(self) -> Iterator[Problem]:
+        for index, folder in enumerate(self.search_path):
+            path = self.resolve(folder)
+            if not path.is_dir():
+                what = "is not a folder" if path.exists() else "there is no such folder"
+                yield Problem(f"{folder!r}: {what}", ("search_path", index))
+        for index, node in enumerate(self.nodes):
+            for number, file in enumerate(node.parameter_files):
+                path = self.resolve(file)
+                if not path.is_file():
+                    what = "is not a file" if path.exists() else "there is no such parameter file"
+                    yield Problem(f"{file!r}: {what}", ("nodes", index, "parameter_files", number))
+        for index, bag in enumerate(self.bags):
+            if not self.resolve(bag.path).exists():
+                yield Problem(f"{bag.path!r}: there is no such bag", ("bags", index, "path"))

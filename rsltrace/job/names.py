@@ -1,0 +1,107 @@
+"""ROS naming rules, checked while the job is read.
+
+A wrong name would otherwise fail inside rcl, in the middle of a run and without a line number.
+rclpy is not imported here (a job is read on machines without ROS); a test compares with rclpy.
+"""
+
+from __future__ import annotations
+
+import re
+
+NODE_NAME_LENGTH_MAX = 255
+NAMESPACE_LENGTH_MAX = 245
+
+_PART = r"[A-Za-z_][A-Za-z0-9_]*"
+_NODE_NAME = re.compile(_PART, re.ASCII)
+_NAMESPACE = re.compile(rf"/|(?:/{_PART})+", re.ASCII)
+_TOPIC = re.compile(rf"(?:/{_PART})+", re.ASCII)
+_FIELD_PATH = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:\.[A-Za-z][A-Za-z0-9_]*)*", re.ASCII)
+
+# In a remapping rule rcl's lexer knows no double underscores inside a name.
+_TOKEN = rf"(?![A-Za-z0-9_]*__){_PART}"
+_RULE_NAME = rf"(?:~/|/)?{_TOKEN}(?:/{_TOKEN})*"
+_REMAP_FROM = re.compile(rf"(?:{_TOKEN}:)?(?:rostopic://|rosservice://)?{_RULE_NAME}", re.ASCII)
+_REMAP_TO = re.compile(_RULE_NAME, re.ASCII)
+
+_MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
+_TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
+
+
+def check_node_name(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` can be a ROS node name."""
+    if not _NODE_NAME.fullmatch(name):
+        raise ValueError(
+            f"{name!r} is not a node name: use letters, digits and '_', not starting with a digit"
+        )
+    if len(name) > NODE_NAME_LENGTH_MAX:
+        raise ValueError(
+            f"a node name has at most {NODE_NAME_LENGTH_MAX} characters, this one has {len(name)}"
+        )
+
+
+def check_namespace(namespace: str) -> None:
+    """Raise ``ValueError`` unless ``namespace`` can be a ROS namespace: ``/`` or ``/a/b``."""
+    if not namespace.startswith("/"):
+        raise ValueError(f"a namespace starts with '/': write '/{namespace}'")
+    if not _NAMESPACE.fullmatch(namespace):
+        raise ValueError(
+            f"{namespace!r} is not a namespace: parts of letters, digits and '_', none starting "
+            "with a digit, after one '/' each and with none at the end"
+        )
+    if len(namespace) > NAMESPACE_LENGTH_MAX:
+        raise ValueError(
+            f"a namespace has at most {NAMESPACE_LENGTH_MAX} characters, this one has "
+            f"{len(namespace)}"
+        )
+
+
+def check_topic(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` is a fully qualified topic name."""
+    if not name.startswith("/"):
+        raise ValueError(f"a topic is named in full, from '/': write '/{name}'")
+    if not _TOPIC.fullmatch(name):
+        raise ValueError(
+            f"{name!r} is not a topic name: parts of letters, digits and '_', none starting with "
+            "a digit, after one '/' each"
+        )
+
+
+def check_field_path(path: str) -> None:
+    """Raise ``ValueError`` unless ``path`` is a field of a message: ``data``, ``header.seq``."""
+    if not _FIELD_PATH.fullmatch(path):
+        raise ValueError(f"{path!r} is not a field: write its name, or a path such as status.code")
+
+
+def check_target(target: str) -> None:
+    """Raise ``ValueError`` unless ``target`` looks like ``module:Class`` (dots in both parts)."""
+    if not _TARGET.fullmatch(target):
+        raise ValueError(f"expected module:Class or module:function, got {target!r}")
+
+
+def check_remap_from(name: str) -> None:
+    """Raise ``ValueError`` unless rcl accepts ``name`` on the left of a remapping rule."""
+    if name in ("__node", "__name", "__ns"):
+        key = "namespace" if name == "__ns" else "name"
+        raise ValueError(f"{name} is not a topic or service: use the node's '{key}:' instead")
+    if not _REMAP_FROM.fullmatch(name):
+        raise ValueError(
+            f"rcl cannot remap {name!r}: write a topic or service name such as chatter, "
+            "/robot/chatter or ~/chatter (no wildcards, no '__')"
+        )
+
+
+def check_remap_to(name: str) -> None:
+    """Raise ``ValueError`` unless rcl accepts ``name`` on the right of a remapping rule."""
+    if not _REMAP_TO.fullmatch(name):
+        raise ValueError(
+            f"rcl cannot remap to {name!r}: write a topic or service name such as chatter, "
+            "/robot/chatter or ~/chatter (no wildcards, no '__', no '/' at the end)"
+        )
+
+
+def check_glob(glob: str) -> None:
+    """Raise ``ValueError`` unless ``glob`` can match a topic name."""
+    if not glob:
+        raise ValueError("an empty pattern matches no topic: write a topic name or a glob")
+    if glob[0] not in "/*?[":
+        raise ValueError(f"topic names start with '/': write '/{glob}' (or '*{glob}')")

@@ -1,0 +1,183 @@
+"""What all parts of a job share: strict frozen models, and the checks their fields are made of.
+
+A part is built in two ways. From a job file, keys are the YAML names and nothing may be null. From
+Python, ``None`` means "not given" and a time may also be given in nanoseconds under its field's
+name (``duration_ns=``). The pydantic context tells the two apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
+
+from rsltrace.errors import JobError
+from rsltrace.job.problems import Problem, Problems, describe, problems_of
+from rsltrace.job.times import Nanoseconds, parse_time
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+FROM_FILE = {"from_file": True}
+"""The validation context of a job that is read from a file."""
+
+
+class Part(BaseModel):
+    """Base of a job and its parts. Built wrongly, it raises ``JobError``, not pydantic's error."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+
+    TIMES: ClassVar[dict[str, str]] = {}
+    """YAML key of each time → name of its field, which ends in ``_ns``."""
+
+    def __init__(self, **data: Any) -> None:
+        try:
+            super().__init__(**data)
+        except ValidationError as error:
+            problems = problems_of(error, type(self))
+            text = "\n".join(problem.message for problem in problems)
+            raise JobError(text, where=type(self).__name__) from None
+
+    # Without this pydantic would build nested parts through __init__ too, and an error in one of
+    # them would no longer know its place in the whole.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _accept_field_names_of_times(cls, data: object, info: ValidationInfo) -> object:
+        if not isinstance(data, dict) or from_file(info):
+            return data
+        for key, name in cls.TIMES.items():
+            if name in data:
+                if key in data:
+                    raise Problem(f"give either {key} or {name}, not both", (name,))
+                value = data[name]
+                data = {k: v for k, v in data.items() if k != name}
+                data[key] = value if value is None else Nanoseconds(value)
+        return data
+
+    def replace(self, **changes: object) -> Self:
+        """Return a copy with ``changes`` (keys as in the constructor), validated again."""
+        values: dict[str, object] = {}
+        for name, field in type(self).model_fields.items():
+            key = field.alias or name
+            if key not in changes and name not in changes and name in self.model_fields_set:
+                values[name if key in self.TIMES else key] = getattr(self, name)
+        return type(self)(**values, **changes)
+
+
+def from_file(info: ValidationInfo) -> bool:
+    """Say whether the value being validated was read from a job file."""
+    return info.context is not None
+
+
+def check(function: Callable[[Any], object], *, optional: bool = False) -> BeforeValidator:
+    """Make a field validator of ``function``, which returns the value or raises ``ValueError``.
+
+    ``optional`` lets ``None`` through when the part is built in Python.
+    """
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None and from_file(info):
+            raise Problem("no value is given: give one, or leave the key out")
+        return None if value is None and optional else function(value)
+
+    return BeforeValidator(validate)
+
+
+def text(rule: Callable[[str], None] | None = None) -> Callable[[Any], str]:
+    """Return a check for text that ``rule`` accepts."""
+
+    def function(value: object) -> str:
+        if not isinstance(value, str):
+            raise Problem(f"expected text, got {describe(value)}")
+        if rule is not None:
+            rule(value)
+        return value
+
+    return function
+
+
+def whole(least: int, most: int = 2**63 - 1) -> Callable[[Any], int]:
+    """Return a check for an integer from ``least`` to ``most``."""
+
+    def function(value: object) -> int:
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise Problem(f"expected an integer, got {describe(value)}")
+        if not least <= value <= most:
+            bound = f"at least {least}" if value < least else f"at most {most}"
+            raise Problem(f"must be {bound}, got {value}")
+        return int(value)
+
+    return function
+
+
+def one_of(*choices: str) -> Callable[[Any], str]:
+    """Return a check for one of some words."""
+
+    def function(value: object) -> str:
+        if not isinstance(value, str) or value not in choices:
+            raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}")
+        return value
+
+    return function
+
+
+def positive_time(value: object) -> int:
+    """Check a time that must be more than nothing."""
+    time_ns = parse_time(value)
+    if time_ns == 0:
+        raise Problem("must be more than 0")
+    return time_ns
+
+
+def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ...]]:
+    """Return a check for a list whose elements ``function`` accepts; gives a tuple."""
+
+    def check_items(values: object) -> tuple[object, ...]:
+        if not isinstance(values, (list, tuple)):
+            raise Problem(f"expected a list, got {describe(values)}")
+        checked: list[object] = []
+        problems: list[Problem] = []
+        for index, value in enumerate(values):
+            try:
+                checked.append(function(value))
+            except ValueError as error:
+                problems.append(Problem(str(error), (index,)))
+        if problems:
+            raise Problems(problems)
+        return tuple(checked)
+
+    return check_items
+
+
+def parts(shorthand: str | None = None) -> BeforeValidator:
+    """Prepare a list of parts for pydantic; plain text stands for ``{shorthand: text}``."""
+
+    def validate(values: object) -> object:
+        if not isinstance(values, (list, tuple)):
+            raise Problem(f"expected a list, got {describe(values)}")
+        if shorthand is None:
+            return tuple(values)
+        return tuple({shorthand: v} if isinstance(v, str) else v for v in values)
+
+    return BeforeValidator(validate)
+
+
+def part(shorthand: str) -> BeforeValidator:
+    """Prepare one optional part for pydantic; plain text stands for ``{shorthand: text}``."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None and from_file(info):
+            raise Problem("no value is given: give one, or leave the key out")
+        return {shorthand: value} if isinstance(value, str) else value
+
+    return BeforeValidator(validate)

@@ -1,0 +1,131 @@
+"""The smaller parts of a job: which bags play, when the run stops, what is recorded."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from rsltrace.job.names import check_field_path, check_glob, check_topic
+from rsltrace.job.node import Target, check_callable_target, check_path
+from rsltrace.job.part import Part, check, from_file, items, part, positive_time, text, whole
+from rsltrace.job.problems import Problem, describe
+from rsltrace.job.times import parse_time
+
+TimeLike = str | int | float
+"""A time in Python as in YAML: seconds as a number, or text with a unit."""
+
+Globs = Annotated[tuple[str, ...], check(items(text(check_glob)))]
+
+
+def _flag(value: object) -> bool:
+    if not isinstance(value, bool):
+        raise Problem(f"expected true or false, got {describe(value)}")
+    return value
+
+
+class BagSpec(Part):
+    """One entry of ``bags:``.
+
+    ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
+    ``start_offset_ns`` counts from the first message of the whole bag.
+    """
+
+    TIMES: ClassVar[dict[str, str]] = {"start_offset": "start_offset_ns"}
+
+    path: Annotated[str, check(check_path)]
+    topics: Globs = ()
+    exclude: Globs = ()
+    start_offset_ns: Annotated[int, check(parse_time)] = Field(default=0, alias="start_offset")
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            path: str | os.PathLike[str],
+            topics: Sequence[str] = (),
+            exclude: Sequence[str] = (),
+            start_offset: TimeLike = 0,
+            start_offset_ns: int = 0,
+        ) -> None: ...
+
+    @field_validator("topics")
+    @classmethod
+    def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if not value and from_file(info):
+            raise Problem("an empty list would play nothing: leave the key out to play all topics")
+        return value
+
+
+class TopicStop(Part):
+    """A message on topic ``name`` ends the run; its field ``exit_code`` is the exit status."""
+
+    name: Annotated[str, check(text(check_topic))]
+    exit_code: Annotated[str | None, check(text(check_field_path), optional=True)] = None
+
+
+class StopSpec(Part):
+    """What ends a run. Any of the conditions; times in nanoseconds, ``None`` where not given."""
+
+    TIMES: ClassVar[dict[str, str]] = {
+        "duration": "duration_ns",
+        "time": "time_ns",
+        "quiescence": "quiescence_ns",
+    }
+
+    duration_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None, alias="duration"
+    )
+    time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None, alias="time"
+    )
+    events: Annotated[int | None, check(whole(1), optional=True)] = None
+    topic: Annotated[TopicStop | None, part("name")] = None
+    function: Annotated[Target | None, check(check_callable_target, optional=True)] = None
+    quiescence_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="quiescence"
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            duration: TimeLike | None = None,
+            duration_ns: int | None = None,
+            time: TimeLike | None = None,
+            time_ns: int | None = None,
+            events: int | None = None,
+            topic: TopicStop | str | None = None,
+            function: Target | None = None,
+            quiescence: TimeLike | None = None,
+            quiescence_ns: int | None = None,
+        ) -> None: ...
+
+
+class RecordSpec(Part):
+    """Which payloads the trace keeps. Hashes are kept in any case."""
+
+    payloads: Annotated[bool, check(_flag)] = True
+    topics: Globs = ("*",)
+    exclude: Globs = ()
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            payloads: bool = True,
+            topics: Sequence[str] = ("*",),
+            exclude: Sequence[str] = (),
+        ) -> None: ...
+
+    @field_validator("topics")
+    @classmethod
+    def _not_empty(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not value:
+            raise Problem("an empty list would keep no payload: write 'payloads: false' for that")
+        return value

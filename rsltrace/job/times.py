@@ -1,0 +1,133 @@
+"""Times in a job are read exactly: text to integer nanoseconds, never through a float.
+
+``0.1`` and ``10.000000001`` have no exact binary float, so the number is taken from the text it was
+written as: from the YAML source (``ExactFloat``) or from a Python float's ``repr``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from fractions import Fraction
+
+from rsltrace.model.stamp import NS_PER_S, format_seconds
+
+TIME_NS_MAX = 2**63 - 1
+"""ROS keeps a time in a signed 64-bit count of nanoseconds."""
+
+UNITS_NS = {
+    "ns": 1,
+    "us": 1_000,
+    "ms": 1_000_000,
+    "s": NS_PER_S,
+    "min": 60 * NS_PER_S,
+    "h": 3600 * NS_PER_S,
+}
+
+_TIME_TEXT = re.compile(
+    r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-z]*)\s*"
+)
+_EXPECTED = "expected a time: seconds as a number, or a number with a unit (ns, us, ms, s, min, h)"
+
+
+class ExactFloat(float):
+    """A float that remembers the text it was written as."""
+
+    text: str
+
+    def __new__(cls, value: float, text: str) -> ExactFloat:
+        self = super().__new__(cls, value)
+        self.text = text
+        return self
+
+
+@dataclass(frozen=True)
+class Nanoseconds:
+    """Marks a value that already counts nanoseconds (``duration_ns=``), not seconds."""
+
+    value: object
+
+
+def parse_time(value: object) -> int:
+    """Return a time of a job in nanoseconds.
+
+    ``value`` is a number of seconds, a string with a unit (``5ms``), or ``Nanoseconds``. Raises
+    ``ValueError`` when it is anything else, negative, not finite, finer than a nanosecond, or
+    beyond 64 bits.
+    """
+    if isinstance(value, Nanoseconds):
+        if isinstance(value.value, bool) or not isinstance(value.value, int):
+            raise ValueError(f"expected an integer number of nanoseconds, got {value.value!r}")
+        return _checked(value.value, f"{value.value} ns")
+    if isinstance(value, bool):
+        raise ValueError(f"{_EXPECTED}, got {str(value).lower()}")
+    if isinstance(value, int):
+        return _checked(value * NS_PER_S, str(value))
+    if isinstance(value, float):
+        text = value.text if isinstance(value, ExactFloat) else float.__repr__(value)
+        return _exact(text.replace("_", ""), NS_PER_S, text)
+    if isinstance(value, str):
+        return _parse_text(value)
+    raise ValueError(f"{_EXPECTED}, got {_kind(value)}")
+
+
+def format_time(time_ns: int) -> str:
+    """Return the shortest text in seconds that ``parse_time`` reads back exactly: ``1.5s``."""
+    return format_seconds(time_ns).rstrip("0").rstrip(".") + "s"
+
+
+def _parse_text(text: str) -> int:
+    match = _TIME_TEXT.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{_EXPECTED}, got {text!r}")
+    number, unit = match.groups()
+    if not unit:
+        raise ValueError(f"{text!r} has no unit: write '{number}s' for seconds")
+    if unit not in UNITS_NS:
+        raise ValueError(f"unknown unit {unit!r} in {text!r}; units are {', '.join(UNITS_NS)}")
+    return _exact(number, UNITS_NS[unit], text.strip())
+
+
+def _exact(number: str, unit_ns: int, shown: str) -> int:
+    try:
+        decimal = Decimal(number.lower().replace(".inf", "inf").replace(".nan", "nan"))
+    except InvalidOperation:
+        raise ValueError(f"{_EXPECTED}, got {shown}") from None
+    if not decimal.is_finite():
+        raise ValueError(f"a time must be finite, got {shown}")
+    # An exponent of a million digits must not become an integer of a million digits.
+    if decimal and decimal.adjusted() > 30:
+        raise ValueError(_too_large(shown))
+    if decimal and decimal.adjusted() < -30:
+        raise ValueError(_too_fine(shown))
+    time_ns = Fraction(decimal) * unit_ns
+    if time_ns.denominator != 1:
+        raise ValueError(_too_fine(shown))
+    return _checked(time_ns.numerator, shown)
+
+
+def _checked(time_ns: int, shown: str) -> int:
+    if time_ns < 0:
+        raise ValueError(f"a time must not be negative, got {shown}")
+    if time_ns > TIME_NS_MAX:
+        raise ValueError(_too_large(shown))
+    return time_ns
+
+
+def _too_large(shown: str) -> str:
+    return f"{shown} is too large: 64-bit nanoseconds end at {format_time(TIME_NS_MAX)}"
+
+
+def _too_fine(shown: str) -> str:
+    return f"{shown} is finer than a nanosecond, the resolution of simulated time"
+
+
+def _kind(value: object) -> str:
+    if value is None:
+        return "nothing"
+    if isinstance(value, dict):
+        return "a mapping"
+    if isinstance(value, (list, tuple)):
+        return "a list"
+    return repr(value)
