@@ -12,6 +12,9 @@ import numpy as np
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"
+MCAP_MAGIC = b"\x89MCAP0\r\n"
+SCHEMA_ENCODING = "ros2msg"
+MESSAGE_ENCODING = "cdr"
 
 TOPIC_EVENTS = "/rsltrace/events"
 TOPIC_OUTPUTS = "/rsltrace/outputs"
@@ -22,6 +25,8 @@ PREFIX_OWN = "/rsltrace/"
 PREFIX_REQUEST = "/rsltrace/request"
 PREFIX_RESPONSE = "/rsltrace/response"
 
+METADATA_FORMAT = "rsltrace:format"
+"""The first record after the header, so that an interrupted file says what it is, too."""
 METADATA_JOB = "rsltrace:job"
 METADATA_ENVIRONMENT = "rsltrace:environment"
 METADATA_RESULT = "rsltrace:result"
@@ -32,6 +37,10 @@ ATTACHMENT_INDEX = "rsltrace/segments"
 EVENTS_PER_SEGMENT = 4096
 """Events are written in segments of this many: small enough to lose little when a run is killed
 and to read little when a diff looks one up, large enough to compress well."""
+
+OUTPUTS_PER_SEGMENT = 65536
+"""A segment ends early with the event that brings it to this many outputs: memory stays bounded
+even when every event publishes thousands of messages."""
 
 PAYLOAD_BYTES_PER_CHUNK = 1 << 20
 """A payload chunk is closed once it holds at least this many bytes."""
@@ -121,12 +130,13 @@ MESSAGE_HEADER_DTYPE = np.dtype(
         ("opcode", "u1"),
         ("length", "<u8"),
         ("channel_id", "<u2"),
-        ("sequence", "<u4"),
+        ("message_sequence", "<u4"),
         ("log_time", "<u8"),
         ("publish_time", "<u8"),
     ]
 )
-"""An MCAP Message record up to its data."""
+"""An MCAP Message record up to its data. ``message_sequence`` is what MCAP calls ``sequence``: an
+output has a field of that name too, and the two stand in one numpy layout below."""
 
 EVENT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *EVENT_DTYPE.descr])
 OUTPUT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *OUTPUT_DTYPE.descr])

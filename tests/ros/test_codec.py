@@ -220,7 +220,7 @@ def fast_only(cls: type, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any]:
 
 
 @every_class
-@settings(QUICK, max_examples=5)
+@settings(QUICK, max_examples=3)
 @given(seed=st.integers(0, 2**32))
 def test_bytes_and_messages_are_those_of_rclpy(
     cls: type, monkeypatch: pytest.MonkeyPatch, seed: int
@@ -240,7 +240,7 @@ def test_bytes_and_messages_are_those_of_rclpy(
 
 
 @every_class
-@settings(QUICK, max_examples=3)
+@settings(QUICK, max_examples=2)
 @given(seed=st.integers(0, 2**32))
 def test_dirty_padding_is_cleaned(cls: type, seed: int) -> None:
     rng = random.Random(seed)
@@ -292,6 +292,11 @@ def big_endian(type_: Any, value: Any, out: bytearray) -> bytearray:
     else:
         if not isinstance(type_, Array):
             put("I", len(value))
+        if isinstance(value, np.ndarray | array.array) and len(value):
+            size = type_.item.size
+            swapped = np.frombuffer(value.tobytes(), f"u{size}").byteswap().tobytes()
+            out.extend(bytes(-len(out) % size) + swapped)
+            return out
         for item in value:
             big_endian(type_.item, item, out)
     return out
@@ -417,7 +422,7 @@ def message_with(cls: type, field: str, value: Any) -> Any:
         (LaserScan, "ranges", array.array("d", [0.5, 1.5])),
         (PointCloud2, "data", bytearray(b"abc")),
         (JointState, "name", ("a", "bc")),
-        (JointState, "name", {"only": 1}.keys() and {"only"}),
+        (JointState, "name", {"only"}),
         (JointState, "name", "abc"),
         (JointState, "name", np.array(["a", "bcd"])),
         (UnboundedSequences, "bool_values", (True, False)),
@@ -476,13 +481,25 @@ class MyPoint(Point):
         (Pose, "position", MyPoint(), TypeError, "must be a geometry_msgs/msg/Point message"),
         (Imu, "orientation_covariance", np.eye(3), ValueError, r"with shape \(3, 3\)"),
         (Imu, "orientation_covariance", [1.0] * 5, ValueError, r"with shape \(5,\)"),
-        (Imu, "_orientation_covariance", [1.0] * 9, TypeError, "must be a numpy array of 9 float64"),
+        (
+            Imu,
+            "_orientation_covariance",
+            [1.0] * 9,
+            TypeError,
+            "must be a numpy array of 9 float64",
+        ),
         (Imu, "_orientation_covariance", np.zeros(9, ">f8"), ValueError, "must be a numpy array"),
         (JointState, "name", ["a", 1], TypeError, r"'name\[1\]' must be a str, but is int 1"),
         (JointState, "name", {"a": 1}, TypeError, "must be a sequence, but is dict"),
         (JointState, "name", iter("ab"), TypeError, "must be a sequence"),
         (JointState, "name", None, TypeError, "must be a sequence, but is NoneType"),
-        (UnboundedSequences, "bool_values", [1, 0], TypeError, r"'bool_values\[0\]' must be a bool"),
+        (
+            UnboundedSequences,
+            "bool_values",
+            [1, 0],
+            TypeError,
+            r"'bool_values\[0\]' must be a bool",
+        ),
         (UnboundedSequences, "bool_values", b"\2", ValueError, "other than 0 and 1"),
         (UnboundedSequences, "bool_values", 3, TypeError, "must be a sequence"),
         (UnboundedSequences, "byte_values", [1], TypeError, r"'byte_values\[0\]' must be bytes"),
@@ -493,11 +510,23 @@ class MyPoint(Point):
             ValueError,
             "not C-contiguous",
         ),
-        (UnboundedSequences, "basic_types_values", [Point()], TypeError, r"_values\[0\]' must be a"),
+        (
+            UnboundedSequences,
+            "basic_types_values",
+            [Point()],
+            TypeError,
+            r"_values\[0\]' must be a",
+        ),
         (UnboundedSequences, "_float64_values", [1], TypeError, r"_values\[0\]' must be a float"),
         (UnboundedSequences, "_float64_values", array.array("f", [1]), ValueError, "whole number"),
         (BoundedSequences, "uint8_values", [1] * 4, ValueError, "4 items, more than its bound 3"),
-        (BoundedSequences, "string_values", ["a"] * 4, ValueError, "4 items, more than its bound 3"),
+        (
+            BoundedSequences,
+            "string_values",
+            ["a"] * 4,
+            ValueError,
+            "4 items, more than its bound 3",
+        ),
         (
             BoundedSequences,
             "basic_types_values",
@@ -506,7 +535,13 @@ class MyPoint(Point):
             "4 items, more than its bound 3",
         ),
         (Arrays, "string_values", ["a"], ValueError, "has 1 items instead of 3"),
-        (Arrays, "bool_values", np.array([True] * 3), TypeError, r"'bool_values\[0\]' must be a bool"),
+        (
+            Arrays,
+            "bool_values",
+            np.array([True] * 3),
+            TypeError,
+            r"'bool_values\[0\]' must be a bool",
+        ),
     ],
     ids=repr,
 )
@@ -577,12 +612,22 @@ def test_trailing_bytes_are_refused_unless_they_pad_to_a_multiple_of_four() -> N
             codec_for(UInt64).deserialize(HEADER + bytes(8 + extra))
 
 
-def test_the_oversized_buffers_that_rclpy_returns_are_read() -> None:
-    message = BoundedPlainSequences(uint8_values=[1, 2])
+@pytest.mark.parametrize(
+    "message",
+    [
+        JointState(),
+        JointState(name=["a", "bc"], effort=[1.0]),
+        BoundedPlainSequences(uint8_values=[1, 2]),
+        WStrings(wstring_value="abc"),
+        UInt8(data=7),
+    ],
+)
+def test_the_oversized_buffers_that_rclpy_returns_are_read(message: Any) -> None:
+    codec = codec_for(type(message))
     raw = native_serialize(message)
-    codec = codec_for(BoundedPlainSequences)
+    assert len(raw) > len(codec.serialize(message))
     assert codec.deserialize(raw) == message
-    assert len(codec.canonical(raw)) < len(raw)
+    assert codec.canonical(raw) == codec.serialize(message)
     with pytest.raises(ValueError, match="ends at offset"):
         codec.deserialize(raw + bytes(4))
 
@@ -699,8 +744,9 @@ def assert_foreign_equals(foreign: Any, type_: Any, value: Any) -> None:
         assert len(foreign) == len(value)
         for one, other in zip(foreign, value, strict=True):
             assert_foreign_equals(one, type_.item, other)
-    elif isinstance(type_, Primitive) and type_.name == "octet":
-        assert (foreign if isinstance(foreign, int | np.integer) else foreign[0]) == value[0]
+    elif isinstance(type_, Primitive) and type_.size == 1:
+        number = value[0] if isinstance(value, bytes) else int(value)
+        assert int(foreign) % 256 == number % 256  # some take byte and char for signed
     elif isinstance(type_, Primitive) and type_.code in "fd":
         rounded = struct.unpack(type_.code, struct.pack(type_.code, value))[0]
         assert foreign == rounded or (math.isnan(foreign) and math.isnan(rounded))
@@ -718,12 +764,12 @@ def test_rosbags_reads_the_schema_and_the_bytes(cls: type) -> None:
 
     spec, name = message_spec(cls), type_name(cls)
     types = get_types_from_msg(schema_text(cls), name)
-    assert name in types
+    name = name if name in types else name.replace("/srv/", "/srv/msg/")  # as rosbags has it
     if has_wide_text(spec):
         return  # rosbags does not read wstrings
     store = get_typestore(Stores.EMPTY)
     store.register(types)
-    message = random_message(spec, random.Random(name))
+    message = random_message(spec, random.Random(type_name(cls)))
     foreign = store.deserialize_cdr(codec_for(cls).serialize(message), name)
     assert_foreign_equals(foreign, spec, message)
 
@@ -738,7 +784,7 @@ def test_rosbags_reads_the_schema_and_the_bytes(cls: type) -> None:
         UnboundedSequences,
         BasicTypes,
         Trigger.Response,
-        Fibonacci.Impl.FeedbackMessage,
+        Trigger.Request,
     ],
     ids=type_name,
 )
@@ -746,11 +792,7 @@ def test_mcap_ros2_reads_the_schema_and_the_bytes(cls: type) -> None:
     from mcap.records import Schema
 
     factory = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
-    schema = Schema(
-        data=schema_text(cls).encode(), encoding="ros2msg", id=1, name=type_name(cls)
-    )
+    schema = Schema(data=schema_text(cls).encode(), encoding="ros2msg", id=1, name=type_name(cls))
     decoder = factory.decoder_for("cdr", schema)
     message = random_message(message_spec(cls), random.Random(3))
-    assert_foreign_equals(
-        decoder(codec_for(cls).serialize(message)), message_spec(cls), message
-    )
+    assert_foreign_equals(decoder(codec_for(cls).serialize(message)), message_spec(cls), message)

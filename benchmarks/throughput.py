@@ -1,0 +1,236 @@
+"""What a callback costs: the same node graphs on rclpy's executors over DDS, and under rsltrace.
+
+    python benchmarks/throughput.py                     everything, about three minutes
+    python benchmarks/throughput.py --only rsltrace     cases whose name contains "rsltrace"
+    python benchmarks/throughput.py --json              the same figures for a machine
+
+Every measurement is a process of its own, and the repetitions go round all cases, so that a busy
+minute of the machine does not hit one case alone. Shown are the median and the extremes.
+
+Over DDS the graphs are saturated and callbacks are counted for some seconds of wall time. Under
+rsltrace a short and a long run are timed and the difference is taken, so that start-up counts for
+neither; the native figures do not contain it either.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from graphs import EXECUTORS, GRAPHS, run_native, run_rsltrace
+
+RSLTRACE_MODES = {"rsltrace": False, "rsltrace_recorded": True}
+TITLES = {
+    "single_threaded": "SingleThreadedExecutor over DDS",
+    "multi_threaded": "MultiThreadedExecutor over DDS",
+    "events_executor": "EventsExecutor over DDS",
+    "rsltrace": "rsltrace, nothing recorded",
+    "rsltrace_recorded": "rsltrace, everything recorded",
+}
+AIMS = (
+    # (slower case, faster case, how many times faster it is meant to be)
+    ("single_threaded", "rsltrace_recorded", 15.0),
+    ("events_executor", "rsltrace_recorded", 1.2),
+    ("events_executor", "rsltrace", 2.0),
+)
+WORKER_S_MAX = 180
+UNAVAILABLE = "unavailable"
+
+
+@dataclass
+class Case:
+    """One graph on one executor, with what was measured so far (microseconds per callback)."""
+
+    graph: str
+    mode: str
+    us: list[float] = field(default_factory=list)
+    callbacks: int = 0
+    start_up_s: list[float] = field(default_factory=list)
+    problem: str = ""
+
+    @property
+    def name(self) -> str:
+        """The name that ``--only`` filters: ``ping_pong/single_threaded``."""
+        return f"{self.graph}/{self.mode}"
+
+
+def all_cases() -> list[Case]:
+    """Return every case in the order of the table."""
+    cases = []
+    for graph in GRAPHS.values():
+        native = EXECUTORS if graph.make_native else ()
+        cases += [Case(graph.name, mode) for mode in (*native, *RSLTRACE_MODES)]
+    return cases
+
+
+def child_environment(folder: Path) -> dict[str, str]:
+    """Return an environment in which a native graph neither meets others nor litters."""
+    environment = dict(os.environ)
+    environment.pop("ROS_LOCALHOST_ONLY", None)  # its successor, next line, is enough
+    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # Domains 1 to 100 have ports below the ephemeral range on every platform.
+    environment["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    environment["ROS_LOG_DIR"] = str(folder)
+    return environment
+
+
+def run_worker(case: Case, amount: float) -> dict[str, Any]:
+    """Measure ``case`` once in a fresh interpreter; return its figures or what went wrong.
+
+    ``amount`` is seconds of wall time over DDS, callbacks under rsltrace.
+    """
+    with tempfile.TemporaryDirectory(prefix="rsltrace-throughput-") as folder:
+        command = [sys.executable, __file__, "--worker", case.name, str(amount), folder]
+        try:
+            done = subprocess.run(
+                command,
+                env=child_environment(Path(folder)),
+                capture_output=True,
+                text=True,
+                timeout=WORKER_S_MAX,
+            )
+        except subprocess.TimeoutExpired:
+            return {"problem": f"no result after {WORKER_S_MAX} s"}
+    for line in reversed(done.stdout.splitlines()):
+        if line.startswith("{"):
+            figures: dict[str, Any] = json.loads(line)
+            return figures
+    last = done.stderr.strip().splitlines()[-1:] or ["no output"]
+    return {"problem": f"exit status {done.returncode}: {last[0]}"}
+
+
+def work(name: str, amount: float, folder: Path) -> dict[str, Any]:
+    """Do what one worker process does. A missing package is a finding, not a crash."""
+    graph_name, mode = name.split("/")
+    graph = GRAPHS[graph_name]
+    try:
+        if mode in RSLTRACE_MODES:
+            return run_rsltrace(graph, int(amount), folder, record=RSLTRACE_MODES[mode])
+        return run_native(graph, mode, amount)
+    except ImportError as error:
+        return {"problem": f"not available: {error}", UNAVAILABLE: True}
+
+
+def measure(case: Case, seconds: float, events: int) -> None:
+    """Add one repetition to ``case``."""
+    if case.mode not in RSLTRACE_MODES:
+        figures = run_worker(case, seconds)
+        if not (problem := figures.get("problem")):
+            case.us.append(figures["wall_s"] / figures["callbacks"] * 1e6)
+            case.callbacks = figures["callbacks"]
+    else:
+        # Short enough to be start-up, long enough to have met every kind of callback.
+        short = run_worker(case, events // 20)
+        figures = short if short.get("problem") else run_worker(case, events)
+        if not (problem := figures.get("problem")):
+            callbacks = figures["callbacks"] - short["callbacks"]
+            case.us.append((figures["wall_s"] - short["wall_s"]) / callbacks * 1e6)
+            case.start_up_s.append(short["wall_s"] - short["callbacks"] * case.us[-1] / 1e6)
+            case.callbacks = figures["callbacks"]
+    case.problem = problem or ""
+
+
+def ratios(cases: list[Case]) -> list[dict[str, Any]]:
+    """Return what was aimed at and what was reached, for the pairs that were both measured."""
+    medians = {case.name: median(case.us) for case in cases if case.us}
+    found = []
+    for graph in GRAPHS:
+        for slow, fast, aim in AIMS:
+            names = f"{graph}/{slow}", f"{graph}/{fast}"
+            if all(name in medians for name in names):
+                ratio = medians[names[0]] / medians[names[1]]
+                found.append({"graph": graph, "slow": slow, "fast": fast, "x": ratio, "aim": aim})
+    for mode in RSLTRACE_MODES:
+        few, many = f"graph8/{mode}", f"graph200/{mode}"
+        if few in medians and many in medians:
+            ratio = medians[many] / medians[few]
+            found.append({"graph": "graph200", "slow": mode, "fast": "graph8", "x": ratio})
+    return found
+
+
+def print_table(cases: list[Case]) -> None:
+    """Print the figures for a person."""
+    medians = {case.name: median(case.us) for case in cases if case.us}
+    for graph in GRAPHS.values():
+        rows = [case for case in cases if case.graph == graph.name]
+        if not rows:
+            continue
+        print(f"\n{graph.title:<36}{'µs/callback':>12}  {'least .. most':<18}{'× single':>9}")
+        base = medians.get(f"{graph.name}/single_threaded")
+        for case in rows:
+            if not case.us:
+                print(f"  {TITLES[case.mode]:<34}{'':>12}  {case.problem}")
+                continue
+            mid = medians[case.name]
+            spread = f"{min(case.us):.2f} .. {max(case.us):.2f}"
+            speed = f"{base / mid:.1f}" if base else ""
+            failed = f"  then: {case.problem}" if case.problem else ""
+            print(f"  {TITLES[case.mode]:<34}{mid:>12.2f}  {spread:<18}{speed:>9}{failed}")
+    print()
+    for each in ratios(cases):
+        if "aim" in each:
+            verdict = "reached" if each["x"] >= each["aim"] else "missed"
+            print(
+                f"{each['graph']}: {TITLES[each['fast']]} is {each['x']:.1f} times as fast as "
+                f"{TITLES[each['slow']]} (aim {each['aim']:g}: {verdict})"
+            )
+        else:
+            print(f"an event among 200 nodes costs {each['x']:.2f} of one among 8 ({each['slow']})")
+
+
+def main() -> int:
+    """Measure and print. Returns the exit status: 1 if a case failed that could have run."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("--repeat", type=int, default=3, help="how often each case is measured")
+    parser.add_argument("--seconds", type=float, default=3.0, help="wall time of a native case")
+    parser.add_argument("--events", type=int, default=200_000, help="events of an rsltrace case")
+    parser.add_argument("--only", action="append", help="cases whose name contains this")
+    parser.add_argument("--list", action="store_true", help="print the names of the cases")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.add_argument("--worker", nargs=3, metavar=("CASE", "AMOUNT", "FOLDER"), help="internal")
+    options = parser.parse_args()
+    if options.worker:
+        name, amount, folder = options.worker
+        print(json.dumps(work(name, float(amount), Path(folder))), flush=True)
+        # DDS's threads may linger, and what they would still do is not part of the measurement.
+        sys.stderr.flush()
+        os._exit(0)
+    if options.repeat < 1 or options.events < 1000 or not options.seconds > 0:
+        parser.error("--repeat must be at least 1, --events at least 1000, --seconds above 0")
+
+    cases = all_cases()
+    if options.only:
+        cases = [case for case in cases if any(part in case.name for part in options.only)]
+    if options.list or not cases:
+        print("\n".join(case.name for case in cases or all_cases()))
+        return 0 if cases else 2
+    unavailable: set[str] = set()
+    for turn in range(options.repeat):
+        for case in cases:
+            if case.name not in unavailable:
+                print(f"{turn + 1}/{options.repeat} {case.name}", file=sys.stderr, flush=True)
+                measure(case, options.seconds, options.events)
+                if case.problem.startswith("not available"):
+                    unavailable.add(case.name)
+    if options.json:
+        figures = [
+            {"case": c.name, "us_per_callback": c.us, "callbacks": c.callbacks}
+            | {"start_up_s": c.start_up_s, "problem": c.problem}
+            for c in cases
+        ]
+        print(json.dumps({"cases": figures, "ratios": ratios(cases)}, indent=2))
+    else:
+        print_table(cases)
+    return int(any(case.problem and case.name not in unavailable for case in cases))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

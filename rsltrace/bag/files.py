@@ -1,0 +1,107 @@
+"""From the path of a bag to its open storage files, decompressed first where a file is zstd."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from rsltrace.bag.mcap_file import McapFile
+from rsltrace.bag.mcap_records import MAGIC as MCAP_MAGIC
+from rsltrace.bag.metadata import NAME, read_metadata
+from rsltrace.bag.sqlite_file import MAGIC as SQLITE_MAGIC
+from rsltrace.bag.sqlite_file import SqliteFile
+from rsltrace.bag.storage import Storage
+from rsltrace.bag.topic import BagQos
+from rsltrace.errors import BagError
+
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+@dataclass
+class BagFiles:
+    """The open storage files of a bag, in order; ``close`` closes them.
+
+    ``compressed_messages`` is ``None`` when only the messages themselves can tell; ``topics`` is
+    what metadata.yaml, if there is one, says about them.
+    """
+
+    storage_id: str = ""
+    storages: list[Storage] = field(default_factory=list)
+    compressed_messages: bool | None = None
+    topics: dict[tuple[str, str], tuple[tuple[BagQos, ...], str]] = field(default_factory=dict)
+    _stack: ExitStack = field(default_factory=ExitStack)
+
+    def close(self) -> None:
+        """Close all files and remove what was decompressed."""
+        self._stack.close()
+
+
+def open_files(path: Path) -> BagFiles:
+    """Open a bag's folder, or a single storage file. Raises ``BagError`` saying what to do."""
+    files = BagFiles()
+    try:
+        if path.is_dir():
+            metadata = read_metadata(path)
+            files.storage_id = metadata.storage_id
+            files.topics = metadata.topics
+            files.compressed_messages = metadata.compression == "message"
+            for file in metadata.files:
+                _open_file(file, files, expected=metadata.storage_id)
+        elif path.is_file():
+            if path.name == NAME:
+                raise BagError(f"{path}: name the bag's folder, {path.parent}")
+            _open_file(path, files, expected=None)
+        else:
+            raise BagError(f"{path}: there is no such bag")
+    except OSError as error:
+        files.close()
+        raise BagError(f"{error.filename or path}: {error.strerror}") from None
+    except BaseException:
+        files.close()
+        raise
+    return files
+
+
+def _open_file(path: Path, files: BagFiles, expected: str | None) -> None:
+    with path.open("rb") as file:
+        magic = file.read(16)
+    if not magic:
+        raise BagError(f"{path}: the file is empty: nothing was recorded, or the copy failed")
+    readable = path
+    if magic.startswith(ZSTD_MAGIC):
+        readable = _decompressed(path, files)
+        with readable.open("rb") as file:
+            magic = file.read(16)
+    storage: Storage
+    if magic.startswith(MCAP_MAGIC):
+        storage_id, storage = "mcap", McapFile(readable)
+    elif magic.startswith(SQLITE_MAGIC):
+        storage_id, storage = "sqlite3", SqliteFile(readable)
+    elif magic.startswith(b"#ROSBAG"):
+        raise BagError(f"{path}: a ROS 1 bag; convert it with 'rosbags-convert'")
+    else:
+        raise BagError(
+            f"{path}: not a bag: neither MCAP nor sqlite3 (name a bag's folder, or one .mcap or "
+            ".db3 file)"
+        )
+    files._stack.callback(storage.close)
+    if expected not in (None, storage_id):
+        raise BagError(f"{path}: {storage_id}, but {NAME} says {expected}; run 'ros2 bag reindex'")
+    files.storage_id = storage_id
+    files.storages.append(storage)
+
+
+def _decompressed(path: Path, files: BagFiles) -> Path:
+    """Return a decompressed copy of a zstd file; readers of both formats need random access."""
+    import zstandard
+
+    folder = files._stack.enter_context(TemporaryDirectory(prefix="rsltrace-bag-"))
+    target = Path(folder, path.name.removesuffix(".zstd"))
+    try:
+        with path.open("rb") as source, target.open("wb") as sink:
+            zstandard.ZstdDecompressor().copy_stream(source, sink)
+    except zstandard.ZstdError as error:
+        raise BagError(f"{path}: cannot be decompressed ({error}): copy it again") from None
+    return target

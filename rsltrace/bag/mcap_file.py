@@ -1,0 +1,141 @@
+"""Reading an MCAP file as a rosbag2 storage: topics, and messages by chunk.
+
+The rosbags and mcap packages read MCAP too. This reader exists because order and completeness
+decide what a simulation does: rosbags passes over chunks that are indexed without their messages,
+and neither refuses a chunk whose messages lie outside the times its index promises.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from rsltrace.bag.mcap_chunk import cut_messages, read_chunk
+from rsltrace.bag.mcap_index import CutOffError, read_index
+from rsltrace.bag.mcap_records import MAGIC, Channel
+from rsltrace.bag.mcap_scan import McapIndex, Span
+from rsltrace.bag.merge import Message
+from rsltrace.bag.qos import parse_qos
+from rsltrace.bag.storage import Extent, StoredTopic
+from rsltrace.errors import BagError
+from rsltrace.model.stamp import format_seconds
+
+
+class McapFile:
+    """One open ``.mcap`` file. Raises ``BagError`` when it is no ROS 2 recording or damaged."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._file = path.open("rb")
+        try:
+            self._index = self._read_index()
+            self._spans = {span.offset: span for span in self._index.spans}
+            channels = self._index.channels.values()
+            self.topics = [self._topic(channel) for channel in channels]
+        except BaseException:
+            self._file.close()
+            raise
+        self.message_count = self._index.counts.total()
+        self.start_ns, self.end_ns = self._index.start_ns, self._index.end_ns
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
+        """Return the chunks that may hold wanted messages, in file order."""
+        extents = []
+        for span in self._index.spans:
+            known = span.channels is None or not span.channels.isdisjoint(wanted)
+            if known and span.end_ns >= first_ns:
+                extents.append(
+                    Extent(span.offset, span.length, max(span.start_ns, first_ns), span.end_ns)
+                )
+        return extents
+
+    def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
+        """Yield the wanted messages of a chunk by time, equal times in file order."""
+        yield from self._messages(self._spans[extent.offset], wanted, first_ns)
+
+    def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
+        """Return how many wanted messages there are."""
+        count = sum(self._index.counts[channel] for channel in wanted)
+        for span in self._index.spans if first_ns > self.start_ns else []:
+            if span.start_ns < first_ns:
+                messages = self._messages(span, wanted, 0)
+                count -= sum(stamp_ns < first_ns for stamp_ns, _, _ in messages)
+        return count
+
+    def last_ns(self, wanted: Mapping[int, int], first_ns: int) -> int | None:
+        """Return the time of the last wanted message."""
+        last_ns: int | None = None
+        extents = self.extents(wanted, first_ns)
+        for extent in sorted(extents, key=lambda extent: extent.end_ns, reverse=True):
+            if last_ns is not None and extent.end_ns <= last_ns:
+                break
+            messages = self._messages(self._spans[extent.offset], wanted, first_ns)
+            if messages:
+                last_ns = max(messages[-1][0], last_ns or 0)
+        return last_ns
+
+    def _messages(self, span: Span, wanted: Mapping[int, int], first_ns: int) -> list[Message]:
+        if self._file.closed:
+            raise ValueError(f"{self.path} is closed")
+        try:
+            if span.is_chunk:
+                data = read_chunk(self._file, span.offset, span.length)
+            else:
+                self._file.seek(span.offset)
+                data = self._file.read(span.length)
+            messages = cut_messages(data, wanted, first_ns)
+            # The order of the whole stream rests on these two times.
+            if messages and not (span.start_ns <= messages[0][0] <= messages[-1][0] <= span.end_ns):
+                raise ValueError("messages lie outside the times the index promises")
+        except (ValueError, OSError) as error:
+            raise BagError(
+                f"{self.path}: {error}, in the {'chunk' if span.is_chunk else 'messages'} at byte "
+                f"{span.offset} (log time {format_seconds(span.start_ns)} to "
+                f"{format_seconds(span.end_ns)}); repair it with 'mcap recover'"
+            ) from None
+        return messages
+
+    def _read_index(self) -> McapIndex:
+        magic = self._file.read(len(MAGIC))
+        if magic != MAGIC:
+            raise BagError(f"{self.path}: not an MCAP file")
+        size = self._file.seek(0, 2)
+        try:
+            index = read_index(self._file, size)
+        except CutOffError as error:
+            raise BagError(
+                f"{self.path}: the recording was cut off, its footer and index are missing: "
+                f"{error}. Repair it with 'mcap recover {self.path.name} -o repaired.mcap' (and "
+                "'ros2 bag reindex' if it belongs to a bag folder)"
+            ) from None
+        except (ValueError, OSError) as error:
+            raise BagError(f"{self.path}: {error}; repair it with 'mcap recover'") from None
+        if index.profile not in ("ros2", ""):
+            ros1 = index.profile == "ros1"
+            advice = "; convert it with 'rosbags-convert'" if ros1 else ""
+            raise BagError(
+                f"{self.path}: not a ROS 2 recording: its MCAP profile is {index.profile!r}{advice}"
+            )
+        return index
+
+    def _topic(self, channel: Channel) -> StoredTopic:
+        schema = self._index.schemas.get(channel.schema_id)
+        try:
+            offered = parse_qos(channel.metadata.get("offered_qos_profiles", ""))
+        except ValueError as error:
+            raise BagError(f"{self.path}: topic {channel.topic}: {error}") from None
+        return StoredTopic(
+            id=channel.id,
+            name=channel.topic,
+            type_name=schema.name if schema else "",
+            serialization_format=channel.message_encoding,
+            offered_qos=offered,
+            message_count=self._index.counts[channel.id],
+            schema_text=schema.text if schema and schema.text else None,
+            schema_encoding=schema.encoding if schema and schema.text else "",
+            type_hash=channel.metadata.get("topic_type_hash", ""),
+        )

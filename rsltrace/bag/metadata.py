@@ -1,0 +1,96 @@
+"""Reading ``metadata.yaml``: which files a bag has, of which storage, compressed how."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from rsltrace.bag.qos import parse_qos
+from rsltrace.bag.topic import BagQos
+from rsltrace.errors import BagError
+
+NAME = "metadata.yaml"
+STORAGE_IDS = ("mcap", "sqlite3")
+
+
+@dataclass(frozen=True, slots=True)
+class BagMetadata:
+    """What has to be known before the storage files are opened.
+
+    ``compression`` is ``""``, ``"file"`` or ``"message"`` (always zstd). ``topics`` has the QoS and
+    the type's hash by (topic, type), for storage files that do not keep them.
+    """
+
+    storage_id: str
+    files: tuple[Path, ...]
+    compression: str
+    topics: dict[tuple[str, str], tuple[tuple[BagQos, ...], str]]
+
+
+def read_metadata(folder: Path) -> BagMetadata:
+    """Return the metadata of the bag in ``folder``. Raises ``BagError`` saying what to do."""
+    path = folder / NAME
+    if not path.is_file():
+        recordings = sorted(
+            p.name for p in folder.iterdir() if ".mcap" in p.name or ".db3" in p.name
+        )
+        if not recordings:
+            raise BagError(f"{folder}: not a bag: there is no {NAME} and no recording in it")
+        raise BagError(
+            f"{folder}: there is no {NAME}; make one with 'ros2 bag reindex {folder.name}', or "
+            f"name a file in it ({', '.join(recordings)})"
+        )
+    values = _load(path)
+    try:
+        information = values["rosbag2_bagfile_information"]
+        storage_id = information["storage_identifier"]
+        names = list(information["relative_file_paths"])
+        mode = str(information.get("compression_mode") or "").lower()
+        scheme = str(information.get("compression_format") or "")
+        topics = dict(map(_topic, information["topics_with_message_count"]))
+    except KeyError as error:
+        raise BagError(f"{path}: the key {error} is missing; run 'ros2 bag reindex'") from None
+    except (TypeError, AttributeError, ValueError):
+        raise BagError(f"{path}: not the metadata of a bag; run 'ros2 bag reindex'") from None
+    if storage_id not in STORAGE_IDS:
+        raise BagError(
+            f"{path}: the storage {storage_id!r} is unknown (only {' and '.join(STORAGE_IDS)}); "
+            "convert the bag with 'ros2 bag convert'"
+        )
+    compression = "" if mode in ("", "none") else mode
+    if compression not in ("", "file", "message") or (compression and scheme != "zstd"):
+        raise BagError(
+            f"{path}: the compression {scheme!r} by {mode!r} is unknown (only zstd, by file or "
+            "message); convert the bag with 'ros2 bag convert'"
+        )
+    # Before version 4 the folder's name stood in front. Only names are taken, so a bag cannot
+    # point outside its folder.
+    files = tuple(folder / PurePosixPath(str(name)).name for name in names)
+    if not files:
+        raise BagError(f"{path}: no storage files are listed: the bag is empty")
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise BagError(
+            f"{path}: {', '.join(missing)} is listed but not there; put it back, or run "
+            "'ros2 bag reindex' to do without"
+        )
+    return BagMetadata(storage_id, files, compression, topics)
+
+
+def _topic(item: Any) -> tuple[tuple[str, str], tuple[tuple[BagQos, ...], str]]:
+    values = item["topic_metadata"]
+    offered = parse_qos(values.get("offered_qos_profiles", ""))
+    return (values["name"], values["type"]), (offered, values.get("type_description_hash") or "")
+
+
+def _load(path: Path) -> Any:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+    except (YAMLError, UnicodeDecodeError) as error:
+        raise BagError(f"{path}: not YAML ({error}); run 'ros2 bag reindex'") from None
+    except OSError as error:
+        raise BagError(f"{path}: {error.strerror}") from None

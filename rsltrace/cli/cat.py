@@ -1,0 +1,212 @@
+"""``rsltrace cat``: the events of a trace, one per line, for people and pipes."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.cli.event_text import EventJson, EventText
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import Event, EventKind, Output
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.segments import event_of, output_of
+
+_TOPIC_KINDS = frozenset(
+    (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
+)
+
+
+class _Time(click.ParamType[int]):
+    """A simulated time: seconds, or a number with a unit, exactly as in a job."""
+
+    name = "time"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return nanoseconds, or end with a usage error."""
+        if isinstance(value, int):
+            return value
+        from rsltrace.job.times import parse_time  # the job package needs pydantic, we do not
+
+        text = str(value).strip()
+        try:
+            return parse_time(text if text[-1:].isalpha() else f"{text}s")
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
+@click.option("--payloads", is_flag=True, help="With --json: add the decoded messages.")
+@click.option(
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="GLOB",
+    help="Only events that receive from or send to such a topic or service.",
+)
+@click.option("--node", "nodes", multiple=True, metavar="GLOB", help="Only events of such nodes.")
+@click.option(
+    "--entity",
+    "entities",
+    multiple=True,
+    metavar="ID|GLOB",
+    help="Only events of these entities, by id or name.",
+)
+@click.option(
+    "--kind",
+    "kinds",
+    multiple=True,
+    type=click.Choice([kind.label for kind in EventKind]),
+    help="Only events of this kind.",
+)
+@click.option(
+    "--from",
+    "from_ns",
+    type=_Time(),
+    metavar="T",
+    help="Only from simulated time T on (seconds, or 90s, 5ms, …).",
+)
+@click.option(
+    "--to", "to_ns", type=_Time(), metavar="T", help="Only up to simulated time T, T included."
+)
+@click.option("--limit", type=click.IntRange(min=0), metavar="N", help="At most N events.")
+def cat(
+    trace: Path,
+    as_json: bool,
+    payloads: bool,
+    topics: tuple[str, ...],
+    nodes: tuple[str, ...],
+    entities: tuple[str, ...],
+    kinds: tuple[str, ...],
+    from_ns: int | None,
+    to_ns: int | None,
+    limit: int | None,
+) -> None:
+    """Print the events of TRACE, one per line, in the order they happened.
+
+    Columns: index, simulated time in seconds, node, kind, entity, hash of the input, hash of the
+    outputs, the outputs (/topic, call /service, reply /service, log LEVEL text, …), [flags].
+
+    Options of different names must all hold; of several values of one option, any. Globs are
+    shell patterns that match whole names: --topic '/robot1/*'.
+    """
+    if payloads and not as_json:
+        raise click.UsageError("--payloads needs --json")
+    with Trace.open(trace) as opened:
+        choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
+        write = sys.stdout.write
+        form = _json_form(opened, payloads) if as_json else EventText(opened).line
+        for event, outputs in islice(_events(opened, choice), limit):
+            write(form(event, outputs) + "\n")
+
+
+def _json_form(trace: Trace, payloads: bool) -> Callable[[Event, list[Output]], str]:
+    make = EventJson(trace, payloads=payloads).object
+    return lambda event, outputs: json.dumps(make(event, outputs), allow_nan=False)
+
+
+@dataclass(frozen=True, slots=True)
+class _Choice:
+    """Which events are wanted. None stands for all; arrays hold sorted numbers."""
+
+    entities: npt.NDArray[np.uint32] | None
+    touching: npt.NDArray[np.uint32] | None
+    kinds: npt.NDArray[np.uint8] | None
+    from_ns: int
+    to_ns: int
+
+
+def _choice(
+    trace: Trace,
+    topics: tuple[str, ...],
+    nodes: tuple[str, ...],
+    entities: tuple[str, ...],
+    kinds: tuple[str, ...],
+    from_ns: int | None,
+    to_ns: int | None,
+) -> _Choice:
+    everything = list(trace.entities.values())
+    wanted: set[int] | None = None
+    touching = None
+    if nodes:
+        owners = {e.id for e in everything if e.kind is EntityKind.NODE and _any(e.name, nodes)}
+        _warn_if_none(owners, "node", nodes, [e for e in everything if e.kind is EntityKind.NODE])
+        wanted = {e.id for e in everything if e.node in owners}
+    if entities:
+        named = {e.id for e in everything if _any(e.name, entities) or str(e.id) in entities}
+        _warn_if_none(named, "entity", entities, everything)
+        wanted = named if wanted is None else wanted & named
+    if topics:
+        with_topic = [e for e in everything if e.kind in _TOPIC_KINDS]
+        on_topic = {e.id for e in with_topic if _any(e.name, topics)}
+        _warn_if_none(on_topic, "topic or service", topics, with_topic)
+        touching = np.array(sorted(on_topic), dtype=np.uint32)
+    labels = [kind for kind in EventKind if kind.label in kinds]
+    return _Choice(
+        entities=None if wanted is None else np.array(sorted(wanted), dtype=np.uint32),
+        touching=touching,
+        kinds=np.array(labels, dtype=np.uint8) if kinds else None,
+        from_ns=0 if from_ns is None else from_ns,
+        to_ns=2**64 - 1 if to_ns is None else to_ns,
+    )
+
+
+def _any(name: str, globs: tuple[str, ...]) -> bool:
+    return bool(name) and any(fnmatchcase(name, glob) for glob in globs)
+
+
+def _warn_if_none(found: set[int], what: str, globs: tuple[str, ...], all_: list[Entity]) -> None:
+    """An empty answer to a mistyped name looks like a run in which nothing happened: say so."""
+    if not found:
+        names = ", ".join(sorted({e.name for e in all_ if e.name})[:12]) or "none"
+        click.echo(
+            f"rsltrace: no {what} of the trace matches {' or '.join(globs)}; there are: {names}",
+            err=True,
+        )
+
+
+def _events(trace: Trace, choice: _Choice) -> Iterator[tuple[Event, list[Output]]]:
+    """Yield the chosen events with their outputs; memory is that of one segment."""
+    segments = trace.segments
+    for row in segments:
+        if row["end_stamp"] < choice.from_ns or row["start_stamp"] > choice.to_ns:
+            continue
+        first = int(row["first_event"])
+        last = first + int(row["events"])
+        events = next(trace.events(first, last))
+        outputs = next(trace.outputs(first, last))
+        ends = np.searchsorted(outputs["event"], events["index"], side="right").tolist()
+        for position in np.flatnonzero(_mask(events, outputs, choice)).tolist():
+            begin = ends[position - 1] if position else 0
+            own = [output_of(output) for output in outputs[begin : ends[position]]]
+            yield event_of(events[position]), own
+
+
+def _mask(
+    events: npt.NDArray[np.void], outputs: npt.NDArray[np.void], choice: _Choice
+) -> npt.NDArray[np.bool_]:
+    stamps = events["stamp"]
+    mask: npt.NDArray[np.bool_] = (stamps >= np.uint64(choice.from_ns)) & (
+        stamps <= np.uint64(choice.to_ns)
+    )
+    if choice.kinds is not None:
+        mask &= np.isin(events["kind"], choice.kinds)
+    if choice.entities is not None:
+        mask &= np.isin(events["entity"], choice.entities)
+    if choice.touching is not None:
+        touching = np.isin(events["entity"], choice.touching)
+        senders = outputs["event"][np.isin(outputs["entity"], choice.touching)]
+        touching[(senders - events["index"][0]).astype(np.intp)] = True
+        mask &= touching
+    return mask

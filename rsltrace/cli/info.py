@@ -1,0 +1,193 @@
+"""``rsltrace info``: what is in a trace, for people and (``--json``) for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import click
+
+from rsltrace.cli.text import printable, table
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.trace.counts import Counts, count
+from rsltrace.trace.format import FORMAT_VERSION
+from rsltrace.trace.reader import Trace
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.option("--check", is_flag=True, help="First read the whole file and check every hash.")
+def info(trace: Path, as_json: bool, check: bool) -> None:
+    """Show what is in TRACE: its digest, counts, nodes and entities with their rates.
+
+    Two traces with the same digest hold the same run. A rate is that of an entity's events (of
+    what it sent, for publishers) from the first to the last, in simulated time. A trace whose run
+    was killed is shown as far as it goes.
+    """
+    with Trace.open(trace) as opened:
+        if check:
+            opened.check()
+        counts = count(opened)
+        if as_json:
+            click.echo(json.dumps(_as_json(opened, counts), indent=2))
+        else:
+            click.echo("\n".join(_as_text(opened, counts)))
+
+
+def _as_text(trace: Trace, counts: Counts) -> list[str]:
+    start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
+    size = f"{trace.size} bytes, format {FORMAT_VERSION}, {printable(trace.header.library)}"
+    lines = table(
+        (
+            ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
+            ("state", _state(trace)),
+            ("digest", trace.digest),
+            ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})"),
+            ("events", _by_kind(trace.event_count, counts.event_kinds, _event_kind)),
+            ("outputs", _by_kind(trace.output_count, counts.output_kinds, _output_kind)),
+        )
+    )
+    for title, mapping in (("job", trace.job), ("environment", trace.environment)):
+        if mapping:
+            rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
+            lines += ["", title, *table(rows)]
+    lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts)]
+    return lines
+
+
+def _short(value: str) -> str:
+    """Return a value of metadata as it fits on a line; whole job files stand there, too."""
+    text = printable(value)
+    return text if len(text) <= _VALUE_MAX else f"{len(text)} characters (see --json)"
+
+
+def _state(trace: Trace) -> str:
+    if not trace.complete:
+        return "interrupted: the file has no end (the run was killed, or is still going on)"
+    reason = printable(trace.result.get("stop_reason", "no reason given"))
+    return f"complete: {reason}, exit code {printable(trace.result.get('exit_code', 'unknown'))}"
+
+
+def _node_lines(trace: Trace, counts: Counts) -> list[str]:
+    nodes = _nodes(trace)
+    rows = [("  node", "entities", "events", "outputs")]
+    for node in nodes:
+        owned = [e.id for e in trace.entities.values() if e.node == node.id]
+        events = sum(counts.events[e].count for e in owned if e in counts.events)
+        outputs = sum(counts.outputs[e].count for e in owned if e in counts.outputs)
+        rows.append((f"  {printable(node.name)}", str(len(owned)), str(events), str(outputs)))
+    title = f"nodes: {len(nodes)}"
+    return [title, *table(rows, right=frozenset((1, 2, 3)))] if nodes else [title]
+
+
+def _entity_lines(trace: Trace, counts: Counts) -> list[str]:
+    rows = [("  id", "node", "kind", "name", "type", "events", "outputs", "Hz")]
+    for entity in _entities(trace, counts):
+        rate = counts.rate_hz(entity.id)
+        rows.append(
+            (
+                f"  {entity.id}",
+                _owner(trace, entity),
+                entity.kind.label,
+                printable(entity.name) or "-",
+                printable(entity.type) or "-",
+                str(_count(counts.events, entity.id)),
+                str(_count(counts.outputs, entity.id)),
+                "-" if rate is None else f"{rate:.6g}",
+            )
+        )
+    return [f"entities: {len(rows) - 1}", *table(rows, right=frozenset((0, 5, 6, 7)))]
+
+
+def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
+    return {
+        "trace": trace.name,
+        "size_bytes": trace.size,
+        "format_version": FORMAT_VERSION,
+        "library": trace.header.library,
+        "complete": trace.complete,
+        "digest": trace.digest,
+        "start_ns": trace.start_ns,
+        "end_ns": trace.end_ns,
+        "duration_ns": _duration_ns(trace),
+        "events": trace.event_count,
+        "outputs": trace.output_count,
+        "event_kinds": {_event_kind(k): n for k, n in sorted(counts.event_kinds.items())},
+        "output_kinds": {_output_kind(k): n for k, n in sorted(counts.output_kinds.items())},
+        "result": trace.result,
+        "job": trace.job,
+        "environment": trace.environment,
+        "nodes": [node.name for node in _nodes(trace)],
+        "entities": [
+            {
+                "id": entity.id,
+                "node": entity.node,
+                "kind": entity.kind.name.lower(),
+                "name": entity.name,
+                "type": entity.type,
+                "created_ns": entity.created_ns,
+                "detail": entity.detail,
+                "events": _count(counts.events, entity.id),
+                "outputs": _count(counts.outputs, entity.id),
+                "rate_hz": counts.rate_hz(entity.id),
+            }
+            for entity in _entities(trace, counts)
+        ],
+        "topics": [
+            {
+                "name": channel.topic,
+                "type": channel.type,
+                "messages": trace.message_counts.get(channel.id, 0),
+            }
+            for channel in trace.channels.values()
+        ],
+    }
+
+
+def _nodes(trace: Trace) -> list[Entity]:
+    return [e for e in trace.entities.values() if e.kind is EntityKind.NODE]
+
+
+def _entities(trace: Trace, counts: Counts) -> list[Entity]:
+    """All entities; the run itself only where it did something (constructing nodes, say)."""
+    return [
+        entity
+        for entity in sorted(trace.entities.values(), key=lambda e: e.id)
+        if entity.id or _count(counts.events, 0) or _count(counts.outputs, 0)
+    ]
+
+
+def _owner(trace: Trace, entity: Entity) -> str:
+    owner = trace.entities.get(entity.node)
+    return printable(owner.name) if owner is not None and owner.name else "-"
+
+
+def _duration_ns(trace: Trace) -> int:
+    return max(trace.end_ns - trace.start_ns, 0)
+
+
+def _count(series: Mapping[int, Any], entity: int) -> int:
+    return series[entity].count if entity in series else 0
+
+
+def _by_kind(total: int, kinds: Mapping[int, int], label: Any) -> str:
+    parts = ", ".join(f"{label(kind)} {number}" for kind, number in sorted(kinds.items()))
+    return f"{total}  ({parts})" if parts else str(total)
+
+
+def _event_kind(number: int) -> str:
+    return EventKind(number).label if number in _EVENT_KINDS else f"kind {number}"
+
+
+def _output_kind(number: int) -> str:
+    return OutputKind(number).label if number in _OUTPUT_KINDS else f"kind {number}"
+
+
+_VALUE_MAX = 100
+_EVENT_KINDS = frozenset(map(int, EventKind))
+_OUTPUT_KINDS = frozenset(map(int, OutputKind))

@@ -1,0 +1,87 @@
+"""The two rsltrace messages that hold strings, as CDR.
+
+Events and outputs are fixed-size and packed by ``struct``; entities and details are few and small,
+and writing them needs four rules of CDR, not a code generator.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.trace.format import CDR_HEADER
+
+_ENTITY_HEAD = struct.Struct("<IIB")
+_DETAIL_HEAD = struct.Struct("<QI")
+_LENGTH = struct.Struct("<I")
+_KINDS = frozenset(map(int, EntityKind))
+
+
+def pack_entity(entity: Entity) -> bytes:
+    """Return an ``rsltrace_msgs/msg/Entity``. Its ``created_ns`` is the time of the message."""
+    head = CDR_HEADER + _ENTITY_HEAD.pack(entity.id, entity.node, entity.kind)
+    # Sorted keys: equal details give equal bytes however the recorder came by them.
+    detail = json.dumps(entity.detail, sort_keys=True, separators=(",", ":"), ensure_ascii=False)
+    return _append_strings(head, entity.name, entity.type, detail)
+
+
+def unpack_entity(data: bytes, created_ns: int) -> Entity:
+    """Return the entity of one message. Raises TraceError when the bytes are not one."""
+    try:
+        _check_header(data)
+        entity_id, node, kind = _ENTITY_HEAD.unpack_from(data, 4)
+        name, type_name, detail_text = _read_strings(data, 4 + _ENTITY_HEAD.size, 3)
+        detail = json.loads(detail_text)
+        if not isinstance(detail, dict):
+            raise ValueError("its detail is not a JSON object")
+        if kind not in _KINDS:
+            raise ValueError(f"it is of kind {kind}, which only a newer rsltrace knows")
+        return Entity(entity_id, node, EntityKind(kind), name, type_name, created_ns, detail)
+    except (struct.error, ValueError, RecursionError) as error:
+        raise TraceError(f"an entity of the trace cannot be read: {error}") from error
+
+
+def pack_detail(event: int, output: int, text: str) -> bytes:
+    """Return an ``rsltrace_msgs/msg/Detail``: the text that belongs to one output of one event."""
+    return _append_strings(CDR_HEADER + _DETAIL_HEAD.pack(event, output), text)
+
+
+def unpack_detail(data: bytes) -> tuple[int, int, str]:
+    """Return (event, output, text). Raises TraceError when the bytes are not a detail."""
+    try:
+        _check_header(data)
+        event, output = _DETAIL_HEAD.unpack_from(data, 4)
+        (text,) = _read_strings(data, 4 + _DETAIL_HEAD.size, 1)
+        return event, output, text
+    except (struct.error, ValueError) as error:
+        raise TraceError(f"a detail of the trace cannot be read: {error}") from error
+
+
+def _append_strings(head: bytes, *texts: str) -> bytes:
+    data = bytearray(head)
+    for text in texts:
+        data += bytes(-(len(data) - 4) % 4)  # a string's length is aligned to 4, after the header
+        # A name may hold what is not valid Unicode (surrogates from os.fsdecode): keep it readable.
+        encoded = text.encode("utf-8", "backslashreplace") + b"\0"
+        data += _LENGTH.pack(len(encoded)) + encoded
+    return bytes(data)
+
+
+def _check_header(data: bytes) -> None:
+    if data[:4] != CDR_HEADER:
+        raise ValueError("it is not little-endian CDR")
+
+
+def _read_strings(data: bytes, offset: int, count: int) -> list[str]:
+    texts = []
+    for _ in range(count):
+        offset += -(offset - 4) % 4
+        (length,) = _LENGTH.unpack_from(data, offset)
+        end = offset + 4 + length
+        if length == 0 or end > len(data) or data[end - 1] != 0:
+            raise ValueError("a string in it is cut off")
+        texts.append(data[offset + 4 : end - 1].decode("utf-8"))
+        offset = end
+    return texts

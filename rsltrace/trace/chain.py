@@ -1,0 +1,59 @@
+"""The hashes that make a run comparable: one chain over all events, one fold over their outputs.
+
+    chain_0 = H(rest_0, seed 0)          chain_i = H(rest_i, seed chain_{i-1})
+
+where ``rest_i`` is event i as packed by ``EVENT_REST`` (everything but the chain hash itself) and
+H is XXH3-64. A chain hash thus stands for the whole run up to its event, and two traces agree up
+to event i exactly when their chain hashes agree at i. An event's output hash folds its outputs:
+
+    h = 0, then for each output in order: h = H(packed[OUTPUT_HASHED], seed h)
+
+XXH3 is fast and well distributed, not cryptographic: it finds differences, it does not stop
+somebody who wants two runs to collide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+
+from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_HASHED
+
+hash64 = xxhash.xxh3_64_intdigest
+"""``hash64(data: bytes, seed: int = 0) -> int``: XXH3-64 as an unsigned integer. The library's
+function itself and not a wrapper of it, since the loop calls this several times per event."""
+
+
+def digest_text(chain_hash: int) -> str:
+    """Return a run's digest as people see it: its last chain hash (0: no events) in hex."""
+    return f"{chain_hash:016x}"
+
+
+def output_hash(packed_outputs: Iterable[bytes]) -> int:
+    """Return the output hash of an event from its outputs as packed by ``OUTPUT``, in order."""
+    folded = 0
+    for packed in packed_outputs:
+        folded = hash64(packed[OUTPUT_HASHED], folded)
+    return folded
+
+
+def verify_chain(events: npt.NDArray[np.void], previous: int = 0) -> int | None:
+    """Check the chain hashes of consecutive events.
+
+    ``events`` has the fields of ``EVENT_DTYPE``, shape (n,); ``previous`` is the chain hash of the
+    event before the first (0 at the start of a run). Returns the position in ``events`` of the
+    first event whose chain hash is not that of its contents, or None.
+    """
+    packed = np.ascontiguousarray(events, dtype=EVENT_DTYPE).tobytes()
+    size = EVENT_DTYPE.itemsize
+    start_of_rest = size - EVENT_REST_DTYPE.itemsize
+    hashes: list[int] = events["chain_hash"].tolist()
+    for position, chain_hash in enumerate(hashes):
+        offset = position * size
+        previous = hash64(packed[offset + start_of_rest : offset + size], previous)
+        if previous != chain_hash:
+            return position
+    return None

@@ -1,0 +1,164 @@
+"""Messages of a trace as objects, decoded by the schemas that the trace itself carries.
+
+rosbags generates a Python decoder per type from schema text. A trace may come from anybody, so its
+schemas are checked before they reach that generator: only the parsed structure goes on, every name
+in it is a plain identifier, sizes and nesting are bounded, and constants (which decoding does not
+need) are left out. Opening a trace runs none of this; only decoding a message does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys.base import TypesysError
+from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
+from rosbags.typesys.store import Typestore
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.format import SCHEMA_ENCODING
+from rsltrace.trace.index import ChannelInfo
+
+_TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
+_FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
+_INTEGER_TYPES = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
+_BASE_TYPES = _INTEGER_TYPES | {"bool", "byte", "char", "float32", "float64", "string"}
+_SCHEMA_BYTES_MAX = 1 << 20
+_NESTING_MAX = 32
+_ARRAY_ITEMS_MAX = 1 << 32
+_UNROLLED_ITEMS_MAX = 4096
+"""The generator writes a statement per element of a fixed array of strings or messages."""
+_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
+
+
+class Decoder:
+    """Decodes the messages of one channel's schema."""
+
+    def __init__(self, channel: ChannelInfo) -> None:
+        """Check the schema and make the decoder. Raises TraceError if the schema is unusable."""
+        self._channel = channel
+        if channel.schema_encoding != SCHEMA_ENCODING:
+            raise self._unusable(f"its encoding is {channel.schema_encoding!r}")
+        if len(channel.schema_text) > _SCHEMA_BYTES_MAX:
+            raise self._unusable(f"it is longer than {_SCHEMA_BYTES_MAX} characters")
+        if not _TYPE_NAME.fullmatch(channel.type):
+            raise self._unusable(f"{channel.type!r} is no name of a type")
+        # Types named without a package are looked up beside the type: those a service names are in
+        # the package's msg folder, as if the request or response stood there itself.
+        self._name = normalize_msgtype(channel.type.replace("/srv/", "/msg/", 1))
+        try:
+            types = get_types_from_msg(channel.schema_text, self._name)
+            checked: dict[str, Any] = {name: ([], _checked_fields(name, types)) for name in types}
+            depths: dict[str, int] = {}
+            for name in types:
+                _nesting(name, types, depths)
+            # A store of its own per schema: two channels may define one type in different ways.
+            self._store = Typestore()
+            self._store.register(checked)
+            self._store.get_msgdef(self._name)
+        except (TypesysError, _UnsafeSchema, RecursionError, KeyError) as error:
+            raise self._unusable(error) from error
+
+    def decode(self, data: bytes) -> object:
+        """Return the message, an instance of a class made for its type. Raises TraceError.
+
+        Arrays and sequences of numbers are numpy arrays; fields are attributes by their ROS names
+        (with an underscore behind those that Python reserves).
+        """
+        try:
+            return self._store.deserialize_cdr(data, self._name)
+        except (SerdeError, IndexError, OverflowError, MemoryError, TypeError) as error:
+            raise TraceError(
+                f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "
+                f"{error}"
+            ) from error
+
+    def _unusable(self, why: object) -> TraceError:
+        first_line = (str(why).splitlines() or [type(why).__name__])[0]
+        return TraceError(
+            f"messages on {self._channel.topic} cannot be decoded: the trace's schema of "
+            f"{self._channel.type or 'their type'} is not usable ({first_line})"
+        )
+
+
+def to_plain(value: object) -> Any:
+    """Return a decoded message as what ``json`` writes: dicts, lists, numbers, strings.
+
+    JSON has no NaN or infinity; they become the strings ``NaN``, ``Infinity``, ``-Infinity``.
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {
+            field.name: to_plain(getattr(value, field.name))
+            for field in dataclasses.fields(value)
+            if field.name not in _NOT_OF_THE_MESSAGE
+        }
+    if isinstance(value, np.ndarray):
+        values = value.tolist()
+        if value.dtype.kind == "f" and not np.isfinite(value).all():
+            return [to_plain(item) for item in values]
+        return values
+    if isinstance(value, list):
+        return [to_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
+class _UnsafeSchema(ValueError):
+    """The schema says something that no ROS interface says."""
+
+
+def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:
+    """Return the fields of type ``name`` after checking all that the generator makes code of."""
+    if not _TYPE_NAME.fullmatch(name):
+        raise _UnsafeSchema(f"{name!r} is no name of a type")
+    fields: list[tuple[str, Any]] = types[name][1]
+    for field_name, description in fields:
+        if not _FIELD_NAME.fullmatch(field_name):
+            raise _UnsafeSchema(f"{field_name!r} is no name of a field")
+        _check_type(description, types)
+    return fields
+
+
+def _check_type(description: Any, types: dict[str, Any]) -> None:
+    kind, detail = description
+    if kind == Nodetype.BASE:
+        base, limit = detail
+        if base not in _BASE_TYPES or not isinstance(limit, int):
+            raise _UnsafeSchema(f"there is no type {base!r}")
+    elif kind == Nodetype.NAME:
+        if detail not in types:
+            raise _UnsafeSchema(f"it does not define {detail!r}")
+    elif kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+        item, size = detail
+        if item[0] not in (Nodetype.BASE, Nodetype.NAME):
+            raise _UnsafeSchema("it has an array of arrays")
+        _check_type(item, types)
+        unrolled = kind == Nodetype.ARRAY and (item[0] == Nodetype.NAME or item[1][0] == "string")
+        limit = _UNROLLED_ITEMS_MAX if unrolled else _ARRAY_ITEMS_MAX
+        # A fixed array of nothing would let arrays of arrays count forever without using data.
+        smallest = 1 if kind == Nodetype.ARRAY else 0
+        if not isinstance(size, int) or not smallest <= size <= limit:
+            raise _UnsafeSchema(f"an array cannot have {size} items")
+    else:
+        raise _UnsafeSchema(f"there is no kind of field {kind!r}")
+
+
+def _nesting(name: str, types: dict[str, Any], known: dict[str, int]) -> int:
+    """Return how deeply type ``name`` nests others; ``known`` keeps what was found before."""
+    if name not in known:
+        known[name] = _NESTING_MAX  # what a type that contains itself finds
+        inner = [0]
+        for _, (kind, detail) in types[name][1]:
+            item = detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
+            if item[0] == Nodetype.NAME:
+                inner.append(1 + _nesting(item[1], types, known))
+        if max(inner) >= _NESTING_MAX:
+            raise _UnsafeSchema(f"{name!r} contains itself or is nested too deeply")
+        known[name] = max(inner)
+    return known[name]

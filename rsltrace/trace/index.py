@@ -1,0 +1,297 @@
+"""What is where in a trace file, and how the summary at its end tells.
+
+An interrupted trace has no summary; ``scan`` makes the same index by walking the file.
+"""
+
+from __future__ import annotations
+
+import struct
+from binascii import crc32
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+
+from rsltrace.errors import TraceFormatError
+from rsltrace.trace.format import (
+    ATTACHMENT_INDEX,
+    FORMAT_VERSION,
+    MCAP_MAGIC,
+    METADATA_FORMAT,
+    SEGMENT_DTYPE,
+)
+from rsltrace.trace.records import (
+    RECORD_HEAD,
+    Cursor,
+    Damaged,
+    Span,
+    damaged,
+    read_body,
+    read_head,
+)
+from rsltrace.trace.source import ByteSource
+
+_FOOTER = struct.Struct("<QQI")
+_FOOTER_BYTES = RECORD_HEAD.size + _FOOTER.size
+_CRC = struct.Struct("<I")
+_MESSAGE_INDEX_FIXED = RECORD_HEAD.size + 6
+_INDEX_ENTRY_BYTES = 16
+
+
+class Header(NamedTuple):
+    """The first record of the file: the profile (``ros2``) and what wrote it."""
+
+    profile: str
+    library: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelInfo:
+    """A channel: a topic with its type and the ros2msg text of its schema."""
+
+    id: int
+    topic: str
+    type: str
+    schema_encoding: str
+    schema_text: str
+    metadata: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class ChunkEntry:
+    """A chunk: where it is, how many messages of each channel it holds, where their indexes are.
+
+    A channel without an index (the file was cut off behind the chunk) is found by walking.
+    """
+
+    span: Span
+    counts: Mapping[int, int]
+    indexes: Mapping[int, Span]
+
+
+@dataclass(slots=True)
+class TraceIndex:
+    """Everything needed to find things in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
+
+    ``summary_start`` is where the data section is over (0: nobody knows). ``chunks`` reads the
+    list of chunks, which only payloads need and opening does not.
+    """
+
+    complete: bool
+    header: Header
+    channels: dict[int, ChannelInfo] = field(default_factory=dict)
+    message_counts: dict[int, int] = field(default_factory=dict)
+    metadata: dict[str, Span] = field(default_factory=dict)
+    attachments: dict[str, Span] = field(default_factory=dict)
+    summary_start: int = 0
+    segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
+    chunks: Callable[[], Sequence[ChunkEntry]] = tuple
+
+
+Schemas = dict[int, tuple[str, str, str]]
+"""By schema id: name, encoding, text."""
+
+
+def read_header(source: ByteSource) -> tuple[Header, int]:
+    """Return the header and the offset behind it. Raises TraceFormatError if it is not MCAP."""
+    head = source.read_at(0, min(source.size, 16))
+    if not head:
+        raise TraceFormatError(
+            f"{source.name} is empty: the run that should have written it ended before it began"
+        )
+    if head[: len(MCAP_MAGIC)] != MCAP_MAGIC[: len(head)]:
+        what = "an SQLite file, maybe a rosbag2 recording" if head[:6] == b"SQLite" else "not MCAP"
+        raise TraceFormatError(
+            f"{source.name} is not a trace (it is {what}); a trace is what `rsltrace record` writes"
+        )
+    offset = len(MCAP_MAGIC)
+    if source.size < offset + RECORD_HEAD.size or source.size < sum(
+        span := Span(offset, read_head(source, offset)[1])
+    ):
+        raise TraceFormatError(f"{source.name} ends in its first record: nothing can be read of it")
+    try:
+        cursor = Cursor(read_body(source, span, Opcode.HEADER, "the header"))
+        return Header(cursor.text(), cursor.text()), sum(span)
+    except Damaged as error:
+        raise damaged(source, offset, "the header", error) from error
+
+
+def has_end(source: ByteSource) -> bool:
+    """Return whether the file ends as a finished MCAP file does."""
+    size = len(MCAP_MAGIC)
+    if source.size < 2 * size + _FOOTER_BYTES:
+        return False
+    return source.read_at(source.size - size, size) == MCAP_MAGIC
+
+
+def read_summary(source: ByteSource) -> TraceIndex:
+    """Return the index of a finished trace. Raises TraceError if it is damaged or no trace."""
+    header, _ = read_header(source)
+    index = TraceIndex(complete=True, header=header)
+    footer_at = source.size - len(MCAP_MAGIC) - _FOOTER_BYTES
+    footer = read_body(source, Span(footer_at, _FOOTER_BYTES), Opcode.FOOTER, "the footer")
+    start, _, crc = _FOOTER.unpack(footer)
+    if not 0 < start <= footer_at:
+        if start == 0:
+            raise not_a_trace(source, index)
+        raise damaged(source, footer_at, "the footer", "the summary would be outside of the file")
+    index.summary_start = start
+    data = source.read_at(start, footer_at - start + _FOOTER_BYTES)
+    if crc32(data[: -_CRC.size]) != crc:
+        # Other writers may leave the CRC out; then this is no trace of ours, which says it better.
+        if crc == 0:
+            raise not_a_trace(source, index)
+        raise damaged(source, start, "the summary", "its checksum does not match")
+    try:
+        _parse_summary(index, data[:-_FOOTER_BYTES])
+    except Damaged as error:
+        raise damaged(source, start, "the summary", error) from error
+    check_version(source, index)
+    if ATTACHMENT_INDEX not in index.attachments:
+        raise TraceFormatError(f"{source.name} is incomplete: {ATTACHMENT_INDEX} is missing in it")
+    index.segments = _read_segments(source, index.attachments[ATTACHMENT_INDEX])
+    return index
+
+
+def _parse_summary(index: TraceIndex, summary: bytes) -> None:
+    schemas: Schemas = {}
+    chunk_bodies: list[bytes] = []
+    cursor = Cursor(summary)
+    while not cursor.at_end:
+        opcode, length = RECORD_HEAD.unpack(cursor.take(RECORD_HEAD.size))
+        body = cursor.take(length)
+        if opcode == Opcode.CHUNK_INDEX:
+            chunk_bodies.append(body)
+        elif opcode == Opcode.SCHEMA:
+            add_schema(schemas, body)
+        elif opcode == Opcode.CHANNEL:
+            add_channel(index, schemas, body)
+        elif opcode == Opcode.STATISTICS:
+            index.message_counts = _message_counts(body)
+        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+            entry = Cursor(body)
+            span = Span(entry.u64(), entry.u64())
+            if opcode == Opcode.ATTACHMENT_INDEX:
+                entry.take(24)  # log time, creation time, size
+                index.attachments[entry.text()] = span
+            else:
+                index.metadata[entry.text()] = span
+    index.chunks = lambda: [_chunk_entry(body) for body in chunk_bodies]
+
+
+def add_schema(schemas: Schemas, body: bytes) -> None:
+    """Take over a Schema record. Raises Damaged."""
+    cursor = Cursor(body)
+    schema_id = cursor.u16()
+    schemas[schema_id] = (cursor.text(), cursor.text(), cursor.text())
+
+
+def add_channel(index: TraceIndex, schemas: Schemas, body: bytes) -> None:
+    """Take over a Channel record, whose schema must be there. Raises Damaged."""
+    cursor = Cursor(body)
+    channel_id, schema_id = cursor.u16(), cursor.u16()
+    topic, _, metadata = cursor.text(), cursor.text(), cursor.mapping()
+    name, encoding, text = schemas.get(schema_id, ("", "", ""))
+    index.channels[channel_id] = ChannelInfo(channel_id, topic, name, encoding, text, metadata)
+
+
+def _message_counts(statistics: bytes) -> dict[int, int]:
+    cursor = Cursor(statistics)
+    cursor.take(42)  # counts of other things, and the times of the first and last message
+    return {row[0]: row[1] for row in cursor.integers("<HQ")}
+
+
+def _chunk_entry(body: bytes) -> ChunkEntry:
+    cursor = Cursor(body)
+    cursor.take(16)  # times
+    span = Span(cursor.u64(), cursor.u64())
+    # Each index reaches to the next one: that gives its length, and so the number of messages.
+    starts = sorted((offset, channel_id) for channel_id, offset in cursor.integers("<HQ"))
+    ends = [offset for offset, _ in starts[1:]] + [sum(span) + cursor.u64()]
+    indexes = {
+        channel_id: Span(offset, end - offset)
+        for (offset, channel_id), end in zip(starts, ends, strict=True)
+    }
+    counts = {
+        channel_id: (span.length - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
+        for channel_id, span in indexes.items()
+    }
+    return ChunkEntry(span, counts, indexes)
+
+
+def read_attachment(source: ByteSource, span: Span) -> bytes:
+    """Return the data of the attachment at ``span``, its CRC checked. Raises TraceError."""
+    body = read_body(source, span, Opcode.ATTACHMENT, "the attachment")
+    try:
+        if len(body) < _CRC.size or crc32(body[: -_CRC.size]) != _CRC.unpack(body[-_CRC.size :])[0]:
+            raise Damaged("its checksum does not match")
+        cursor = Cursor(body[: -_CRC.size])
+        cursor.take(16)  # times
+        cursor.text()
+        cursor.text()
+        return cursor.take(cursor.u64())
+    except Damaged as error:
+        raise damaged(source, span.offset, "the attachment", error) from error
+
+
+def read_metadata(source: ByteSource, span: Span) -> dict[str, str]:
+    """Return the mapping of the metadata record at ``span``. Raises TraceError."""
+    body = read_body(source, span, Opcode.METADATA, "the metadata")
+    try:
+        cursor = Cursor(body)
+        cursor.text()
+        return cursor.mapping()
+    except Damaged as error:
+        raise damaged(source, span.offset, "the metadata", error) from error
+
+
+def check_version(source: ByteSource, index: TraceIndex) -> None:
+    """Raise TraceFormatError unless this is a trace of the format version that is read here."""
+    if METADATA_FORMAT not in index.metadata:
+        raise not_a_trace(source, index)
+    version = read_metadata(source, index.metadata[METADATA_FORMAT]).get("version", "")
+    if version != str(FORMAT_VERSION):
+        raise TraceFormatError(
+            f"{source.name} has trace format {version or 'unknown'}, this rsltrace reads "
+            f"{FORMAT_VERSION}; it was written by {index.header.library}, which can read it"
+        )
+
+
+def not_a_trace(source: ByteSource, index: TraceIndex) -> TraceFormatError:
+    """Return the error for an MCAP file that somebody else wrote."""
+    profile, library = index.header
+    writer = f"written by {library!r}" if library else "of an unknown writer"
+    hint = "; to use it as input, name it under bags: in a job" if profile == "ros2" else ""
+    return TraceFormatError(
+        f"{source.name} is a plain MCAP recording ({writer}), not a trace of rsltrace{hint}"
+    )
+
+
+def _read_segments(source: ByteSource, span: Span) -> npt.NDArray[np.void]:
+    data = read_attachment(source, span)
+    if len(data) % SEGMENT_DTYPE.itemsize:
+        raise damaged(source, span.offset, ATTACHMENT_INDEX, "its length is not a multiple")
+    segments = np.frombuffer(data, dtype=SEGMENT_DTYPE)
+    size = np.uint64(source.size)
+    sound = all(
+        (
+            np.array_equal(segments["first_event"], _starts(segments["events"])),
+            np.array_equal(segments["first_output"], _starts(segments["outputs"])),
+            bool((segments["events"] > 0).all()),
+            bool((segments["events_offset"] <= size).all()),
+            bool((segments["events_length"] <= size).all()),
+            bool((segments["outputs_offset"] <= size).all()),
+            bool((segments["outputs_length"] <= size).all()),
+        )
+    )
+    if not sound:
+        raise damaged(source, span.offset, ATTACHMENT_INDEX, "its rows contradict each other")
+    return segments
+
+
+def _starts(counts: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Return where each count begins when they follow each other from 0."""
+    return np.cumsum(counts, dtype=np.uint64) - counts

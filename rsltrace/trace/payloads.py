@@ -1,0 +1,144 @@
+"""Finding the messages of a trace: by channel and sequence, or all of a topic.
+
+The chunk list says how many messages of a channel each chunk holds, so the n-th message of a
+channel is found by bisection: one chunk is unpacked, nothing is scanned.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from functools import cached_property, lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.index import ChunkEntry, TraceIndex
+from rsltrace.trace.records import (
+    Cursor,
+    Damaged,
+    MessageView,
+    Span,
+    damaged,
+    message_at,
+    read_body,
+    read_chunk,
+    walk_messages,
+)
+from rsltrace.trace.source import ByteSource
+
+_CHUNKS_CACHED = 4
+"""Payload chunks have about 1 MB, so this is memory; two topics read side by side need two."""
+
+_INDEX_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
+
+
+class PayloadReader:
+    """Reads messages of any channel."""
+
+    def __init__(self, source: ByteSource, index: TraceIndex) -> None:
+        self._source = source
+        self._index = index
+        self._records = lru_cache(maxsize=_CHUNKS_CACHED)(self._read_records)
+        self._offsets = lru_cache(maxsize=4 * _CHUNKS_CACHED)(self._read_offsets)
+
+    def message(self, channel_id: int, sequence: int) -> tuple[int, bytes]:
+        """Return (stamp in ns, data) of message number ``sequence`` of a channel.
+
+        Raises TraceError if the trace has no such message or is damaged where it is.
+        """
+        firsts, entries = self._by_channel.get(channel_id, ([], []))
+        position = bisect_right(firsts, sequence) - 1
+        if position < 0:
+            raise self._missing(channel_id, sequence)
+        entry = entries[position]
+        offsets = self._offsets(entry.span, channel_id)
+        place = sequence - firsts[position]
+        if place >= len(offsets):
+            raise self._missing(channel_id, sequence)
+        records = self._records(entry.span)
+        message = self._message_at(entry, records, offsets[place], channel_id)
+        if message.sequence != sequence:
+            raise damaged(self._source, entry.span.offset, "the chunk", "messages are out of order")
+        return message.log_time, records[message.start : message.end]
+
+    def messages(self, channel_ids: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (stamp in ns, sequence, data) of all messages of some channels, in file order."""
+        for entry in self._chunks:
+            wanted = [c for c in entry.counts if c in channel_ids]
+            if not wanted:
+                continue
+            records = self._read_records(entry.span)
+            places = [(offset, c) for c in wanted for offset in self._read_offsets(entry.span, c)]
+            for offset, channel_id in sorted(places):
+                message = self._message_at(entry, records, offset, channel_id)
+                yield message.log_time, message.sequence, records[message.start : message.end]
+
+    @cached_property
+    def _chunks(self) -> list[ChunkEntry]:
+        try:
+            return list(self._index.chunks())
+        except Damaged as error:
+            raise TraceError(f"{self._source.name}: the index is damaged ({error})") from error
+
+    @cached_property
+    def _by_span(self) -> dict[Span, ChunkEntry]:
+        return {entry.span: entry for entry in self._chunks}
+
+    @cached_property
+    def _by_channel(self) -> dict[int, tuple[list[int], list[ChunkEntry]]]:
+        """By channel id: the first sequence in each chunk with messages of it, and the chunks."""
+        result: dict[int, tuple[list[int], list[ChunkEntry]]] = {}
+        counts: dict[int, int] = {}
+        for entry in self._chunks:
+            for channel_id, count in entry.counts.items():
+                firsts, entries = result.setdefault(channel_id, ([], []))
+                firsts.append(counts.get(channel_id, 0))
+                entries.append(entry)
+                counts[channel_id] = firsts[-1] + count
+        return result
+
+    def _read_records(self, span: Span) -> bytes:
+        return read_chunk(self._source, span)
+
+    def _read_offsets(self, span: Span, channel_id: int) -> list[int]:
+        """Return where in the records of a chunk the messages of a channel are."""
+        index_span = self._by_span[span].indexes.get(channel_id)
+        if index_span is None:
+            try:
+                walked = walk_messages(self._records(span))
+                return [offset for offset, view in walked if view.channel_id == channel_id]
+            except Damaged as error:
+                raise damaged(self._source, span.offset, "the chunk", error) from error
+        body = read_body(self._source, index_span, Opcode.MESSAGE_INDEX, "the message index")
+        try:
+            cursor = Cursor(body)
+            if cursor.u16() != channel_id:
+                raise Damaged("it is that of another channel")
+            entries = cursor.take(cursor.u32())
+            if len(entries) % _INDEX_DTYPE.itemsize:
+                raise Damaged("an entry is cut off")
+        except Damaged as error:
+            raise damaged(self._source, index_span.offset, "the message index", error) from error
+        table: npt.NDArray[np.void] = np.frombuffer(entries, dtype=_INDEX_DTYPE)
+        offsets: list[int] = table["offset"].tolist()
+        return offsets
+
+    def _message_at(
+        self, entry: ChunkEntry, records: bytes, offset: int, channel_id: int
+    ) -> MessageView:
+        try:
+            message = message_at(records, offset)
+            if message.channel_id != channel_id:
+                raise Damaged(f"the message at {offset} is of another channel than the index says")
+        except Damaged as error:
+            raise damaged(self._source, entry.span.offset, "the chunk", error) from error
+        return message
+
+    def _missing(self, channel_id: int, sequence: int) -> TraceError:
+        info = self._index.channels.get(channel_id)
+        topic = info.topic if info else f"channel {channel_id}"
+        cut = "" if self._index.complete else " (its recording was interrupted)"
+        return TraceError(f"{self._source.name} has no message {sequence} on {topic}{cut}")

@@ -1,0 +1,366 @@
+"""Reading a trace: one read-only object that fetches what is asked for, and only that.
+
+Opening reads the summary at the end of the file, not the run; a digest of a million events costs
+as much as one of ten. A trace whose run was killed has no summary: it is walked once and then read
+in the same way, with ``complete`` false.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
+from rsltrace.trace.cdr import unpack_detail, unpack_entity
+from rsltrace.trace.chain import digest_text
+from rsltrace.trace.check import check_data_section, check_hashes
+from rsltrace.trace.format import (
+    ATTACHMENT_JOB,
+    METADATA_ENVIRONMENT,
+    METADATA_JOB,
+    METADATA_RESULT,
+    PREFIX_REQUEST,
+    PREFIX_RESPONSE,
+    TOPIC_DETAILS,
+    TOPIC_ENTITIES,
+    TOPIC_EVENTS,
+    TOPIC_OUTPUTS,
+    TOPIC_ROSOUT,
+)
+from rsltrace.trace.index import (
+    ChannelInfo,
+    Header,
+    has_end,
+    read_attachment,
+    read_metadata,
+    read_summary,
+)
+from rsltrace.trace.payloads import PayloadReader
+from rsltrace.trace.scan import scan
+from rsltrace.trace.segments import SegmentReader, event_of, output_of
+from rsltrace.trace.source import ByteSource, FileSource
+
+if TYPE_CHECKING:
+    from rsltrace.trace.decode import Decoder
+
+RUN = Entity(0, 0, EntityKind.SYSTEM, "", "", 0, {})
+"""The run itself, in traces that do not describe it: what belongs to no node."""
+
+
+class Trace:
+    """A trace, opened. A context manager; every method may raise TraceError for damage it meets.
+
+    ``complete`` is false for an interrupted run; then everything up to the last whole segment is
+    here. Times are simulated nanoseconds, hashes unsigned 64-bit integers.
+    """
+
+    def __init__(self, source: ByteSource) -> None:
+        """Read the index of ``source``, which belongs to this object from now on."""
+        self._source = source
+        try:
+            index = read_summary(source) if has_end(source) else scan(source)
+            ids: dict[str, list[int]] = {}
+            for channel in index.channels.values():
+                ids.setdefault(channel.topic, []).append(channel.id)
+            for topic in (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS):
+                # A run killed at once may have an entity to its name but no event, or neither.
+                if topic not in ids and index.complete:
+                    raise TraceError(f"{source.name} has no channel {topic}; it is no whole trace")
+            self._index = index
+            self._ids_of_topic = ids
+            self._segments = SegmentReader(
+                source,
+                index.segments,
+                ids.get(TOPIC_EVENTS, [0])[0],
+                ids.get(TOPIC_OUTPUTS, [0])[0],
+            )
+            self._payloads = PayloadReader(source, index)
+            self._decoders: dict[int, Decoder] = {}
+            self._check_result()
+        except BaseException:
+            source.close()
+            raise
+
+    @classmethod
+    def open(cls, path: Path | str) -> Trace:
+        """Open the trace at ``path``.
+
+        Raises TraceError if it is missing or damaged, TraceFormatError if it is something else
+        (a plain recording, no MCAP) or of another format version.
+        """
+        return cls(FileSource(Path(path)))
+
+    def close(self) -> None:
+        """Let go of the file. Arrays handed out stay valid."""
+        self._source.close()
+
+    def __enter__(self) -> Trace:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # What kind of file it is and how the run went.
+
+    @property
+    def name(self) -> str:
+        """The path as it was given."""
+        return self._source.name
+
+    @property
+    def size(self) -> int:
+        """Size of the file in bytes."""
+        return self._source.size
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run ended properly; false if the file was cut off or is still written."""
+        return self._index.complete
+
+    @property
+    def header(self) -> Header:
+        """The profile (``ros2``) and what wrote the trace (``rsltrace 0.1.0``)."""
+        return self._index.header
+
+    @property
+    def digest(self) -> str:
+        """The last chain hash as 16 hex digits, equal for equal runs (no event: zeros)."""
+        table = self.segments
+        return digest_text(int(table["chain_hash"][-1]) if len(table) else 0)
+
+    @property
+    def event_count(self) -> int:
+        """How many events there are."""
+        return int(self.segments["events"].sum(dtype=np.uint64))
+
+    @property
+    def output_count(self) -> int:
+        """How many outputs all events have."""
+        return int(self.segments["outputs"].sum(dtype=np.uint64))
+
+    @property
+    def start_ns(self) -> int:
+        """When the run started: as its result says, or else the earliest event (0: none)."""
+        return self._result_ns("start_time", min(self.segments["start_stamp"].tolist(), default=0))
+
+    @property
+    def end_ns(self) -> int:
+        """When the run ended: as its result says, or else the latest event (0: none)."""
+        return self._result_ns("end_time", max(self.segments["end_stamp"].tolist(), default=0))
+
+    @cached_property
+    def result(self) -> dict[str, str]:
+        """How the run ended: the metadata ``rsltrace:result``; empty for an interrupted run."""
+        return self.metadata(METADATA_RESULT)
+
+    @cached_property
+    def environment(self) -> dict[str, str]:
+        """What the run was made with: the metadata ``rsltrace:environment``."""
+        return self.metadata(METADATA_ENVIRONMENT)
+
+    @cached_property
+    def job(self) -> dict[str, str]:
+        """What was asked for: the metadata ``rsltrace:job``."""
+        return self.metadata(METADATA_JOB)
+
+    @cached_property
+    def job_text(self) -> str:
+        """The job file as it was, or an empty text when the run had none."""
+        data = self.attachment(ATTACHMENT_JOB)
+        return data.decode("utf-8", "replace") if data is not None else ""
+
+    def metadata(self, name: str) -> dict[str, str]:
+        """Return a metadata record, or an empty mapping if there is none of that name."""
+        span = self._index.metadata.get(name)
+        return read_metadata(self._source, span) if span else {}
+
+    def attachment(self, name: str) -> bytes | None:
+        """Return the bytes of an attachment, or None if there is none of that name."""
+        span = self._index.attachments.get(name)
+        return read_attachment(self._source, span) if span else None
+
+    def check(self) -> None:
+        """Read the whole file and raise TraceError at the first thing in it that is not right.
+
+        An interrupted trace has no checksum over the file; its hashes are checked all the same.
+        """
+        if self._index.summary_start:
+            check_data_section(self._source, self._index.summary_start)
+        check_hashes(self._source, self._segments)
+
+    # Entities.
+
+    @cached_property
+    def entities(self) -> dict[int, Entity]:
+        """All entities by id, in creation order. Id 0, the run, is always there."""
+        entities = {RUN.id: RUN}
+        for stamp_ns, _, data in self.messages(TOPIC_ENTITIES):
+            entity = unpack_entity(data, stamp_ns)
+            entities[entity.id] = entity
+        return entities
+
+    def entity(self, entity_id: int) -> Entity:
+        """Return one entity. Raises TraceError if the trace has none of that id."""
+        entity = self.entities.get(entity_id)
+        if entity is None:
+            raise TraceError(f"{self.name} has no entity {entity_id}")
+        return entity
+
+    def node_of(self, entity: Entity) -> Entity:
+        """Return the node that owns ``entity``: a node itself, or the run for what has no node."""
+        return self.entity(entity.node)
+
+    # Events and outputs.
+
+    @property
+    def segments(self) -> npt.NDArray[np.void]:
+        """The table of segments: SEGMENT_DTYPE, shape (segments,)."""
+        return self._segments.table
+
+    def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
+        """Yield the events ``first <= index < last`` as arrays of EVENT_DTYPE, one per segment.
+
+        The arrays look into the file's bytes: they are read-only and not contiguous.
+        """
+        for segment, begin, end in self._pieces(first, last):
+            yield self._segments.events(segment)[begin:end]
+
+    def outputs(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
+        """Yield the outputs of the events ``first <= index < last``: OUTPUT_DTYPE, per segment."""
+        for segment, begin, end in self._pieces(first, last):
+            outputs = self._segments.outputs(segment)
+            start = int(self.segments["first_event"][segment])
+            bounds = np.array([start + begin, start + end], dtype=np.uint64)
+            low, high = np.searchsorted(outputs["event"], bounds).tolist()
+            yield outputs[low:high]
+
+    def event(self, index: int) -> Event:
+        """Return event number ``index``. Raises IndexError if there is none."""
+        segment = self._segment_of(index)
+        first = int(self.segments["first_event"][segment])
+        return event_of(self._segments.cached_events(segment)[index - first])
+
+    def outputs_of(self, index: int) -> list[Output]:
+        """Return the outputs of event ``index``, in order. Raises IndexError if there is none."""
+        outputs = self._segments.cached_outputs(self._segment_of(index))
+        bounds = np.array([index, index + 1], dtype=np.uint64)
+        low, high = np.searchsorted(outputs["event"], bounds).tolist()
+        return [output_of(row) for row in outputs[low:high]]
+
+    # Payloads.
+
+    @property
+    def channels(self) -> Mapping[int, ChannelInfo]:
+        """All channels by id."""
+        return self._index.channels
+
+    @property
+    def message_counts(self) -> Mapping[int, int]:
+        """By channel id, how many messages it has (absent: none)."""
+        return self._index.message_counts
+
+    def channel_of(self, output: Output) -> ChannelInfo | None:
+        """Return the channel with the payloads of outputs like this, or None if there is none."""
+        if output.kind is OutputKind.LOG:
+            return self._channel(TOPIC_ROSOUT, "")
+        entity = self.entity(output.entity)
+        if output.kind is OutputKind.MESSAGE:
+            return self._channel(entity.name, entity.type)
+        if output.kind is OutputKind.REQUEST:
+            return self._channel(PREFIX_REQUEST + entity.name, f"{entity.type}_Request")
+        if output.kind is OutputKind.RESPONSE:
+            return self._channel(PREFIX_RESPONSE + entity.name, f"{entity.type}_Response")
+        return self._channel(TOPIC_DETAILS, "")
+
+    def payload(self, output: Output) -> tuple[int, str, bytes] | None:
+        """Return (stamp in ns, topic, data) of what an output sent, or None if it was not kept."""
+        if output.sequence == NO_SEQUENCE:
+            return None
+        channel = self.channel_of(output)
+        if channel is None:
+            return None
+        stamp_ns, data = self._payloads.message(channel.id, output.sequence)
+        return stamp_ns, channel.topic, data
+
+    def detail(self, output: Output) -> str | None:
+        """Return the text of an output that is no message, or None if it has none."""
+        found = self.payload(output)
+        return unpack_detail(found[2])[2] if found and found[1] == TOPIC_DETAILS else None
+
+    def messages(self, topic: str) -> Iterator[tuple[int, int, bytes]]:
+        """Yield (stamp in ns, sequence, data) of every message on ``topic``, in file order."""
+        yield from self._payloads.messages(frozenset(self._ids_of_topic.get(topic, ())))
+
+    def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
+        """Return ``data`` decoded by the schema of a channel (or its id, or its topic).
+
+        Raises TraceError if there is no such channel, or schema and data do not fit.
+        """
+        if isinstance(channel, str):
+            found = self._channel(channel, "")
+        elif isinstance(channel, int):
+            found = self.channels.get(channel)
+        else:
+            found = channel
+        if found is None:
+            raise TraceError(f"{self.name} has no topic {channel}")
+        decoder = self._decoders.get(found.id)
+        if decoder is None:
+            from rsltrace.trace.decode import (
+                Decoder,  # its library takes as long as opening a trace
+            )
+
+            decoder = self._decoders[found.id] = Decoder(found)
+        return decoder.decode(data)
+
+    def _channel(self, topic: str, type_name: str) -> ChannelInfo | None:
+        """Return the channel of a topic: the one of that type, where there are several."""
+        found = [self.channels[i] for i in self._ids_of_topic.get(topic, ())]
+        return next((c for c in found if c.type == type_name), found[0] if found else None)
+
+    def _segment_of(self, index: int) -> int:
+        if not 0 <= index < self.event_count:
+            raise IndexError(f"{self.name} has no event {index}, it has {self.event_count}")
+        return self._segments.segment_of(index)
+
+    def _pieces(self, first: int, last: int | None) -> Iterator[tuple[int, int, int]]:
+        """Yield (segment, begin, end) for the parts of segments that hold a range of events."""
+        count = self.event_count
+        last = count if last is None else min(last, count)
+        first = max(first, 0)
+        if first >= last:
+            return
+        for segment in range(self._segments.segment_of(first), len(self.segments)):
+            start = int(self.segments["first_event"][segment])
+            if start >= last:
+                return
+            end = start + int(self.segments["events"][segment])
+            yield segment, max(first - start, 0), min(last, end) - start
+
+    def _result_ns(self, key: str, otherwise: int) -> int:
+        text = self.result.get(key, "")
+        if text.isascii() and text.isdigit():
+            return int(text)
+        return otherwise
+
+    def _check_result(self) -> None:
+        """The result is not covered by a checksum, but what matters of it is known twice."""
+        said = self.result.get("digest")
+        if self.complete and said != self.digest:
+            raise TraceError(
+                f"{self.name} contradicts itself: its result says digest {said}, its events have "
+                f"{self.digest}; the file is damaged"
+            )

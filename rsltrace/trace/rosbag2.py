@@ -1,0 +1,108 @@
+"""The ``rosbag2`` metadata record: what makes ``ros2 bag`` take a trace for a bag of its own.
+
+rosbag2's MCAP plugin stores its bag metadata (version 9 since Jazzy) as one YAML text in a
+metadata record. The text is written by hand, in the plugin's order of keys, because a general YAML
+writer would be a dependency of recording for the sake of twenty lines. Nothing here depends on
+where the file lies: the file name in it is fixed, and readers put in the real one.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rsltrace.errors import OutputError
+
+BAG_METADATA_VERSION = 9
+FILE_NAME = "trace.mcap"
+KEY = "serialized_metadata"
+
+_PLAIN = re.compile(r"[/A-Za-z_][/A-Za-z0-9_]*")
+_NOT_TEXT = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
+
+
+@dataclass(frozen=True, slots=True)
+class BagTopic:
+    """One channel as rosbag2 lists it. ``qos_yaml`` is a YAML sequence (``[]`` when unknown)."""
+
+    name: str
+    type: str
+    type_hash: str
+    qos_yaml: str
+    message_count: int
+
+
+def bag_metadata_yaml(
+    topics: Sequence[BagTopic], *, start_ns: int, duration_ns: int, ros_distro: str
+) -> str:
+    """Return the YAML of a bag whose only file is this trace. Times are in nanoseconds."""
+    message_count = sum(topic.message_count for topic in topics)
+    lines = [
+        f"version: {BAG_METADATA_VERSION}",
+        "storage_identifier: mcap",
+        "duration:",
+        f"  nanoseconds: {duration_ns}",
+        "starting_time:",
+        f"  nanoseconds_since_epoch: {start_ns}",
+        f"message_count: {message_count}",
+        "topics_with_message_count:" + ("" if topics else " []"),
+    ]
+    for topic in topics:
+        lines += [
+            "  - topic_metadata:",
+            f"      name: {_scalar(topic.name)}",
+            f"      type: {_scalar(topic.type)}",
+            "      serialization_format: cdr",
+            *_qos_lines(topic.qos_yaml),
+            f"      type_description_hash: {_scalar(topic.type_hash)}",
+            f"    message_count: {topic.message_count}",
+        ]
+    lines += [
+        'compression_format: ""',
+        'compression_mode: ""',
+        "relative_file_paths:",
+        f"  - {FILE_NAME}",
+        "files:",
+        f"  - path: {FILE_NAME}",
+        "    starting_time:",
+        f"      nanoseconds_since_epoch: {start_ns}",
+        "    duration:",
+        f"      nanoseconds: {duration_ns}",
+        f"    message_count: {message_count}",
+        "custom_data: ~",
+        f"ros_distro: {_scalar(ros_distro)}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def normalized_qos(qos_yaml: str, *, topic: str) -> str:
+    """Return ``qos_yaml`` ready to be stored: ``[]`` for nothing, no newline at its end.
+
+    rosbag2 refuses an empty text where it expects a sequence, so nothing is an empty sequence.
+    Raises OutputError when the text cannot be a YAML sequence: a bag player would stumble over it.
+    """
+    text = textwrap.dedent(qos_yaml).strip("\n")
+    if not text.strip():
+        return "[]"
+    one_line = "\n" not in text and text.startswith("[") and text.endswith("]")
+    if not one_line and not text.startswith("- "):
+        raise OutputError(
+            f"the QoS profiles of {topic} cannot be written: expected a YAML sequence "
+            f"('- history: …'), got {text.splitlines()[0]!r}"
+        )
+    return text
+
+
+def _qos_lines(qos_yaml: str) -> list[str]:
+    if qos_yaml.startswith("["):
+        return [f"      offered_qos_profiles: {qos_yaml}"]
+    return ["      offered_qos_profiles:", textwrap.indent(qos_yaml, " " * 8)]
+
+
+def _scalar(text: str) -> str:
+    """Quote what YAML could take for something else than a string (JSON strings are YAML)."""
+    plain = _PLAIN.fullmatch(text) and text.lower() not in _NOT_TEXT
+    return text if plain else json.dumps(text)

@@ -1,0 +1,164 @@
+"""Events and outputs of a trace, a segment at a time, seen in place.
+
+A chunk of events is one array of fixed-size records, so reading a segment is: fetch, unpack, check
+the CRC, look at the bytes as a numpy array. Nothing is parsed or copied per event.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+from mcap.opcode import Opcode
+
+from rsltrace.errors import TraceError
+from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
+from rsltrace.trace.format import (
+    EVENT_DTYPE,
+    EVENT_MESSAGE_DTYPE,
+    OUTPUT_DTYPE,
+    OUTPUT_MESSAGE_DTYPE,
+)
+from rsltrace.trace.records import RECORD_HEAD, Damaged, Span, damaged, read_chunk
+from rsltrace.trace.source import ByteSource
+
+_CDR_LITTLE_ENDIAN = b"\x00\x01"
+"""The CDR header as numpy gives it: without the zeros at its end."""
+
+_SEGMENTS_CACHED = 4
+"""For looking up single events: a diff goes back and forth between two or three places."""
+
+
+def events_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
+    """Return the events of a chunk as EVENT_DTYPE, shape (n,), in place. Raises Damaged."""
+    return _bodies(records, EVENT_MESSAGE_DTYPE, EVENT_DTYPE, channel_id)
+
+
+def outputs_in(records: bytes, channel_id: int) -> npt.NDArray[np.void]:
+    """Return the outputs of a chunk as OUTPUT_DTYPE, shape (n,), in place. Raises Damaged."""
+    return _bodies(records, OUTPUT_MESSAGE_DTYPE, OUTPUT_DTYPE, channel_id)
+
+
+def check_numbered(events: npt.NDArray[np.void], first: int) -> None:
+    """Raise Damaged unless the events are numbered ``first``, ``first + 1``, …"""
+    numbers = np.arange(first, first + len(events), dtype=np.uint64)
+    if not np.array_equal(events["index"], numbers):
+        raise Damaged(f"its events are not numbered from {first} on")
+
+
+def _bodies(
+    records: bytes, message: np.dtype[np.void], body: np.dtype[np.void], channel_id: int
+) -> npt.NDArray[np.void]:
+    if len(records) % message.itemsize:
+        raise Damaged("its length is not a multiple of that of a message")
+    messages = np.frombuffer(records, dtype=message)
+    sound = (
+        (messages["opcode"] == int(Opcode.MESSAGE))
+        & (messages["length"] == message.itemsize - RECORD_HEAD.size)
+        & (messages["channel_id"] == channel_id)
+        & (messages["cdr"] == _CDR_LITTLE_ENDIAN)
+    )
+    if not sound.all():
+        raise Damaged("it holds other messages than it should")
+    bodies: npt.NDArray[np.void] = np.ndarray(
+        shape=messages.shape,
+        dtype=body,
+        buffer=records,
+        offset=message.itemsize - body.itemsize,
+        strides=(message.itemsize,),
+    )
+    return bodies
+
+
+class SegmentReader:
+    """Reads segments by number. ``table`` is SEGMENT_DTYPE, shape (segments,)."""
+
+    def __init__(
+        self,
+        source: ByteSource,
+        table: npt.NDArray[np.void],
+        event_channel: int,
+        output_channel: int,
+    ) -> None:
+        self.table = table
+        self._source = source
+        self._event_channel = event_channel
+        self._output_channel = output_channel
+        self._first_events = table["first_event"]
+        # Caches of this object, not of the class: they go away with the trace.
+        self.cached_events = lru_cache(maxsize=_SEGMENTS_CACHED)(self.events)
+        self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
+
+    def segment_of(self, event: int) -> int:
+        """Return the number of the segment that holds ``event`` (which must exist)."""
+        return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1
+
+    def events(self, segment: int) -> npt.NDArray[np.void]:
+        """Return the events of a segment: EVENT_DTYPE, shape (n,), read-only. Raises TraceError."""
+        row = self.table[segment]
+        span = Span(int(row["events_offset"]), int(row["events_length"]))
+        try:
+            events = events_in(read_chunk(self._source, span), self._event_channel)
+            if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
+                raise Damaged("it is not the one the index speaks of")
+            check_numbered(events, int(row["first_event"]))
+        except Damaged as error:
+            raise damaged(self._source, span.offset, "the events chunk", error) from error
+        return events
+
+    def outputs(self, segment: int) -> npt.NDArray[np.void]:
+        """Return the outputs of a segment: OUTPUT_DTYPE, shape (n,). Raises TraceError."""
+        row = self.table[segment]
+        if not row["outputs"]:
+            return np.zeros(0, dtype=OUTPUT_DTYPE)
+        span = Span(int(row["outputs_offset"]), int(row["outputs_length"]))
+        try:
+            outputs = outputs_in(read_chunk(self._source, span), self._output_channel)
+            owners = outputs["event"]
+            first = int(row["first_event"])
+            if (
+                len(outputs) != row["outputs"]
+                or owners[0] < first
+                or owners[-1] >= first + int(row["events"])
+                or (owners[1:] < owners[:-1]).any()
+            ):
+                raise Damaged("it is not the one the index speaks of")
+        except Damaged as error:
+            raise damaged(self._source, span.offset, "the outputs chunk", error) from error
+        return outputs
+
+
+def event_of(row: np.void) -> Event:
+    """Return an element of an array of EVENT_DTYPE as an Event. Raises TraceError."""
+    chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
+        row.item()
+    )
+    try:
+        return Event(
+            index=index,
+            stamp_ns=stamp,
+            entity=entity,
+            kind=EventKind(kind),
+            flags=EventFlag(flags),
+            cause_event=cause,
+            cause_output=nth,
+            outputs=outputs,
+            input_hash=hash_in,
+            output_hash=hash_out,
+            state_hash=state,
+            chain_hash=chain_hash,
+        )
+    except ValueError as error:
+        raise TraceError(f"event {index}: {error}; a newer rsltrace wrote this trace") from error
+
+
+def output_of(row: np.void) -> Output:
+    """Return an element of an array of OUTPUT_DTYPE as an Output. Raises TraceError."""
+    event, content_hash, entity, kind, sequence = row.item()
+    try:
+        return Output(event, entity, OutputKind(kind), content_hash, sequence)
+    except ValueError as error:
+        raise TraceError(
+            f"an output of event {event}: {error}; a newer rsltrace wrote this trace"
+        ) from error

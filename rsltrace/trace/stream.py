@@ -1,0 +1,200 @@
+"""An MCAP file being written, record by record, with its summary at the end.
+
+This layer knows MCAP and the disk but not what a trace is: that is ``writer``.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+from binascii import crc32
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import zstandard
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
+
+from rsltrace.errors import OutputError
+from rsltrace.trace.chunks import ChunkBody
+from rsltrace.trace.format import MCAP_MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
+from rsltrace.trace.sink import Sink
+from rsltrace.trace.summary import SummaryBuilder, record_bytes
+
+CHANNELS_MAX = 2**16 - 1
+_ZSTD_LEVEL = 1
+"""Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
+
+
+class McapStream:
+    """Writes records in order. Every method raises OutputError when the disk refuses.
+
+    ``progress`` says in words what was written so far, for that message.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        force: bool,
+        compression: str,
+        profile: str,
+        library: str,
+        progress: Callable[[], str],
+    ) -> None:
+        if compression not in ("zstd", ""):
+            raise ValueError(f"compression is 'zstd' or '', not {compression!r}")
+        self._compression = compression
+        self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self._progress = progress
+        self._summary = SummaryBuilder()
+        self._schema_ids: dict[tuple[str, str], int] = {}
+        self._failure: OutputError | None = None
+        self._sink = Sink(path, force=force)
+        self._write(MCAP_MAGIC + record_bytes(Header(profile, library)))
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far."""
+        return self._sink.offset
+
+    @property
+    def closed(self) -> bool:
+        """Whether the file was finished or given up."""
+        return self._sink.closed
+
+    @property
+    def start_ns(self) -> int:
+        """Smallest log time of all messages so far (0: none)."""
+        return self._summary.start_ns
+
+    @property
+    def end_ns(self) -> int:
+        """Largest log time of all messages so far (0: none)."""
+        return self._summary.end_ns
+
+    @property
+    def channels(self) -> list[tuple[Channel, str, int]]:
+        """Each channel with the name of its type and its number of messages."""
+        counts = self._summary.message_counts
+        names = {schema.id: schema.name for schema in self._summary.schemas}
+        return [(c, names[c.schema_id], counts.get(c.id, 0)) for c in self._summary.channels]
+
+    def channel(
+        self, topic: str, type_name: str, schema_text: str, metadata: Mapping[str, str]
+    ) -> int:
+        """Write a channel, and its schema unless an equal one is there. Returns its id."""
+        channel_id = len(self._summary.channels) + 1
+        if channel_id > CHANNELS_MAX:
+            raise OutputError(
+                f"{self._sink.path}: {topic} is one topic too many: a trace has room for "
+                f"{CHANNELS_MAX}; leave topics out (record: in the job)"
+            )
+        schema_id = self._schema_ids.get((type_name, schema_text))
+        if schema_id is None:
+            schema_id = len(self._schema_ids) + 1
+            schema = Schema(schema_id, schema_text.encode(), SCHEMA_ENCODING, type_name)
+            self._write(record_bytes(schema))
+            self._schema_ids[type_name, schema_text] = schema_id
+            self._summary.schemas.append(schema)
+        channel = Channel(channel_id, topic, MESSAGE_ENCODING, dict(metadata), schema_id)
+        self._write(record_bytes(channel))
+        self._summary.channels.append(channel)
+        return channel_id
+
+    def metadata(self, name: str, mapping: Mapping[str, str]) -> None:
+        """Write a metadata record."""
+        record = record_bytes(Metadata(name=name, metadata=dict(mapping)))
+        self._summary.add_metadata(name, offset=self._sink.offset, length=len(record))
+        self._write(record)
+
+    def attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Write an attachment. Its times are 0: dates would make files of equal runs differ."""
+        record = record_bytes(
+            Attachment(create_time=0, log_time=0, name=name, media_type=media_type, data=data)
+        )
+        offset = self._sink.offset
+        self._summary.add_attachment(
+            name, media_type, size=len(data), offset=offset, length=len(record)
+        )
+        self._write(record)
+
+    def chunk(self, body: ChunkBody) -> tuple[int, int]:
+        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
+        data = self._compressor.compress(body.records) if self._compression else body.records
+        record = record_bytes(
+            Chunk(
+                compression=self._compression,
+                data=data,
+                message_end_time=body.end_ns,
+                message_start_time=body.start_ns,
+                uncompressed_crc=crc32(body.records),
+                uncompressed_size=len(body.records),
+            )
+        )
+        offset, length = self._sink.offset, len(record)
+        self._write(record + b"".join(index for _, _, index in body.indexes))
+        self._summary.add_chunk(
+            body,
+            offset=offset,
+            length=length,
+            compression=self._compression,
+            compressed_size=len(data),
+        )
+        return offset, length
+
+    def finish(self) -> None:
+        """Write the end of the file and close it."""
+        self._write(record_bytes(DataEnd(self._sink.crc)))
+        self._write(self._summary.tail(self._sink.offset) + MCAP_MAGIC)
+        try:
+            self._sink.close()
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def abort(self) -> None:
+        """Close the file as it is. What was written stays readable."""
+        try:
+            self._sink.close()
+        except OSError:
+            pass  # there is nothing left to save, and the error that led here is the one to show
+
+    def poison(self) -> None:
+        """Refuse all further records, because one was left half written or half noted.
+
+        An exception out of a signal handler (KeyboardInterrupt) can come between any two steps of
+        a write. Going on would put a whole record after a half one; an interrupted file is better.
+        """
+        if self._failure is None:
+            self._failure = OutputError(
+                f"writing the trace {self._sink.path} was interrupted in the middle of a segment; "
+                "what was written before is readable up to its last whole segment"
+            )
+
+    def _write(self, data: bytes) -> None:
+        if self._failure is not None:
+            raise self._failure  # after a gap in the file, nothing more may follow
+        try:
+            self._sink.write(data)
+        except OSError as error:
+            raise self._failed(error) from error
+        except BaseException:
+            self.poison()
+            raise
+
+    def _failed(self, error: OSError) -> OutputError:
+        code = errno.errorcode.get(error.errno or 0, "unknown")
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        hint = _HINTS.get(error.errno or 0, "check the disk, or choose another place with -o")
+        self._failure = OutputError(
+            f"cannot go on writing the trace {self._sink.path}: {reason} ({code}) after "
+            f"{self._sink.offset} bytes, {self._progress()}; what was written is readable up to "
+            f"its last whole segment; {hint}"
+        )
+        return self._failure
+
+
+_HINTS = {
+    errno.ENOSPC: "free some space or choose another disk with -o",
+    errno.EDQUOT: "your disk quota is used up: free some space or choose another disk with -o",
+    errno.EFBIG: "the file reached its size limit (ulimit -f, or the file system's)",
+}

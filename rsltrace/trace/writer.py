@@ -1,0 +1,326 @@
+"""Writing a trace as a stream: bounded memory, the same bytes for the same calls.
+
+The loop hands over events, outputs and payloads as they happen; they wait in plain lists, and every
+few thousand events a *segment* goes to the file: first the payloads, then the outputs, then the
+events, so that whatever an event refers to is in the file before it. A run that is killed leaves
+a file that reads up to its last whole segment.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace._version import __version__
+from rsltrace.errors import OutputError
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import NO_SEQUENCE
+from rsltrace.trace import chunks
+from rsltrace.trace.cdr import pack_detail, pack_entity
+from rsltrace.trace.chain import digest_text
+from rsltrace.trace.format import (
+    ATTACHMENT_INDEX,
+    EVENTS_PER_SEGMENT,
+    FORMAT_VERSION,
+    MESSAGE_HEADER_DTYPE,
+    METADATA_ENVIRONMENT,
+    METADATA_FORMAT,
+    METADATA_RESULT,
+    METADATA_ROSBAG2,
+    OUTPUTS_PER_SEGMENT,
+    PAYLOAD_BYTES_PER_CHUNK,
+    PROFILE,
+    SCHEMA_DETAIL,
+    SCHEMA_ENTITY,
+    SCHEMA_EVENT,
+    SCHEMA_OUTPUT,
+    SCHEMA_TEXT,
+    SEGMENT_DTYPE,
+    TOPIC_DETAILS,
+    TOPIC_ENTITIES,
+    TOPIC_EVENTS,
+    TOPIC_OUTPUTS,
+)
+from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
+from rsltrace.trace.stream import McapStream
+
+_HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
+SEGMENT_MEDIA_TYPE = "application/octet-stream"
+
+
+class TraceWriter:
+    """Writes one trace.
+
+    An event's outputs are added before the event itself; entities and payloads at any time before
+    the event that refers to them. ``close`` ends the file; used as a context manager, leaving the
+    block without ``close`` gives the file up as an interrupted run would (``abort``).
+
+    Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no room,
+    a failing disk, a file too large. The file is then readable up to its last whole segment.
+    """
+
+    def __init__(self, path: Path, *, force: bool, compression: str = "zstd") -> None:
+        """Create the file. ``compression`` is ``zstd`` or empty.
+
+        Raises OutputError if ``path`` exists and ``force`` is false, if it is a folder, or if it
+        cannot be created; a missing folder is not made, since it is more often a typing mistake.
+        """
+        self._rests: list[bytes] = []
+        self._chain_hashes = array("Q")
+        self._outputs: list[bytes] = []
+        self._payloads: list[chunks.Payload] = []
+        self._payload_bytes = 0
+        self._sequences: list[int] = [0]  # by channel id, which counts from 1
+        self._channel_ids: dict[tuple[str, str], int] = {}
+        self._segment_end = EVENTS_PER_SEGMENT
+        self._segments: list[bytes] = []
+        self._events_written = 0
+        self._outputs_written = 0
+        self._last_chain_hash = 0
+        self._ros_distro = ""
+        self._stream = McapStream(
+            path,
+            force=force,
+            compression=compression,
+            profile=PROFILE,
+            library=f"rsltrace {__version__}",
+            progress=lambda: f"{self._events_written} events",
+        )
+        try:
+            self._stream.metadata(METADATA_FORMAT, {"version": str(FORMAT_VERSION)})
+            self._event_channel = self._own_channel(TOPIC_EVENTS, SCHEMA_EVENT)
+            self._output_channel = self._own_channel(TOPIC_OUTPUTS, SCHEMA_OUTPUT)
+            self._entity_channel = self._own_channel(TOPIC_ENTITIES, SCHEMA_ENTITY)
+            self._detail_channel = self._own_channel(TOPIC_DETAILS, SCHEMA_DETAIL)
+        except OutputError:
+            self._stream.abort()
+            raise
+
+    def __enter__(self) -> TraceWriter:
+        return self
+
+    def __exit__(
+        self,
+        exc_type: type[BaseException] | None,
+        exc: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.abort()
+
+    @property
+    def event_count(self) -> int:
+        """How many events were added."""
+        return self._events_written + len(self._rests)
+
+    @property
+    def output_count(self) -> int:
+        """How many outputs were added."""
+        return self._outputs_written + len(self._outputs)
+
+    @property
+    def digest(self) -> str:
+        """The digest of the run so far: the last chain hash as 16 hex digits."""
+        return digest_text(self._chain_hashes[-1] if self._chain_hashes else self._last_chain_hash)
+
+    @property
+    def bytes_written(self) -> int:
+        """Size of the file so far; what still waits in memory is not counted."""
+        return self._stream.bytes_written
+
+    def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
+        """Write a metadata record, its keys sorted: equal mappings give equal bytes."""
+        if name == METADATA_ENVIRONMENT:
+            self._ros_distro = mapping.get("ros_distro", "")
+        self._stream.metadata(name, dict(sorted(mapping.items())))
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Write an attachment."""
+        self._stream.attachment(name, media_type, data)
+
+    def add_channel(
+        self,
+        topic: str,
+        type_name: str,
+        schema_text: str,
+        *,
+        qos_yaml: str = "",
+        type_hash: str = "",
+    ) -> int:
+        """Return the id of the channel of ``topic``, written now if it is new.
+
+        ``type_name`` is the interface (``std_msgs/msg/String``; ``std_srvs/srv/Trigger_Request``),
+        ``schema_text`` its ros2msg definition with all it depends on, ``qos_yaml`` the QoS
+        profiles offered as rosbag2 stores them, ``type_hash`` the RIHS01 hash. A topic has one
+        channel per type; when it is there already its id is returned and its first QoS stays.
+        """
+        key = (topic, type_name)
+        channel_id = self._channel_ids.get(key)
+        if channel_id is None:
+            metadata = {"offered_qos_profiles": normalized_qos(qos_yaml, topic=topic)}
+            if type_hash:
+                metadata["topic_type_hash"] = type_hash
+            channel_id = self._stream.channel(topic, type_name, schema_text, metadata)
+            assert channel_id == len(self._sequences)
+            self._sequences.append(0)
+            self._channel_ids[key] = channel_id
+        return channel_id
+
+    def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
+        """Take a message (CDR with its 4-byte header). Returns its sequence in the channel."""
+        sequence = self._sequences[channel_id]
+        self._payloads.append((channel_id, sequence, stamp_ns, data))
+        self._sequences[channel_id] = sequence + 1
+        self._payload_bytes += len(data) + _HEADER_BYTES
+        if self._payload_bytes >= PAYLOAD_BYTES_PER_CHUNK:
+            self._write_payloads()
+        return sequence
+
+    def add_output(self, packed: bytes) -> None:
+        """Take an output of the event that is added next, packed by ``format.OUTPUT``."""
+        self._outputs.append(packed)
+        if len(self._outputs) >= OUTPUTS_PER_SEGMENT:
+            self._segment_end = 0  # the event they belong to ends the segment
+
+    def add_event(self, rest: bytes, chain_hash: int) -> None:
+        """Take the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
+        self._rests.append(rest)
+        self._chain_hashes.append(chain_hash)
+        if len(self._rests) >= self._segment_end:
+            self._write_segment()
+
+    def add_entity(self, entity: Entity) -> int:
+        """Take an entity; to be called before the first event that names it."""
+        return self.add_payload(self._entity_channel, entity.created_ns, pack_entity(entity))
+
+    def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
+        """Take the text of output number ``output`` of ``event``. Returns its sequence."""
+        return self.add_payload(self._detail_channel, stamp_ns, pack_detail(event, output, text))
+
+    def close(self, *, result: Mapping[str, str]) -> None:
+        """Write what is left, then the indexes, and close the file.
+
+        ``result`` says how the run ended (``stop_reason``, ``exit_code``; ``start_time`` and
+        ``end_time`` in simulated nanoseconds, by default those of the first and last message).
+        Version, digest and counts are added here. Outputs of an event that was never added are
+        left out. After an OutputError the file is closed, too.
+        """
+        try:
+            self._drop_unfinished_event()
+            if self._rests:
+                self._write_segment()
+            self._write_payloads()
+            self._stream.attachment(ATTACHMENT_INDEX, SEGMENT_MEDIA_TYPE, b"".join(self._segments))
+            self._stream.metadata(METADATA_RESULT, self._result(result))
+            self._stream.metadata(METADATA_ROSBAG2, {KEY: self._bag_metadata()})
+            self._stream.finish()
+        finally:
+            self._stream.abort()
+
+    def abort(self) -> None:
+        """Close the file without an end, as if the run had been killed. Harmless when closed."""
+        self._stream.abort()
+
+    def _own_channel(self, topic: str, type_name: str) -> int:
+        return self.add_channel(topic, type_name, SCHEMA_TEXT[type_name])
+
+    def _write_payloads(self) -> None:
+        if not self._payloads:
+            return
+        if max(self._sequences) >= NO_SEQUENCE:
+            raise OutputError(
+                f"a topic has more than {NO_SEQUENCE} messages, more than a trace can number; "
+                "leave its payloads out (record: exclude: in the job)"
+            )
+        try:
+            self._stream.chunk(chunks.payloads_chunk(self._payloads))
+            self._payloads.clear()
+            self._payload_bytes = 0
+        except BaseException:
+            self._stream.poison()
+            raise
+
+    def _write_segment(self) -> None:
+        try:
+            self._write_payloads()
+            self._write_events_and_outputs()
+        except BaseException:
+            self._stream.poison()
+            raise
+
+    def _write_events_and_outputs(self) -> None:
+        events = chunks.event_rows(self._rests, self._chain_hashes)
+        outputs = chunks.output_rows(self._outputs)
+        self._check(events, outputs)
+        outputs_at = (0, 0)
+        if len(outputs):
+            outputs_at = self._stream.chunk(
+                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
+            )
+        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel))
+        row = np.zeros(1, dtype=SEGMENT_DTYPE)
+        row["first_event"] = self._events_written
+        row["events"] = len(events)
+        row["first_output"] = self._outputs_written
+        row["outputs"] = len(outputs)
+        row["chain_hash"] = events["chain_hash"][-1]
+        row["start_stamp"] = events["stamp"].min()
+        row["end_stamp"] = events["stamp"].max()
+        row["events_offset"], row["events_length"] = events_at
+        row["outputs_offset"], row["outputs_length"] = outputs_at
+        self._segments.append(row.tobytes())
+        self._last_chain_hash = self._chain_hashes[-1]
+        self._events_written += len(events)
+        self._outputs_written += len(outputs)
+        self._rests.clear()
+        self._outputs.clear()
+        del self._chain_hashes[:]
+        self._segment_end = EVENTS_PER_SEGMENT
+
+    def _check(self, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]) -> None:
+        """A recorder that miscounts would write a trace that misleads: stop at once instead."""
+        first = self._events_written
+        indexes = np.arange(first, first + len(events), dtype=np.uint64)
+        assert np.array_equal(events["index"], indexes), "events are not numbered 0, 1, 2, …"
+        owners = np.repeat(indexes, events["outputs"])
+        assert np.array_equal(outputs["event"], owners), "outputs do not match their events"
+
+    def _drop_unfinished_event(self) -> None:
+        del self._rests[len(self._chain_hashes) :]  # interrupted in the middle of add_event
+        outputs = chunks.output_rows(self._outputs)
+        finished = int(np.count_nonzero(outputs["event"] < self.event_count))
+        del self._outputs[finished:]
+
+    def _result(self, given: Mapping[str, str]) -> dict[str, str]:
+        result = {
+            "start_time": str(self._stream.start_ns),
+            "end_time": str(self._stream.end_ns),
+            **given,
+            "format_version": str(FORMAT_VERSION),
+            "digest": self.digest,
+            "events": str(self._events_written),
+            "outputs": str(self._outputs_written),
+        }
+        return dict(sorted(result.items()))
+
+    def _bag_metadata(self) -> str:
+        topics = [
+            BagTopic(
+                name=channel.topic,
+                type=type_name,
+                type_hash=channel.metadata.get("topic_type_hash", ""),
+                qos_yaml=channel.metadata["offered_qos_profiles"],
+                message_count=count,
+            )
+            for channel, type_name, count in self._stream.channels
+        ]
+        return bag_metadata_yaml(
+            topics,
+            start_ns=self._stream.start_ns,
+            duration_ns=self._stream.end_ns - self._stream.start_ns,
+            ros_distro=self._ros_distro or "rsltrace",
+        )

@@ -1,0 +1,457 @@
+"""``rsltrace info`` and ``rsltrace cat``, and what the command does with errors and pipes.
+
+The texts people read are in ``golden/``. After a change that is meant, run this with
+``UPDATE_GOLDEN=1`` and review the difference.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner, Result
+from trace_maker import (
+    CDR,
+    START_NS,
+    Feeder,
+    Opened,
+    boundaries,
+    log_message,
+    opcodes,
+    uint64_message,
+    write_run,
+)
+
+from rsltrace.cli.main import cli
+from rsltrace.cli.text import printable, table
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+def golden(name: str, text: str) -> None:
+    """Compare ``text`` with a golden file."""
+    path = GOLDEN / name
+    if os.environ.get("UPDATE_GOLDEN"):
+        path.write_text(text)
+    assert text == path.read_text()
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Feeder]:
+    """A small run, not compressed so that its size does not depend on the version of zstd."""
+    path = tmp_path_factory.mktemp("run") / "run.mcap"
+    return path, write_run(path, 40, compression="")
+
+
+@pytest.fixture(scope="module")
+def interrupted(run: tuple[Path, Feeder], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    data = run[0].read_bytes()
+    offsets = boundaries(data)
+    last = max(i for i, opcode in enumerate(opcodes(data, offsets)) if opcode == 0x07)
+    path = tmp_path_factory.mktemp("interrupted") / "cut.mcap"
+    path.write_bytes(data[: offsets[last + 1] + 5])
+    return path
+
+
+def call(*arguments: object) -> Result:
+    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+
+
+def output(*arguments: object) -> str:
+    result = call(*arguments)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def lines(*arguments: object) -> list[str]:
+    return output("cat", *arguments).splitlines()
+
+
+def objects(*arguments: object) -> list[dict]:
+    return [json.loads(line) for line in lines("--json", *arguments)]
+
+
+def indexes(*arguments: object) -> list[int]:
+    found = [event["index"] for event in objects(*arguments)]
+    assert [int(line.split()[0]) for line in lines(*arguments)] == found
+    return found
+
+
+# -- info ------------------------------------------------------------------------------------
+
+
+def test_info_of_a_run(run: tuple[Path, Feeder]) -> None:
+    golden("info.txt", output("info", run[0]))
+
+
+def test_info_of_an_interrupted_run(interrupted: Path) -> None:
+    golden("info_interrupted.txt", output("info", interrupted))
+
+
+def test_info_of_a_run_without_anything(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    with Opened(path, compression="") as feeder:
+        feeder.writer.close(result={})
+    golden("info_empty.txt", output("info", path))
+
+
+def test_info_as_json_says_the_same(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    data = json.loads(output("info", path, "--json"))
+    assert data["digest"] == feeder.digest
+    assert data["complete"] is True
+    assert data["events"] == len(feeder.events) == sum(data["event_kinds"].values())
+    assert data["outputs"] == sum(map(len, feeder.outputs)) == sum(data["output_kinds"].values())
+    assert data["nodes"] == ["/talker", "/listener"]
+    assert data["start_ns"] == START_NS
+    assert data["duration_ns"] == data["end_ns"] - START_NS
+    assert data["result"]["exit_code"] == "3"
+    assert data["environment"]["ros_distro"] == "jazzy"
+    entities = {(e["kind"], e["name"]): e for e in data["entities"]}
+    timer = entities["timer", "tick"]
+    assert timer["events"] == sum(e.kind is EventKind.TIMER for e in feeder.events)
+    assert timer["rate_hz"] == 50
+    assert timer["detail"] == {"period_ns": 20_000_000}
+    publisher = entities["publisher", "/count"]
+    assert (publisher["events"], publisher["rate_hz"]) == (0, 50)
+    assert publisher["outputs"] == timer["events"]  # not counting that it was created
+    assert {t["name"]: t["messages"] for t in data["topics"]}["/count"] == timer["events"]
+
+
+def test_info_check_finds_what_reading_does_not(run: tuple[Path, Feeder], tmp_path: Path) -> None:
+    path, _ = run
+    assert output("info", path, "--check") == output("info", path)
+    changed = tmp_path / "changed.mcap"
+    changed.write_bytes(path.read_bytes().replace(b"3.12.3", b"3.12.4"))
+    assert "3.12.4" in output("info", changed)
+    result = call("info", changed, "--check")
+    assert result.exit_code == 2
+    assert "the data section at offset 0 is damaged" in result.stderr
+
+
+# -- cat -------------------------------------------------------------------------------------
+
+
+def test_cat_of_a_run(run: tuple[Path, Feeder]) -> None:
+    golden("cat.txt", output("cat", run[0]))
+
+
+def test_cat_of_an_interrupted_run_is_that_of_the_whole(
+    run: tuple[Path, Feeder], interrupted: Path
+) -> None:
+    whole = output("cat", run[0]).splitlines()
+    cut = output("cat", interrupted).splitlines()
+    assert [line.split() for line in cut] == [line.split() for line in whole]
+
+
+def test_cat_as_json(run: tuple[Path, Feeder]) -> None:
+    golden("cat.jsonl", output("cat", run[0], "--json"))
+
+
+def test_cat_as_json_with_payloads(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    golden("cat_payloads.jsonl", output("cat", path, "--json", "--payloads", "--from", "10.1"))
+    values = [
+        out["message"]["data"]
+        for event in objects(path, "--payloads")
+        for out in event["outputs"]
+        if out["kind"] == "message"
+    ]
+    assert values == [int.from_bytes(data[4:], "little") for _, data in feeder.payloads[5]]
+
+
+def test_json_has_every_field_of_an_event(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    for event, data in zip(feeder.events, objects(path), strict=True):
+        assert data["stamp_ns"] == event.stamp_ns
+        assert int(data["chain_hash"], 16) == event.chain_hash
+        assert int(data["input_hash"], 16) == event.input_hash
+        assert int(data["output_hash"], 16) == event.output_hash
+        assert data["entity"] == event.entity
+        assert data["kind"] == event.kind.label
+        assert (data["cause_event"] is None) == (event.cause_event == 2**64 - 1)
+        assert len(data["outputs"]) == event.outputs
+
+
+def test_cat_selects_by_topic(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    on_count = [
+        event.index
+        for event, outputs in zip(feeder.events, feeder.outputs, strict=True)
+        if event.kind is EventKind.SUBSCRIPTION
+        or any(feeder.entities[out.entity].name == "/count" for out in outputs)
+    ]
+    assert indexes(path, "--topic", "/count") == on_count
+    assert indexes(path, "--topic", "/c*t") == on_count
+    both = indexes(path, "--topic", "/count", "--topic", "/check")
+    assert set(both) > set(on_count)
+    assert indexes(path, "--topic", "/rosout", "--kind", "subscription") == [
+        event.index
+        for event, outputs in zip(feeder.events, feeder.outputs, strict=True)
+        if any(out.kind is OutputKind.LOG for out in outputs)
+    ]
+
+
+def test_cat_selects_by_node_entity_and_kind(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    talker = [e.index for e in feeder.events if e.entity in (1, 2, 3, 4, 5)]
+    assert indexes(path, "--node", "/talker") == talker
+    assert indexes(path, "--node", "/ta*") == talker
+    timer = [e.index for e in feeder.events if e.entity == 4]
+    assert indexes(path, "--entity", "tick") == indexes(path, "--entity", "4") == timer
+    assert indexes(path, "--kind", "timer") == timer
+    assert indexes(path, "--kind", "timer", "--node", "/listener") == []
+    assert indexes(path, "--entity", "0") == [0, 1]
+    assert indexes(path, "--kind", "construct", "--kind", "timer") == sorted([0, 1, *timer])
+
+
+def test_cat_selects_by_time_both_ends_included(run: tuple[Path, Feeder]) -> None:
+    path, feeder = run
+    low, high = 10_060_000_000, 10_100_000_000
+    expected = [e.index for e in feeder.events if low <= e.stamp_ns <= high]
+    assert indexes(path, "--from", "10.06", "--to", "10.1") == expected
+    assert indexes(path, "--from", "10060ms", "--to", "10100000000ns") == expected
+    assert indexes(path, "--from", "10.060000001", "--to", "10.099999999") != expected
+    assert indexes(path, "--from", "1h") == []
+    assert indexes(path, "--to", "0") == []
+
+
+def test_cat_limits_after_selecting(run: tuple[Path, Feeder]) -> None:
+    path, _ = run
+    assert indexes(path, "--limit", 3) == [0, 1, 2]
+    timers = indexes(path, "--kind", "timer")
+    assert indexes(path, "--kind", "timer", "--limit", 2) == timers[:2]
+    assert lines(path, "--limit", 0) == []
+
+
+def test_cat_selects_across_segments(tmp_path: Path) -> None:
+    path = tmp_path / "long.mcap"
+    feeder = write_run(path, 9000)
+    calls = [e.index for e in feeder.events if e.kind is EventKind.CLIENT]
+    assert [int(line.split()[0]) for line in lines(path, "--kind", "client")] == calls
+    last = feeder.events[-1]
+    assert int(lines(path, "--from", f"{last.stamp_ns}ns")[-1].split()[0]) == last.index
+
+
+def test_a_name_that_matches_nothing_is_said(run: tuple[Path, Feeder]) -> None:
+    path, _ = run
+    result = call("cat", path, "--node", "/taler")
+    assert (result.exit_code, result.stdout) == (0, "")
+    assert "no node of the trace matches /taler; there are: /listener, /talker" in result.stderr
+    result = call("cat", path, "--topic", "/x")
+    assert "no topic or service of the trace matches /x" in result.stderr
+    result = call("cat", path, "--entity", "99")
+    assert "no entity of the trace matches 99" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--from", "soon"], "expected a time"),
+        (["--from", "-3"], "expected a time|must not be negative|requires"),
+        (["--to", "1 parsec"], "unknown unit 'parsec'"),
+        (["--to", "0.1234567891"], "finer than a nanosecond"),
+        (["--kind", "time"], "'time' is not one of"),
+        (["--payloads"], "--payloads needs --json"),
+    ],
+)
+def test_wrong_options_are_usage_errors(
+    run: tuple[Path, Feeder], options: list[str], message: str
+) -> None:
+    import re
+
+    result = call("cat", run[0], *options)
+    assert result.exit_code == 2
+    assert re.search(message, result.stderr)
+    assert "Traceback" not in result.stderr
+
+
+def hostile(path: Path) -> Path:
+    """A trace with names and texts that try things, and outputs whose payload is not there."""
+    escape = "\x1b[31mred\x1b[0m\nsecond line\u202e\x07"
+    with Opened(path) as feeder:
+        node = feeder.entity(EntityKind.NODE, f"/n{escape}")
+        rosout = feeder.entity(EntityKind.PUBLISHER, "/rosout", node=node)
+        topic = feeder.entity(EntityKind.PUBLISHER, "/t" * 100, node=node, type_=escape)
+        log = log_message(0, 30, "n", escape)
+        # A schema that does not fit: the log's text cannot be shown, the event can.
+        channel = feeder.writer.add_channel("/rosout", "x/msg/Bad", "nonsense[")
+        feeder.output(OutputKind.LOG, rosout, log, feeder.payload(channel, 0, log))
+        feeder.output(OutputKind.LOG, rosout, b"not kept")
+        feeder.output(OutputKind.MESSAGE, topic, b"not kept")
+        feeder.output(OutputKind.MESSAGE, 4_000_000_000, b"of nobody", NO_SEQUENCE)
+        feeder.detail(OutputKind.EXCEPTION, node, 0, escape)
+        feeder.detail(OutputKind.TIMER, node, 0, escape)
+        feeder.detail(OutputKind.EXCEPTION, node, 0, "")
+        feeder.event(EventKind.TIMER, 3_000_000_000, 1)
+        feeder.writer.add_metadata("rsltrace:environment", {escape: escape, "long": "x" * 5000})
+        feeder.writer.close(result={"stop_reason": escape})
+    return path
+
+
+def test_nothing_of_a_trace_steers_the_terminal(tmp_path: Path) -> None:
+    path = hostile(tmp_path / "run.mcap")
+    for arguments in (["info"], ["cat"], ["cat", "--json"], ["info", "--json"]):
+        text = output(*arguments, path)
+        assert not set(text) & set("\x1b\x07\u202e")
+    (line,) = lines(path)
+    assert r"exception second line" in line
+    assert r"\x1b[31mred\x1b[0m\nsecond line\u202e\x07" in line
+    assert "#3000000000" in line
+    assert "#4000000000" in line
+    assert "5000 characters (see --json)" in output("info", path)
+
+
+def test_printable_keeps_what_can_be_printed() -> None:
+    assert printable("ünïcode 漢字 \\ ok") == "ünïcode 漢字 \\ ok"
+    assert printable("\t\r\n\0\x9b\ud800\u2028") == r"\t\r\n\x00\x9b\ud800\u2028"
+
+
+def test_tables_are_aligned_and_end_without_spaces() -> None:
+    rows = [("a", "1", ""), ("bbb", "22", "x")]
+    assert table(rows, right=frozenset((1,))) == ["a     1", "bbb  22  x"]
+
+
+# -- the command -----------------------------------------------------------------------------
+
+
+def rsltrace(*arguments: object, **options: object) -> subprocess.CompletedProcess:
+    command = [sys.executable, "-m", "rsltrace.cli.main", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, **options)
+
+
+@pytest.mark.parametrize("command", ["info", "cat"])
+def test_an_error_is_one_line_and_status_2(tmp_path: Path, command: str) -> None:
+    done = rsltrace(command, tmp_path / "nothing.mcap")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == f"rsltrace: error: {tmp_path / 'nothing.mcap'} does not exist\n"
+
+
+def test_help_says_what_to_do_first_and_needs_little() -> None:
+    script = """
+import sys
+from rsltrace.cli.main import cli
+try:
+    cli.main(["--help"], prog_name="rsltrace")
+except SystemExit:
+    pass
+heavy = {"rclpy", "numpy", "pydantic", "rich", "textual", "rerun", "rosbags", "ruamel", "mcap"}
+print(sorted(heavy & {name.partition(".")[0] for name in sys.modules}))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.endswith("[]\n")
+    text = done.stdout
+    assert text.index("rsltrace record job.yaml") < text.index("rsltrace info") < text.index("cat")
+    for command in ("record", "info", "cat"):
+        assert f"\n  {command} " in text
+
+
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_help_and_version_are_quick(option: str) -> None:
+    best = min(_seconds(option) for _ in range(5))
+    assert best < 0.4  # 0.1 s on a quiet machine; twice the 0.2 s that are promised, for busy ones
+
+
+def _seconds(option: str) -> float:
+    start = time.perf_counter()
+    assert rsltrace(option).returncode == 0
+    return time.perf_counter() - start
+
+
+def test_version() -> None:
+    from rsltrace import __version__
+
+    assert rsltrace("--version").stdout == f"rsltrace {__version__}\n"
+
+
+def test_an_unknown_command_is_a_usage_error() -> None:
+    done = rsltrace("recrod")
+    assert done.returncode == 2
+    assert "recrod" in done.stderr
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of POSIX")
+@pytest.mark.parametrize("command", ["cat", "cat --json"])
+def test_head_ends_it_quietly(tmp_path: Path, command: str) -> None:
+    path = tmp_path / "run.mcap"
+    write_run(path, 20_000)
+    shell = f"'{sys.executable}' -m rsltrace.cli.main {command} '{path}' | head -n 2; "
+    done = subprocess.run(
+        ["bash", "-c", shell + "echo ${PIPESTATUS[0]}"], capture_output=True, text=True, check=True
+    )
+    first, second, status = done.stdout.splitlines()
+    assert first != second
+    assert status == "141"
+    assert done.stderr == ""
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has /dev/full")
+def test_output_that_cannot_be_written_is_an_error(run: tuple[Path, Feeder]) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "rsltrace.cli.main", "cat", str(run[0])],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == "rsltrace: error: No space left on device\n"
+
+
+def test_a_terminal_without_unicode_shows_escapes(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Opened(path) as feeder:
+        node = feeder.entity(EntityKind.NODE, "/größe")
+        feeder.event(EventKind.TIMER, node, 1)
+        feeder.writer.close(result={})
+    environment = {**os.environ, "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    done = rsltrace("cat", path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert r"/gr\xf6\xdfe" in done.stdout
+
+
+def test_memory_of_cat_does_not_grow_with_the_trace(tmp_path: Path) -> None:
+    script = """
+import resource, sys
+from rsltrace.cli.main import cli
+try:
+    cli.main(["cat", sys.argv[1]], prog_name="rsltrace")
+except SystemExit:
+    pass
+print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)
+"""
+    peaks = []
+    for events in (5_000, 50_000):
+        path = tmp_path / f"{events}.mcap"
+        write_run(path, events)
+        done = subprocess.run(
+            [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
+        )
+        assert len(done.stdout.splitlines()) >= events
+        peaks.append(int(done.stderr))
+    assert peaks[1] - peaks[0] < 8_000  # kB; the events alone would be 50 MB as objects
+
+
+def test_payloads_that_were_not_kept_are_no_error(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Opened(path) as feeder:
+        publisher = feeder.entity(EntityKind.PUBLISHER, "/t", node=0, type_="std_msgs/msg/UInt64")
+        client = feeder.entity(EntityKind.CLIENT, "/s", node=0, type_="std_srvs/srv/Trigger")
+        feeder.output(OutputKind.MESSAGE, publisher, uint64_message(1))
+        feeder.output(OutputKind.REQUEST, client, CDR)
+        feeder.event(EventKind.TIMER, 1, 1)
+        feeder.writer.close(result={})
+    (event,) = objects(path, "--payloads")
+    assert [out["sequence"] for out in event["outputs"]] == [None, None]
+    assert "/t, call /s" in lines(path)[0]

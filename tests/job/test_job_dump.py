@@ -1,0 +1,178 @@
+"""A job written out loads as the same job, and its resolved form is the same on every machine."""
+
+from __future__ import annotations
+
+import json
+import string
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
+
+names = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,8}", fullmatch=True)
+plain_names = st.from_regex(r"[A-Za-z][A-Za-z0-9]{0,8}", fullmatch=True)
+topics = st.lists(names, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(parts))
+remaps = st.lists(plain_names, min_size=1, max_size=3).map("/".join)
+globs = st.lists(st.text(string.printable, max_size=8).map(lambda text: "/" + text), max_size=3)
+targets = st.tuples(plain_names, plain_names).map(":".join)
+times_ns = st.integers(0, 2**63 - 1)
+texts = st.text(st.characters(exclude_categories=["Cs"]), max_size=30)
+scalars = [st.booleans(), st.integers(-(2**63), 2**63 - 1), st.floats(allow_nan=False), texts]
+parameters = st.dictionaries(
+    st.text(
+        st.characters(exclude_categories=["Cs"], exclude_characters="."), min_size=1, max_size=8
+    ),
+    st.one_of(*scalars, *(st.lists(s, min_size=1, max_size=4) for s in scalars)),
+    max_size=4,
+).map(lambda values: {k: v for k, v in values.items() if k != "ros__parameters"})
+values = st.recursive(
+    st.one_of(st.none(), *scalars),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(texts, inner, max_size=3)),
+    max_leaves=6,
+)
+nodes = st.builds(
+    NodeSpec,
+    node=targets,
+    namespace=st.none() | topics,
+    parameters=parameters,
+    remappings=st.dictionaries(remaps, remaps, max_size=3),
+    arguments=st.dictionaries(plain_names, values, max_size=3),
+)
+
+
+def _named(specs: list[NodeSpec]) -> list[NodeSpec]:
+    """Give every second node a name of its own."""
+    return [s.replace(name=f"n{i}") if i % 2 else s for i, s in enumerate(specs)]
+
+
+stops = st.builds(
+    StopSpec,
+    duration_ns=st.none() | times_ns,
+    time_ns=st.none() | times_ns,
+    events=st.none() | st.integers(1, 2**63 - 1),
+    topic=st.none() | st.builds(TopicStop, name=topics, exit_code=st.none() | plain_names),
+    function=st.none() | targets,
+    quiescence_ns=st.none() | st.integers(1, 2**63 - 1),
+)
+bags = st.builds(
+    BagSpec, path=st.just("bag"), topics=globs, exclude=globs, start_offset_ns=times_ns
+)
+jobs = st.fixed_dictionaries(
+    {
+        "nodes": st.lists(nodes, min_size=1, max_size=3).map(_named),
+        "stop": stops,
+        "bags": st.lists(bags, max_size=2),
+        "record": st.builds(
+            RecordSpec,
+            payloads=st.booleans(),
+            topics=globs.filter(bool),
+            exclude=globs,
+        ),
+        "seed": st.integers(0, 2**64 - 1),
+        "timer_ties": st.sampled_from(["creation", "heap"]),
+        "livelock_limit": st.integers(1, 2**63 - 1),
+    }
+)
+
+
+@given(jobs)
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=150)
+def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "bag").touch()
+        job = Job(**fields, base_dir=folder)
+        path = Path(folder, "job.yaml")
+        path.write_text(job.to_yaml(), encoding="utf-8", newline="")
+        loaded = load_job(path)
+        assert loaded.resolved() == job.resolved()
+        assert repr(loaded) == repr(job)  # also tells 1 from 1.0 and True
+        assert loaded.to_yaml() == job.to_yaml()
+
+
+def test_the_yaml_of_a_job_is_short_and_readable() -> None:
+    job = Job(
+        nodes=[
+            NodeSpec(
+                node="m:N",
+                parameters={"rate": 10.0, "nested": {"a": 1}},
+                arguments={"a": None, "type": Path},
+            )
+        ],
+        start=1.5,
+        stop=StopSpec(duration="2min", topic="/done"),
+        record=RecordSpec(exclude=("/camera/*",)),
+    )
+    assert job.to_yaml() == (
+        "nodes:\n"
+        "  - node: m:N\n"
+        "    parameters:\n"
+        "      rate: 10.0\n"
+        "      nested.a: 1\n"
+        "    arguments:\n"
+        "      a:\n"
+        "      type: pathlib:Path\n"
+        "start: 1.5s\n"
+        "stop:\n"
+        "  duration: 120s\n"
+        "  topic:\n"
+        "    name: /done\n"
+        "record:\n"
+        "  exclude:\n"
+        "    - /camera/*\n"
+    )
+
+
+def test_the_resolved_job_is_complete_and_json_compatible() -> None:
+    job = Job(nodes=[NodeSpec(node="m:N", parameters={"x": float("inf")})], start="1s")
+    assert json.loads(json.dumps(job.resolved(), allow_nan=False)) == {
+        "nodes": [
+            {
+                "node": "m:N",
+                "name": None,
+                "namespace": None,
+                "parameters": {"x": ".inf"},
+                "parameter_files": [],
+                "remappings": {},
+                "arguments": {},
+            }
+        ],
+        "search_path": ["."],
+        "start_ns": 1_000_000_000,
+        "construct_time_ns": None,
+        "stop": {
+            "duration_ns": None,
+            "time_ns": None,
+            "events": None,
+            "topic": None,
+            "function": None,
+            "quiescence_ns": None,
+        },
+        "seed": 0,
+        "timer_ties": "creation",
+        "livelock_limit": 100_000,
+        "bags": [],
+        "record": {"payloads": True, "topics": ["*"], "exclude": []},
+    }
+
+
+def test_the_resolved_job_does_not_depend_on_where_it_lies(tmp_path: Path) -> None:
+    resolved = []
+    for folder in (tmp_path / "here", tmp_path / "there" / "deeper"):
+        (folder / "src").mkdir(parents=True)
+        (folder / "bag.mcap").touch()
+        (folder / "p.yaml").touch()
+        (folder / "job.yaml").write_text(
+            f"nodes: [{{node: m:N, parameter_files: [src/../p.yaml]}}]\n"
+            f"search_path: [./src/, {folder}]\n"
+            f"bags: [{folder}/bag.mcap, src/../bag.mcap]\n",
+            encoding="utf-8",
+        )
+        resolved.append(load_job(folder / "job.yaml").resolved())
+    assert resolved[0] == resolved[1]
+    assert resolved[0]["search_path"] == ["src", "."]
+    assert resolved[0]["nodes"][0]["parameter_files"] == ["p.yaml"]
+    assert [bag["path"] for bag in resolved[0]["bags"]] == ["bag.mcap", "bag.mcap"]

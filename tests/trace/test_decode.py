@@ -1,0 +1,221 @@
+"""Decoding by embedded schemas, and what a hostile schema can do: nothing."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import struct
+import sys
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_typestore
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.decode import Decoder, to_plain
+from rsltrace.trace.index import ChannelInfo
+
+CDR = b"\x00\x01\x00\x00"
+SEPARATOR = "=" * 80
+
+
+def decoder(text: str, name: str = "x/msg/T", encoding: str = "ros2msg") -> Decoder:
+    return Decoder(ChannelInfo(1, "/topic", name, encoding, text, {}))
+
+
+@pytest.fixture(scope="module")
+def jazzy() -> Any:
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def test_every_message_type_of_ros_can_be_decoded(jazzy: Any) -> None:
+    for name in jazzy.fielddefs:
+        text, _ = jazzy.generate_msgdef(name, ros_version=2)
+        decoder(text, name)
+
+
+def test_a_message_with_everything_in_it(jazzy: Any) -> None:
+    name = "sensor_msgs/msg/JointState"
+    types = jazzy.types
+    message = types[name](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](sec=-1, nanosec=5), frame_id="a/ü"
+        ),
+        name=["left", "right"],
+        position=np.array([1.0, float("nan")]),
+        velocity=np.array([float("inf"), -float("inf")]),
+        effort=np.array([]),
+    )
+    text, _ = jazzy.generate_msgdef(name, ros_version=2)
+    data = bytes(jazzy.serialize_cdr(message, name))
+    plain = to_plain(decoder(text, name).decode(data))
+    assert plain == {
+        "header": {"stamp": {"sec": -1, "nanosec": 5}, "frame_id": "a/ü"},
+        "name": ["left", "right"],
+        "position": [1.0, "NaN"],
+        "velocity": ["Infinity", "-Infinity"],
+        "effort": [],
+    }
+    json.dumps(plain, allow_nan=False)
+
+
+def test_scalars_that_json_cannot_hold_become_texts() -> None:
+    made = decoder("float64 a\nfloat32 b\nint64 c\nbool d\n")
+    data = CDR + struct.pack("<df4xq?", float("nan"), -float("inf"), -(2**63), True)
+    assert to_plain(made.decode(data)) == {"a": "NaN", "b": "-Infinity", "c": -(2**63), "d": True}
+
+
+def test_an_empty_message_is_an_empty_object() -> None:
+    assert to_plain(decoder("").decode(CDR + b"\0")) == {}
+
+
+def test_constants_are_not_part_of_a_message() -> None:
+    plain = to_plain(decoder("uint8 A=3\nstring B='x'\nuint8 c\n").decode(CDR + b"\7"))
+    assert plain == {"c": 7}
+
+
+def test_fields_may_have_names_that_python_reserves() -> None:
+    plain = to_plain(decoder("uint8 class\nuint8 self\nuint8 cls\n").decode(CDR + b"\1\2\3"))
+    assert list(plain.values()) == [1, 2, 3]
+
+
+@pytest.mark.parametrize(
+    "name", ["std_srvs/srv/Trigger_Response", "p/action/Fibonacci_Goal", "p/msg/T", "p/T"]
+)
+def test_types_of_services_and_actions_decode(name: str) -> None:
+    data = CDR + b"\1\0\0\0\2\0\0\0a\0"
+    assert to_plain(decoder("bool success\nstring message\n", name).decode(data)) == {
+        "success": True,
+        "message": "a",
+    }
+
+
+def test_a_service_may_name_messages_of_its_package_without_the_package() -> None:
+    text = f"Inner inner\n{SEPARATOR}\nMSG: p/Inner\nuint8 a\n"
+    assert to_plain(decoder(text, "p/srv/S_Request").decode(CDR + b"\5")) == {"inner": {"a": 5}}
+
+
+def test_two_channels_may_define_a_type_in_two_ways() -> None:
+    one = decoder(f"p/I i\n{SEPARATOR}\nMSG: p/I\nuint8 a\n")
+    two = decoder(f"p/I i\n{SEPARATOR}\nMSG: p/I\nuint16 b\n")
+    assert to_plain(one.decode(CDR + b"\1")) == {"i": {"a": 1}}
+    assert to_plain(two.decode(CDR + b"\1\0")) == {"i": {"b": 1}}
+
+
+HOSTILE_TEXTS = {
+    "a type it does not define": "p/Missing a\n",
+    "wide strings": "wstring a\n",
+    "a type that contains itself": "T a\n",
+    "types that contain each other": f"p/A a\n{SEPARATOR}\nMSG: p/A\nx/T t\n",
+    "a huge array of strings": "string[100000000] a\n",
+    "a huge array of messages": f"p/A[100000000] a\n{SEPARATOR}\nMSG: p/A\nuint8 b\n",
+    "an array of nothing": "uint8[0] a\n",
+    "a negative array": "uint8[-1] a\n",
+    "a huge array": "uint8[99999999999999999999] a\n",
+    "code in a name": 'uint8 a"""+__import__("os")\n',
+    "code in a type": "p/A;import_os a\n",
+    "a name that begins with a digit": f"p/A a\n{SEPARATOR}\nMSG: 1p/A\nuint8 a\n",
+    "a name of underscores": f"p/A a\n{SEPARATOR}\nMSG: __/__/__\nuint8 a\n",
+    "a name of six parts": f"p/A a\n{SEPARATOR}\nMSG: a/b/c/d/e/f\nuint8 a\n",
+    "two fields of one name": "uint8 a\nuint16 a\n",
+    "no fields at all": "%%%\n",
+    "much text": "#" * (2 << 20),
+}
+
+
+@pytest.mark.parametrize("text", HOSTILE_TEXTS.values(), ids=HOSTILE_TEXTS)
+def test_schemas_no_interface_has_are_refused(text: str) -> None:
+    with pytest.raises(
+        TraceError, match=r"/topic cannot be decoded: the trace's schema of x/msg/T"
+    ):
+        decoder(text)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        "T",
+        "x/msg/T\nuint8 evil",
+        'x/msg/T"""\nimport os\n"""',
+        "x/msg/" + "T" * 10 + "\n",
+        "x/msg/T;",
+        "../../T",
+        "x/msg/Té",
+    ],
+)
+def test_type_names_that_are_none_are_refused(name: str) -> None:
+    with pytest.raises(TraceError, match="is not usable"):
+        decoder("uint8 a\n", name)
+
+
+def test_only_ros2msg_is_decoded() -> None:
+    with pytest.raises(TraceError, match="its encoding is 'ros2idl'"):
+        decoder("struct T {};", encoding="ros2idl")
+
+
+def test_deep_but_sane_nesting_works_and_deeper_is_refused() -> None:
+    def nested(depth: int) -> str:
+        parts = ["p/A0 a\n"]
+        for level in range(depth):
+            inner = f"p/A{level + 1} a\np/A{level + 1} b\n" if level + 1 < depth else "uint8 a\n"
+            parts.append(f"{SEPARATOR}\nMSG: p/A{level}\n{inner}")
+        return "".join(parts)
+
+    decoder(nested(8))
+    with pytest.raises(TraceError, match="nested too deeply"):
+        decoder(nested(40))  # with two of each, 2^40 paths: it must not walk them
+
+
+INJECTIONS = st.sampled_from(
+    [
+        '"""',
+        "'",
+        "\n",
+        ";",
+        "__import__('sys').exit()",
+        "=",
+        "[",
+        "]",
+        "#",
+        "\\",
+        "(",
+        ")",
+        " ",
+        "\t",
+    ]
+)
+LINE = st.lists(
+    INJECTIONS
+    | st.sampled_from(["uint8", "a", "p/A", "[3]", "<=", "string", "1e999", "MSG:", "T"]),
+    max_size=6,
+).map("".join)
+
+
+@given(lines=st.lists(LINE, max_size=6), name=st.just("x/msg/T") | LINE)
+def test_mangled_schemas_are_refused_or_harmless(lines: list[str], name: str) -> None:
+    modules = set(sys.modules)
+    try:
+        decoder("\n".join(lines), name)
+    except TraceError:
+        pass
+    assert {m for m in set(sys.modules) - modules if not m.startswith("rosbags")} == set()
+
+
+@given(data=st.binary(max_size=60))
+def test_any_bytes_decode_or_are_a_trace_error(data: bytes) -> None:
+    made = decoder(
+        "string[] a\nuint32[<=4] b\nfloat64[2] c\np/A[] d\n" + f"{SEPARATOR}\nMSG: p/A\nstring s\n"
+    )
+    for header in (b"", CDR, b"\x00\x00\x00\x00"):
+        with contextlib.suppress(TraceError):
+            to_plain(made.decode(header + data))
+
+
+def test_a_count_larger_than_the_message_costs_nothing() -> None:
+    for text in ("uint8[] a\n", "string[] a\n", f"p/E[] a\n{SEPARATOR}\nMSG: p/E\n"):
+        with pytest.raises(TraceError, match="does not fit"):
+            decoder(text).decode(CDR + b"\xff\xff\xff\xff")
