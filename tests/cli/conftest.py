@@ -1,4 +1,4 @@
-"""Makes ``tests/trace/make.py`` importable as ``trace_maker``: tests are imported without their folder."""
+"""Makes ``tests/trace/make.py`` importable as ``trace_maker``, as in ``tests/trace``."""
 
 from __future__ import annotations
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -265,8 +266,6 @@ def test_a_name_that_matches_nothing_is_said(run: tuple[Path, Feeder]) -> None:
 def test_wrong_options_are_usage_errors(
     run: tuple[Path, Feeder], options: list[str], message: str
 ) -> None:
-    import re
-
     result = call("cat", run[0], *options)
     assert result.exit_code == 2
     assert re.search(message, result.stderr)
@@ -421,18 +420,20 @@ def test_a_terminal_without_unicode_shows_escapes(tmp_path: Path) -> None:
     assert r"/gr\xf6\xdfe" in done.stdout
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells the peak there")
 def test_memory_of_cat_does_not_grow_with_the_trace(tmp_path: Path) -> None:
     script = """
-import resource, sys
+import re, sys
 from rsltrace.cli.main import cli
 try:
     cli.main(["cat", sys.argv[1]], prog_name="rsltrace")
 except SystemExit:
     pass
-print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)
+# Not getrusage: its maximum is inherited from the process that started this one.
+print(re.search(r"VmHWM:\\s+([0-9]+) kB", open("/proc/self/status").read())[1], file=sys.stderr)
 """
     peaks = []
-    for events in (5_000, 50_000):
+    for events in (10_000, 50_000):
         path = tmp_path / f"{events}.mcap"
         write_run(path, events)
         done = subprocess.run(
@@ -440,7 +441,7 @@ print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)
         )
         assert len(done.stdout.splitlines()) >= events
         peaks.append(int(done.stderr))
-    assert peaks[1] - peaks[0] < 8_000  # kB; the events alone would be 50 MB as objects
+    assert peaks[1] - peaks[0] < 4_000  # kB; the events alone would be 20 MB as objects
 
 
 def test_payloads_that_were_not_kept_are_no_error(tmp_path: Path) -> None:

@@ -153,23 +153,27 @@ def _fake_ros(sim: Sim) -> dict[str, ModuleType]:
     return modules
 
 
+def _loaded_examples() -> list[str]:
+    files = {name: getattr(module, "__file__", None) for name, module in sys.modules.items()}
+    return [name for name, file in files.items() if file and Path(file).is_relative_to(EXAMPLES)]
+
+
 @pytest.fixture
 def load_example(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], ModuleType]]:
-    """Return ``load(folder, module)``; modules it imported are forgotten after the test.
+    """Return ``load(folder, module)``: loaded anew for the test, and forgotten after it.
 
-    Forgetting matters: ``nodes`` is a name that other tests may import from elsewhere.
+    Another test may have loaded the same module on real ROS, or another one called ``nodes``.
     """
-    before = set(sys.modules)
+    for name in _loaded_examples():
+        monkeypatch.delitem(sys.modules, name)
 
     def load(folder: str, module: str) -> ModuleType:
         monkeypatch.syspath_prepend(str(EXAMPLES / folder))
         return importlib.import_module(module)
 
     yield load
-    for name in set(sys.modules) - before:
-        file = getattr(sys.modules[name], "__file__", None)
-        if file and Path(file).is_relative_to(EXAMPLES):
-            del sys.modules[name]
+    for name in _loaded_examples():
+        del sys.modules[name]
 
 
 @pytest.fixture
