@@ -5,4 +5,13 @@ from rsltrace.job.load import load_job, locate
 from rsltrace.job.node import NodeSpec
 from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TopicStop
 
-__all__ = ["BagSpec", "Job", "NodeSpec", "RecordSpec", "StopSpec", "TopicStop", "load_job", "locate"]
+__all__ = [
+    "BagSpec",
+    "Job",
+    "NodeSpec",
+    "RecordSpec",
+    "StopSpec",
+    "TopicStop",
+    "load_job",
+    "locate",
+]

@@ -122,6 +122,9 @@ def _keys_at(model: type[BaseModel], loc: Loc) -> list[str]:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
+    # In Python 3.10 tuple[X, ...] calls itself a type, so what is inside comes first.
+    if inner := get_args(annotation):
+        return next((found for arg in inner if (found := _model_in(arg))), None)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next((found for arg in get_args(annotation) if (found := _model_in(arg))), None)
+    return None

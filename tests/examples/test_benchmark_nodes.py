@@ -7,7 +7,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 Load = Callable[[str, str], ModuleType]
@@ -86,6 +86,7 @@ def test_senseless_arguments_are_refused(
 def test_xorshift_never_dies_and_never_merges(benchmark8: ModuleType) -> None:
     word = st.integers(1, 2**64 - 1)
 
+    @settings(deadline=None)
     @given(word, word)
     def check(a: int, b: int) -> None:
         assert 0 < benchmark8.xorshift(a) < 2**64

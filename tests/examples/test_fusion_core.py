@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 Load = Callable[[str, str], ModuleType]
@@ -76,6 +76,7 @@ def test_covariance_stays_symmetric_and_positive(part: Callable[[str], Any]) -> 
         st.tuples(st.just("frame"), st.floats(-4, 4), place, place),
     )
 
+    @settings(deadline=None)
     @given(st.lists(step, max_size=30))
     def check(steps: list[tuple[Any, ...]]) -> None:
         ekf, now = ekf_class(), 0
@@ -142,6 +143,7 @@ def test_wrap_angle(part: Callable[[str], Any]) -> None:
     assert wrap(-math.pi) == math.pi
     assert wrap(3 * math.pi) == pytest.approx(math.pi)
 
+    @settings(deadline=None)
     @given(st.floats(-1000, 1000))
     def check(angle: float) -> None:
         assert -math.pi < wrap(angle) <= math.pi
@@ -153,6 +155,7 @@ def test_wrap_angle(part: Callable[[str], Any]) -> None:
 def test_local_frame_there_and_back(part: Callable[[str], Any]) -> None:
     frame_class = part("geodesy").LocalFrame
 
+    @settings(deadline=None)
     @given(st.floats(-80, 80), st.floats(-180, 180), st.floats(-5e3, 5e3), st.floats(-5e3, 5e3))
     def check(latitude: float, longitude: float, east: float, north: float) -> None:
         frame = frame_class(latitude, longitude)
@@ -182,6 +185,7 @@ def test_a_datum_off_the_earth_is_refused(
 def test_alignment_finds_the_turn_and_the_shift(part: Callable[[str], Any]) -> None:
     aligner_class = part("alignment").TrackAligner
 
+    @settings(deadline=None)
     @given(st.floats(-3.1, 3.1), st.floats(-1000, 1000), st.floats(-1000, 1000))
     def check(turn: float, x: float, y: float) -> None:
         aligner = aligner_class(9.99)

@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 TESTS = Path(__file__).resolve().parents[1]
@@ -90,6 +90,7 @@ def mix_as_specified(h1: int, h2: int) -> int:
 def test_mix_is_the_formula_written_down(nodes: ModuleType) -> None:
     word = st.integers(0, 2**64 - 1)
 
+    @settings(deadline=None)
     @given(word, word)
     def check(h1: int, h2: int) -> None:
         assert nodes.mix(h1, h2) == mix_as_specified(h1, h2)

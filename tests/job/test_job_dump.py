@@ -8,7 +8,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
@@ -80,7 +80,8 @@ jobs = st.fixed_dictionaries(
 
 
 @given(jobs)
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=150)
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=60)
+@example({"nodes": [NodeSpec(node="m:N", arguments={"a": {"\x85": "\u2028 \ufeff\n"}})]})
 def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "bag").touch()
@@ -99,7 +100,7 @@ def test_the_yaml_of_a_job_is_short_and_readable() -> None:
             NodeSpec(
                 node="m:N",
                 parameters={"rate": 10.0, "nested": {"a": 1}},
-                arguments={"a": None, "type": Path},
+                arguments={"a": None, "type": StopSpec},
             )
         ],
         start=1.5,
@@ -114,7 +115,7 @@ def test_the_yaml_of_a_job_is_short_and_readable() -> None:
         "      nested.a: 1\n"
         "    arguments:\n"
         "      a:\n"
-        "      type: pathlib:Path\n"
+        "      type: rsltrace.job.spec:StopSpec\n"
         "start: 1.5s\n"
         "stop:\n"
         "  duration: 120s\n"
