@@ -1,0 +1,59 @@
+"""What must not be imported, seen from outside in fresh processes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+HEAVY = ("rclpy", "numpy", "pydantic", "rosbags", "textual", "rerun", "rich", "ruamel")
+
+
+def loaded_after(code: str) -> set[str]:
+    """Return which of the heavy packages a fresh interpreter has loaded after running ``code``."""
+    probe = f"{code}\nimport sys\nprint(*[m for m in {HEAVY!r} if m in sys.modules])"
+    done = subprocess.run(
+        [sys.executable, "-c", probe], capture_output=True, text=True, check=True, timeout=60
+    )
+    return set(done.stdout.splitlines()[-1].split())
+
+
+def test_importing_rsltrace_loads_nothing_heavy() -> None:
+    assert loaded_after("import rsltrace; rsltrace.__version__; dir(rsltrace)") == set()
+
+
+def test_help_and_version_load_nothing_heavy() -> None:
+    for argument in ("--help", "--version"):
+        code = (
+            "import sys, contextlib\n"
+            f"sys.argv = ['rsltrace', {argument!r}]\n"
+            "from rsltrace.cli.main import main\n"
+            "with contextlib.suppress(SystemExit):\n    main()\n"
+        )
+        assert loaded_after(code) == set()
+
+
+@pytest.mark.parametrize(
+    ("module", "allowed"),
+    [
+        ("rsltrace.loop.loop", set()),
+        ("rsltrace.model.event", set()),
+        ("rsltrace.job", {"pydantic", "ruamel"}),
+        ("rsltrace.trace.reader", {"numpy"}),
+        ("rsltrace.trace.writer", {"numpy"}),
+    ],
+)
+def test_layers_load_only_what_they_need(module: str, allowed: set[str]) -> None:
+    assert loaded_after(f"import {module}") <= allowed
+
+
+def test_every_public_name_exists() -> None:
+    import rsltrace
+
+    for name in rsltrace.__all__:
+        if name == "record":
+            pytest.importorskip("rclpy")
+        assert getattr(rsltrace, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = rsltrace.nothing  # type: ignore[attr-defined]
