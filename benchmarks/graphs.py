@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 # Bound before rsltrace is imported: under it, ``time.perf_counter`` may tell simulated time.
-from time import perf_counter, sleep
+from time import perf_counter, process_time, sleep
 from typing import Any
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -111,7 +111,8 @@ EXECUTORS = ("single_threaded", "multi_threaded", "events_executor")
 def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, Any]:
     """Spin ``graph`` over DDS and count its callbacks for ``seconds`` of wall time.
 
-    Returns ``{"callbacks": n, "wall_s": s}``. Raises RuntimeError if the graph does not come alive.
+    Returns ``{"callbacks": n, "wall_s": s, "cpu_s": s}``, CPU time being that of all threads.
+    Raises RuntimeError if the graph does not come alive.
     """
     import rclpy
     from rclpy.executors import (
@@ -146,9 +147,10 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
         while not all(node.callbacks for node in nodes) and perf_counter() < given_up:
             sleep(0.05)
         sleep(WARM_UP_S)
-        first, start = count(), perf_counter()
+        first, start, cpu_start = count(), perf_counter(), process_time()
         sleep(seconds)
         measured["callbacks"], measured["wall_s"] = count() - first, perf_counter() - start
+        measured["cpu_s"] = process_time() - cpu_start
         measured["idle"] = [node.get_name() for node in nodes if not node.callbacks]
         enough.set_result(None)
         if not left.wait(2.0):
@@ -180,8 +182,8 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
 def run_rsltrace(graph: Graph, callbacks: int, folder: Path, *, record: bool) -> dict[str, Any]:
     """Run ``graph`` for about ``callbacks`` events under rsltrace, in ``folder``.
 
-    Returns ``{"callbacks": n, "wall_s": s, "digest": d, "bytes": size}``; the wall time is that of
-    the whole run, with imports and construction. Raises ImportError if rsltrace cannot record.
+    Returns ``{"callbacks": n, "wall_s": s, "cpu_s": s, "digest": d, "bytes": size}``; the times
+    are those of the whole run, with construction. Raises ImportError if rsltrace cannot record.
     """
     sys.path.insert(0, str(EXAMPLES.parent))  # the checkout this file is in, installed or not
     from rsltrace import load_job
@@ -190,12 +192,13 @@ def run_rsltrace(graph: Graph, callbacks: int, folder: Path, *, record: bool) ->
     job_path = folder / "job.yaml"
     job_path.write_text(json.dumps(graph.job(callbacks)))  # JSON is YAML
     output = folder / "run.mcap" if record else None
-    start = perf_counter()
+    start, cpu_start = perf_counter(), process_time()
     result = record_job(load_job(job_path), output=output, force=True)
-    wall_s = perf_counter() - start
+    wall_s, cpu_s = perf_counter() - start, process_time() - cpu_start
     return {
         "callbacks": int(result.events),
         "wall_s": wall_s,
+        "cpu_s": cpu_s,
         "digest": str(result.digest),
         "bytes": output.stat().st_size if output else 0,
     }

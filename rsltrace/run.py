@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace._version import __version__
-from rsltrace.errors import JobError, OutputError, RsltraceError, RunError
+from rsltrace.errors import JobError, RsltraceError, RunError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import (
@@ -208,7 +208,7 @@ def _prepare(job: Job) -> list[Entry]:
     return entries
 
 
-# -- bags ------------------------------------------------------------------------------------------
+# -- bags ----------------------------------------------------------------------------------------
 
 
 def _open_bag(job: Job, spec: BagSpec) -> Any:
@@ -249,9 +249,7 @@ def _start_players(world: World, job: Job, bags: list[Bag]) -> None:
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
 
     def build() -> None:
-        player = Node(
-            "rosbag2_player", start_parameter_services=False, enable_rosout=False
-        )
+        player = Node("rosbag2_player", start_parameter_services=False, enable_rosout=False)
         publishers: dict[str, Any] = {}
         for spec, bag in zip(job.bags, bags, strict=True):
             for topic in bag.topics:
@@ -295,7 +293,7 @@ def _qos_values(qos: Any) -> dict[str, Any]:
     }
 
 
-# -- stopping ----------------------------------------------------------------------------------------
+# -- stopping ------------------------------------------------------------------------------------
 
 
 def _end_ns(job: Job, start_ns: int) -> int | None:
@@ -332,7 +330,7 @@ def _stop_conditions(job: Job, start_ns: int) -> Iterator[StopCondition]:
         yield stop_when(function, name)
 
 
-# -- the trace's own words ---------------------------------------------------------------------------
+# -- the trace's own words -----------------------------------------------------------------------
 
 
 def _payload_filter(job: Job) -> Callable[[str], bool]:
@@ -375,7 +373,7 @@ def environment() -> dict[str, str]:
     return values
 
 
-# -- the process --------------------------------------------------------------------------------------
+# -- the process ---------------------------------------------------------------------------------
 
 
 def _housekeeping(

@@ -56,6 +56,7 @@ def read_index(file: BinaryIO, size: int) -> McapIndex:
     summary_at, _, crc = struct.unpack_from("<QQI", footer, RECORD_HEAD.size)
     if summary_at == 0:
         scan_file(file, data_start, footer_at, index)
+        _check_data_crc(file, index)
         return index
     if not data_start <= summary_at <= footer_at:
         raise ValueError(f"the footer at byte {footer_at} is damaged")
@@ -70,7 +71,24 @@ def read_index(file: BinaryIO, size: int) -> McapIndex:
     if not complete:
         index = McapIndex(profile)
         scan_file(file, data_start, summary_at, index)
+    if not complete or not all(span.is_chunk for span in index.spans):
+        _check_data_crc(file, index)
     return index
+
+
+def _check_data_crc(file: BinaryIO, index: McapIndex) -> None:
+    """Check what no chunk's CRC covers: a file that was walked, messages outside chunks."""
+    if index.data_crc == 0:
+        return
+    file.seek(0)
+    crc, rest = 0, index.data_size
+    while rest:
+        block = file.read(min(rest, 1 << 20))
+        if not block:
+            raise ValueError("the data section is cut off")
+        crc, rest = zlib.crc32(block, crc), rest - len(block)
+    if crc != index.data_crc:
+        raise ValueError(f"the CRC of the data section (up to byte {index.data_size}) is wrong")
 
 
 def _header(file: BinaryIO, end: int) -> tuple[str, int]:

@@ -50,7 +50,10 @@ class Span:
 
 @dataclass(slots=True)
 class McapIndex:
-    """Everything about a file that is known before its messages are read."""
+    """Everything about a file that is known before its messages are read.
+
+    ``data_size`` and ``data_crc`` are those of the bytes before the DataEnd record, 0 if unknown.
+    """
 
     profile: str
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -59,6 +62,8 @@ class McapIndex:
     counts: Counter[int] = field(default_factory=Counter)
     start_ns: int = 0
     end_ns: int = 0
+    data_size: int = 0
+    data_crc: int = 0
 
 
 def scan_file(file: BinaryIO, start: int, end: int, index: McapIndex) -> None:
@@ -96,7 +101,12 @@ def scan_records(
         elif opcode in (SCHEMA, CHANNEL):
             file.seek(at)
             _define(opcode, file.read(after - at), index)
-        elif opcode in (DATA_END, FOOTER):
+        elif opcode == DATA_END:
+            file.seek(at)
+            index.data_size = at - RECORD_HEAD.size
+            index.data_crc = int.from_bytes(file.read(4), "little")
+            break
+        elif opcode == FOOTER:
             break
     run.close(index)
     return True

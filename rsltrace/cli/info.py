@@ -101,7 +101,10 @@ def _entity_lines(trace: Trace, counts: Counts) -> list[str]:
                 "-" if rate is None else f"{rate:.6g}",
             )
         )
-    return [f"entities: {len(rows) - 1}", *table(rows, right=frozenset((0, 5, 6, 7)))]
+    title = f"entities: {len(rows) - 1}"
+    if len(rows) == 1:
+        return [title]
+    return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]
 
 
 def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:

@@ -129,13 +129,13 @@ def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
         end = ends.pop()
         end(Stop(name, 128 + number))
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        old[number] = signal.signal(number, handle)
+    for caught in (signal.SIGINT, signal.SIGTERM):
+        old[caught] = signal.signal(caught, handle)
     try:
         yield ends.append
     finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
+        for caught_before, handler in old.items():
+            signal.signal(caught_before, handler)
 
 
 @contextmanager

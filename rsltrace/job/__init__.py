@@ -1,9 +1,28 @@
-"""What a run is to do: job files and jobs built in Python, strictly validated, never executed."""
+"""What a run is to do: job files and jobs built in Python, strictly validated, never executed.
 
-from rsltrace.job.job import Job
-from rsltrace.job.load import load_job, locate
-from rsltrace.job.node import NodeSpec
-from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TopicStop
+The names are loaded when first used: ``rsltrace.job.times`` serves those who need no pydantic.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rsltrace.job.job import Job
+    from rsltrace.job.load import load_job, locate
+    from rsltrace.job.node import NodeSpec
+    from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TopicStop
+
+_HOMES = {
+    "BagSpec": "spec",
+    "Job": "job",
+    "NodeSpec": "node",
+    "RecordSpec": "spec",
+    "StopSpec": "spec",
+    "TopicStop": "spec",
+    "load_job": "load",
+    "locate": "load",
+}
 
 __all__ = [
     "BagSpec",
@@ -15,3 +34,13 @@ __all__ = [
     "load_job",
     "locate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
+    value = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value

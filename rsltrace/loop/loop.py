@@ -104,7 +104,7 @@ class EventLoop:
         """Run until something stops the run, and say what."""
         while True:
             self.run_step()
-            if self.stopped is not None:
+            if self.stopped is not None:  # by an event, or by a signal at any time
                 return self.stopped
             next_ns = self.next_ns()
             stop = self._ask_conditions(next_ns)
@@ -116,8 +116,6 @@ class EventLoop:
                 return self.stopped
             if self._between_steps is not None:
                 self._between_steps()
-                if self._interrupt and self.stopped is not None:
-                    return self.stopped
             self.now_ns = max(next_ns, self.now_ns)
 
     def next_ns(self) -> int | None:
@@ -157,7 +155,8 @@ class EventLoop:
 
     def _run_idle(self) -> bool:
         """Let those who poll have a look, now that nothing else is ready. True: go on."""
-        return any([poll() for poll in self.idle]) if self.idle else False
+        woken = [poll() for poll in self.idle]  # all of them, not just up to the first
+        return any(woken)
 
     def _ask_conditions(self, next_ns: int | None) -> Stop | None:
         if not self.stop_conditions:

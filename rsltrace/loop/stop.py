@@ -1,4 +1,4 @@
-"""When a run ends. Conditions are looked at only between time steps, so the last step runs fully."""
+"""When a run ends. Conditions are asked only between time steps: the last step runs fully."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ class TimerQueue(Protocol):
         """Tell the queue that a timer's deadline has changed other than by having run."""
 
     def ran(self, timer: TimerState) -> None:
-        """Tell the queue that ``timer``, which ``first`` gave, was called and has a new deadline."""
+        """Tell the queue that ``timer``, given by ``first``, was called and has a new deadline."""
 
     def first(self) -> TimerState | None:
         """Return the timer that is due first, or None."""

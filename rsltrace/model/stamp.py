@@ -6,7 +6,7 @@ NS_PER_S = 1_000_000_000
 
 
 def format_seconds(stamp_ns: int) -> str:
-    """Return ``stamp_ns`` as seconds with nine decimals, exactly: ``-1500000000`` → ``-1.500000000``."""
+    """Return ``stamp_ns`` as seconds, exactly, with nine decimals: ``1.500000000``."""
     sign = "-" if stamp_ns < 0 else ""
     whole, fraction = divmod(abs(stamp_ns), NS_PER_S)
     return f"{sign}{whole}.{fraction:09d}"

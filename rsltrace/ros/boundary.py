@@ -145,9 +145,7 @@ class Boundary:
 
     def Node(self, *arguments: Any) -> NodeHandle:  # noqa: N802
         name, namespace, context, cli_args, use_global, rosout = arguments
-        return NodeHandle(
-            self, self.core, name, namespace, context, cli_args, use_global, rosout
-        )
+        return NodeHandle(self, self.core, name, namespace, context, cli_args, use_global, rosout)
 
     def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
         return PublisherHandle(node.core, node, *arguments)

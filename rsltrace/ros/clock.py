@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace.errors import UnsupportedError
 from rsltrace.ros.destroyable import Destroyable
-
-if TYPE_CHECKING:
-    from rsltrace.ros.boundary import Boundary
 
 
 class _Now:
@@ -28,7 +25,7 @@ class ClockHandle(Destroyable):
     for the world of the moment; between runs it stands at the last simulated time.
     """
 
-    boundary: Boundary
+    boundary: Any
 
     def __init__(self, clock_type: Any) -> None:
         super().__init__()

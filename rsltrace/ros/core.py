@@ -145,8 +145,9 @@ class Core:
                     handle.deactivate()
         node.wrapper = None
 
-    def channel(self, topic: str, type_name: str, schema: Callable[[], tuple[str, str]],
-                qos_yaml: str) -> int:
+    def channel(
+        self, topic: str, type_name: str, schema: Callable[[], tuple[str, str]], qos_yaml: str
+    ) -> int:
         """Return the trace's channel for a topic, or -1 if its payloads are not kept.
 
         ``schema`` gives the schema text and the type hash when a channel has to be made.
@@ -239,7 +240,11 @@ class Core:
         self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
 
     def run_outside(
-        self, describe: Callable[[], str], kind: EventKind, entity: int, node: NodeHandle | None,
+        self,
+        describe: Callable[[], str],
+        kind: EventKind,
+        entity: int,
+        node: NodeHandle | None,
         callback: Callable[[], object],
     ) -> None:
         """Run an event that is no entity's callback: construction, shutdown, a clock jump."""

@@ -1,4 +1,4 @@
-"""The life of a handle, as rclpy's ``Destroyable`` has it: used in ``with``, destroyed when idle."""
+"""The life of a handle as rclpy's ``Destroyable`` has it: destroyed when no ``with`` uses it."""
 
 from __future__ import annotations
 

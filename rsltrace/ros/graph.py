@@ -117,7 +117,11 @@ class Graph:
         publisher.send_history(subscription)
 
     def _check_type(self, endpoint: PublisherHandle | SubscriptionHandle) -> None:
-        for other in [*self.publishers(endpoint.topic), *self.subscriptions(endpoint.topic)]:
+        others: list[PublisherHandle | SubscriptionHandle] = [
+            *self.publishers(endpoint.topic),
+            *self.subscriptions(endpoint.topic),
+        ]
+        for other in others:
             if other.type_name != endpoint.type_name:
                 raise UnsupportedError(
                     f"topic {endpoint.topic} has two types: {other.describe()} is "
@@ -130,17 +134,20 @@ class Graph:
     def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every topic with its type, sorted by name."""
         topics: dict[str, str] = {}
-        for endpoints in [*self._publishers.values(), *self._subscriptions.values()]:
-            for endpoint in endpoints:
-                topics[endpoint.topic] = endpoint.type_name
+        for topic, publishers in self._publishers.items():
+            topics.update((topic, publisher.type_name) for publisher in publishers)
+        for topic, subscriptions in self._subscriptions.items():
+            topics.update((topic, subscription.type_name) for subscription in subscriptions)
         return [(topic, [topics[topic]]) for topic in sorted(topics)]
 
     def service_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every service that has a server or a client, sorted by name."""
         services: dict[str, set[str]] = {}
-        for ends in [*self._services.values(), *self._clients.values()]:
-            for end in ends:
-                services.setdefault(end.service, set()).add(end.type_name)
+        for name, servers in self._services.items():
+            services.setdefault(name, set()).update(server.type_name for server in servers)
+        for name, clients in self._clients.items():
+            services.setdefault(name, set()).update(client.type_name for client in clients)
+        services = {name: types for name, types in services.items() if types}
         return [(name, sorted(services[name])) for name in sorted(services)]
 
 

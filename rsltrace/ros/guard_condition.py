@@ -62,6 +62,4 @@ class GuardConditionHandle(EntityHandle):
             begin(group, wrapper)
             start_coroutine(core, self, _GUARD, callback, (), *self._cause, 0)
         else:
-            core.execute(
-                self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0
-            )
+            core.execute(self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0)

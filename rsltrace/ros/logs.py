@@ -68,7 +68,7 @@ class Logs:
     def log(
         self, severity: int, name: str, message: str, function: str, file: str, line: int
     ) -> None:
-        """Take one record. Only severity, name and message are hashed: line numbers are not news."""
+        """Take one record. Severity, name and message are hashed: line numbers are not news."""
         from builtin_interfaces.msg import Time
         from rcl_interfaces.msg import Log
 

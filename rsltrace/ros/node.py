@@ -55,7 +55,9 @@ class NodeHandle(EntityHandle):
         name, namespace = self._renamed(node_name, namespace)
         self.name = name
         self.namespace = namespace
-        self.fully_qualified_name = (namespace if namespace.endswith("/") else namespace + "/") + name
+        self.fully_qualified_name = (
+            namespace if namespace.endswith("/") else namespace + "/"
+        ) + name
         if core.graph.node_named(self.fully_qualified_name) is not None:
             raise _duplicate(core, self.fully_qualified_name)
         super().__init__(core, None)

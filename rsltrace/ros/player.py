@@ -21,7 +21,7 @@ _BAG = int(EventKind.BAG)
 _NAMES = {"reliability": Reliability, "durability": Durability, "history": History}
 
 # (stamp in ns, publisher, serialized message)
-Message = tuple[int, PublisherHandle, bytes]
+Message = tuple[int, "BagPublisher", bytes]
 
 
 class Player:
@@ -46,11 +46,9 @@ class Player:
             self._on_end()
             return
         stamp_ns, publisher, data = message
-        self._core.loop.schedule(
-            stamp_ns, lambda: self._publish(publisher, data), order=ORDER_BAG
-        )
+        self._core.loop.schedule(stamp_ns, lambda: self._publish(publisher, data), order=ORDER_BAG)
 
-    def _publish(self, publisher: PublisherHandle, raw: bytes) -> None:
+    def _publish(self, publisher: BagPublisher, raw: bytes) -> None:
         try:
             data = publisher._canonical(raw)
         except ValueError as error:

@@ -47,10 +47,10 @@ class PublisherHandle(EntityHandle):
         self._canonical = codec.canonical
         peers = [s.qos for s in core.graph.subscriptions(self.topic)]
         profile = qos if isinstance(qos, Qos) else Qos.from_rmw(qos)
-        self.qos = profile.resolved(publisher=True, peers=peers)
+        self.qos: Qos = profile.resolved(publisher=True, peers=peers)
         super().__init__(core, node)
         self.subscriptions: list[SubscriptionHandle] = []
-        self.events = EndpointEvents(core, self)
+        self.events: EndpointEvents = EndpointEvents(core, self)
         self._count = 0
         self._channel: int | None = None
         self._watcher = core.watchers.get(self.topic)
@@ -167,11 +167,11 @@ class SubscriptionHandle(EntityHandle):
         self._msg_type = msg_type
         self._deserialize = codec.deserialize
         peers = [p.qos for p in core.graph.publishers(self.topic)]
-        self.qos = Qos.from_rmw(qos).resolved(publisher=False, peers=peers)
+        self.qos: Qos = Qos.from_rmw(qos).resolved(publisher=False, peers=peers)
         super().__init__(core, node)
         self.queue: deque[Delivery] = deque(maxlen=self.qos.keep)
         self.publishers: list[PublisherHandle] = []
-        self.events = EndpointEvents(core, self)
+        self.events: EndpointEvents = EndpointEvents(core, self)
         self._callback: Any = None
         self._coroutine = False
         self._with_info = False

@@ -114,7 +114,7 @@ class EventHandle(EntityHandle):
         super().__init__(core, parent.node)
         # rclpy makes a handle or two for every endpoint; only those that fire are worth a record.
         self.announced = False
-        self._events = parent.events
+        self._events: EndpointEvents = parent.events
         self._parent = parent
         self._name = _event_name(event_type)
         self._queued = False

@@ -76,9 +76,7 @@ class TimerHandle(EntityHandle):
             begin(wrapper.callback_group, wrapper)
             start_coroutine(core, self, _TIMER, callback, (), NO_EVENT, 0, digest)
         else:
-            core.execute(
-                self, self.entity_id, self.node, _TIMER, callback, (), NO_EVENT, 0, digest
-            )
+            core.execute(self, self.entity_id, self.node, _TIMER, callback, (), NO_EVENT, 0, digest)
         if not state.canceled and not self._destroyed:
             core.loop.timers.ran(state)
 

@@ -250,7 +250,9 @@ def _yaml_value(value: Any) -> str:
     if isinstance(value, int):
         return str(int(value))
     if isinstance(value, float):
-        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(repr(float(value)), _float(value))
+        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(
+            repr(float(value)), _float(value)
+        )
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
         return '"' + escaped.replace("\t", "\\t").replace("\r", "\\r") + '"'

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 
 from rsltrace.bag import open_bag
 from rsltrace.errors import BagError
@@ -304,12 +304,22 @@ def test_a_chunk_index_that_points_nowhere(mcap_bytes: Any) -> None:
         assert message("a.mcap").endswith("repair it with 'mcap recover'")
 
 
+WRITERS: list[dict[str, Any]] = [
+    {},
+    {"compression": CompressionType.NONE},
+    {"use_chunking": False, "enable_data_crcs": True},
+    {"index_types": IndexType.NONE, "use_statistics": False, "enable_data_crcs": True},
+]
+
+
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(st.data())
-def test_a_changed_byte_is_an_error_or_changes_nothing(mcap_maker: Maker, data: Any) -> None:
+@given(st.data(), st.sampled_from(WRITERS))
+def test_a_changed_byte_is_an_error_or_changes_nothing(
+    mcap_maker: Maker, data: Any, options: dict[str, Any]
+) -> None:
     samples = [(i * 7, f"/t{i % 2}", b"\0\1\0\0" + bytes([i]) * 8) for i in range(12)]
     with tempfile.TemporaryDirectory() as folder:
-        path = mcap_maker(Path(folder, "a.mcap"), samples, chunk_size=150)
+        path = mcap_maker(Path(folder, "a.mcap"), samples, chunk_size=150, **options)
         content = bytearray(path.read_bytes())
         at = data.draw(st.integers(0, len(content) - 1))
         content[at] ^= data.draw(st.integers(1, 255))

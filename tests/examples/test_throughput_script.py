@@ -39,24 +39,26 @@ def test_start_up_counts_for_neither_side(
     throughput: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # 10 µs a callback and 0.3 s of start-up.
-    short = {"callbacks": 5_000, "wall_s": 0.35}
-    long = {"callbacks": 100_000, "wall_s": 1.3}
+    short = {"callbacks": 5_000, "wall_s": 0.35, "cpu_s": 0.25}
+    long = {"callbacks": 100_000, "wall_s": 1.3, "cpu_s": 1.01}
     asked = workers(monkeypatch, throughput, short, long)
     case = throughput.Case("graph8", "rsltrace")
     throughput.measure(case, 3.0, 100_000)
     assert asked == [5_000, 100_000]
     assert case.us == [pytest.approx(10.0)]
+    assert case.cpu_us == [pytest.approx(8.0)]
     assert case.start_up_s == [pytest.approx(0.3)]
 
 
 def test_a_native_case_is_wall_time_over_callbacks(
     throughput: ModuleType, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked = workers(monkeypatch, throughput, {"callbacks": 20_000, "wall_s": 3.0})
+    asked = workers(monkeypatch, throughput, {"callbacks": 20_000, "wall_s": 3.0, "cpu_s": 4.0})
     case = throughput.Case("graph8", "single_threaded")
     throughput.measure(case, 3.0, 100_000)
     assert asked == [3.0]
     assert case.us == [pytest.approx(150.0)]
+    assert case.cpu_us == [pytest.approx(200.0)]
 
 
 def test_what_went_wrong_is_kept_and_no_figure_made_up(
@@ -72,7 +74,7 @@ def test_what_went_wrong_is_kept_and_no_figure_made_up(
 
 def test_ratios_compare_medians_with_the_aims(throughput: ModuleType) -> None:
     def case(graph: str, mode: str, *us: float) -> Any:
-        return throughput.Case(graph, mode, us=list(us))
+        return throughput.Case(graph, mode, us=list(us), cpu_us=[2 * each for each in us])
 
     found = throughput.ratios(
         [
@@ -82,6 +84,7 @@ def test_ratios_compare_medians_with_the_aims(throughput: ModuleType) -> None:
             case("graph200", "rsltrace_recorded", 11.0),
         ]
     )
+    assert [each["cpu_x"] for each in found] == [each["x"] for each in found]
     assert [(each["slow"], each["x"], each.get("aim")) for each in found] == [
         ("single_threaded", pytest.approx(16.0), 15.0),
         ("events_executor", pytest.approx(1.2), 1.2),

@@ -139,9 +139,7 @@ def test_a_long_but_finite_instant_is_no_livelock() -> None:
 def worlds(draw: st.DrawFn) -> tuple[list[tuple[int, list[int]]], list[tuple[int, int]]]:
     """Timers with a period each and delays of what they publish; releases from outside."""
     timers = draw(
-        st.lists(
-            st.tuples(st.integers(1, 9), st.lists(st.integers(0, 6), max_size=3)), max_size=5
-        )
+        st.lists(st.tuples(st.integers(1, 9), st.lists(st.integers(0, 6), max_size=3)), max_size=5)
     )
     outside = draw(st.lists(st.tuples(st.integers(0, 40), st.integers(0, 1)), max_size=8))
     return timers, outside

@@ -99,9 +99,7 @@ def test_heap_order_is_that_of_libstdcxx() -> None:
 
 
 @given(
-    st.lists(
-        st.tuples(st.sampled_from("arcm"), st.integers(0, 5), st.integers(1, 9)), max_size=40
-    )
+    st.lists(st.tuples(st.sampled_from("arcm"), st.integers(0, 5), st.integers(1, 9)), max_size=40)
 )
 @pytest.mark.parametrize("ties", ["creation", "heap"])
 def test_first_is_always_a_timer_with_the_smallest_deadline(

@@ -122,8 +122,9 @@ def test_a_suspended_callback_keeps_its_mutually_exclusive_group_busy(simulate: 
             self.publisher = self.create_publisher(UInt64, "n", 10)
             self.create_subscription(UInt64, "n", self.slow, 10, callback_group=first)
             self.create_timer(0.5, self.tick, callback_group=second)
-            self.create_timer(2.2, lambda: self.gate.set_result(None),
-                              callback_group=ReentrantCallbackGroup())
+            self.create_timer(
+                2.2, lambda: self.gate.set_result(None), callback_group=ReentrantCallbackGroup()
+            )
             self.create_timer(0.3, self.start, callback_group=ReentrantCallbackGroup())
             self.started = False
 
@@ -237,7 +238,7 @@ def test_a_server_that_returns_nothing_ends_the_run_with_its_name(simulate: Any)
             self.client = self.create_client(Trigger, "ask")
             self.create_timer(1.0, lambda: self.client.call_async(Trigger.Request()))
 
-    with pytest.raises(NodeError, match="/forgetful: service /ask.* raised TypeError"):
+    with pytest.raises(NodeError, match=r"/forgetful: service /ask.* raised TypeError"):
         simulate(Forgetful, duration=2)
 
 

@@ -57,8 +57,8 @@ def test_states_and_combined_hash_are_rslcpps(name: str, tmp_path: Path) -> None
         monitor = next(e.id for e in trace.entities.values() if e.name == "/monitor")
         others = [e.id for e in trace.entities.values() if e.node != monitor]
         callbacks = sum(
-            int(np.count_nonzero(np.isin(part["kind"], CALLBACKS) & np.isin(part["entity"], others)))
-            for part in trace.events()
+            int(np.count_nonzero(np.isin(p["kind"], CALLBACKS) & np.isin(p["entity"], others)))
+            for p in trace.events()
         )
     states, combined = GOLDEN[name]
     assert [int(t.split()[-1]) for t in texts if t.startswith("final state")] == states
@@ -72,7 +72,8 @@ def test_callbacks_run_in_rslcpps_order(tmp_path: Path, capfd: Any) -> None:
     from rsltrace import record
 
     text = (JOBS / "job.yaml").read_text()
-    text = re.sub(r"- node: nodes:Node(.)", r"- {node: nodes:Node\1, arguments: {keep_order: true}}", text)
+    asked = r"- {node: nodes:Node\1, arguments: {keep_order: true}}"
+    text = re.sub(r"- node: nodes:Node(.)", asked, text)
     probe = tmp_path / "probe.py"
     probe.write_text(
         "from rclpy.node import Node\n"

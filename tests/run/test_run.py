@@ -144,8 +144,8 @@ def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
 @pytest.mark.parametrize(
     ("target", "words"),
     [
-        ("no_such_module:Talker", ["job.yaml:1:16: ", "no module 'no_such_module'", "search_path"]),
-        ("nodes_under_test:Tolker", ["job.yaml:1:16: ", "has no 'Tolker'", "did you mean 'Talker'"]),
+        ("no_such_module:Talker", ["job.yaml:1:16: ", "no module 'no_such_module'"]),
+        ("nodes_under_test:Tolker", ["job.yaml:1:16: ", "'Tolker'", "did you mean 'Talker'"]),
         ("nodes_under_test:TALL", ["not callable"]),
         ("nodes_under_test:something", ["gave a int, not an rclpy Node"]),
     ],
@@ -191,11 +191,7 @@ def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:
 
 
 def test_system_exit_in_a_callback_is_the_exit_status(record_job: Any) -> None:
-    code = (
-        "class Leaver(Talker):\n"
-        "    def tick(self):\n"
-        "        raise SystemExit(5)\n"
-    )
+    code = "class Leaver(Talker):\n    def tick(self):\n        raise SystemExit(5)\n"
     result = record_job("nodes: [{node: nodes_under_test:Leaver}]\n", code)
     assert (result.exit_code, result.error) == (5, None)
 
@@ -220,8 +216,10 @@ def test_recording_does_not_change_what_the_nodes_do(record_job: Any) -> None:
 
 
 def test_runs_in_one_process_do_not_disturb_each_other(record_job: Any, tmp_path: Path) -> None:
-    code = "RUNS = []\nclass Counting(Talker):\n    def __init__(self):\n        RUNS.append(1)\n" \
-           "        super().__init__(1.0 / len(RUNS))\n"
+    code = (
+        "RUNS = []\nclass Counting(Talker):\n    def __init__(self):\n        RUNS.append(1)\n"
+        "        super().__init__(1.0 / len(RUNS))\n"
+    )
     job = "nodes: [{node: nodes_under_test:Counting}]\nstop: {duration: 5s}\n"
     before = (set(sys.modules), list(sys.path), threading.active_count())
     first = record_job(job, code)

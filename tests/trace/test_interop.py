@@ -80,15 +80,21 @@ def test_mcap_summary_and_indexes_are_those_of_the_messages(run: tuple[Path, Fee
 
 def test_mcap_merges_chunks_by_time_without_losing_order(run: tuple[Path, Feeder]) -> None:
     path, feeder = run
+    owners = [output.event for outputs in feeder.outputs for output in outputs]
     with path.open("rb") as stream:
-        times, sequences = [], []
+        times, sequences = [], {"/rsltrace/events": [], "/rsltrace/outputs": []}
         for _, channel, message in make_reader(stream).iter_messages():
             times.append(message.log_time)
             assert message.publish_time == message.log_time
-            if channel.topic == "/rsltrace/events":
-                sequences.append(message.sequence)
+            if channel.topic in sequences:
+                sequences[channel.topic].append(message.sequence)
+                owner = message.sequence
+                if channel.topic == "/rsltrace/outputs":
+                    owner = owners[owner]
+                assert message.log_time == feeder.events[owner].stamp_ns
     assert times == sorted(times)
-    assert sequences == list(range(len(feeder.events)))
+    assert sequences["/rsltrace/events"] == list(range(len(feeder.events)))
+    assert sequences["/rsltrace/outputs"] == list(range(len(owners)))
 
 
 def test_rosbags_opens_it_as_a_bag_and_decodes_it(run: tuple[Path, Feeder]) -> None:
