@@ -21,8 +21,9 @@ from rsltrace.trace.reader import Trace
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.option("--all", "show_all", is_flag=True, help="List every entity (--json always does).")
 @click.option("--check", is_flag=True, help="First read the whole file and check every hash.")
-def info(trace: Path, as_json: bool, check: bool) -> None:
+def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     """Show what is in TRACE: its digest, counts, nodes and entities with their rates.
 
     Two traces with the same digest hold the same run. A rate is that of an entity's events (of
@@ -36,10 +37,10 @@ def info(trace: Path, as_json: bool, check: bool) -> None:
         if as_json:
             click.echo(json.dumps(_as_json(opened, counts), indent=2))
         else:
-            click.echo("\n".join(_as_text(opened, counts)))
+            click.echo("\n".join(_as_text(opened, counts, show_all=show_all)))
 
 
-def _as_text(trace: Trace, counts: Counts) -> list[str]:
+def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
     start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
     size = f"{trace.size} bytes, format {FORMAT_VERSION}, {printable(trace.header.library)}"
     lines = table(
@@ -56,7 +57,7 @@ def _as_text(trace: Trace, counts: Counts) -> list[str]:
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
             lines += ["", title, *table(rows)]
-    lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts)]
+    lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
     return lines
 
 
@@ -85,10 +86,18 @@ def _node_lines(trace: Trace, counts: Counts) -> list[str]:
     return [title, *table(rows, right=frozenset((1, 2, 3)))] if nodes else [title]
 
 
-def _entity_lines(trace: Trace, counts: Counts) -> list[str]:
+def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
+    entities = _entities(trace, counts)
+    shown = [e for e in entities if show_all or not _idle_built_in(e, counts)]
+    title = f"entities: {len(entities)}"
+    if not entities:
+        return [title]
+    if len(shown) < len(entities):
+        left_out = len(entities) - len(shown)
+        title += f"  ({left_out} built-in ones that did nothing are left out; --all shows them)"
     rows = [("  id", "node", "kind", "name", "type", "events", "outputs", "Hz")]
-    for entity in _entities(trace, counts):
-        rate = counts.rate_hz(entity.id)
+    for entity in shown:
+        rate = counts.rate_hz(entity.id) if entity.id else None
         rows.append(
             (
                 f"  {entity.id}",
@@ -101,9 +110,6 @@ def _entity_lines(trace: Trace, counts: Counts) -> list[str]:
                 "-" if rate is None else f"{rate:.6g}",
             )
         )
-    title = f"entities: {len(rows) - 1}"
-    if len(rows) == 1:
-        return [title]
     return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]
 
 
@@ -165,6 +171,17 @@ def _entities(trace: Trace, counts: Counts) -> list[Entity]:
     ]
 
 
+def _idle_built_in(entity: Entity, counts: Counts) -> bool:
+    """Whether rclpy made ``entity`` for every node and nobody used it: eight of ten of them."""
+    if _count(counts.events, entity.id) or _count(counts.outputs, entity.id):
+        return False
+    if entity.kind is EntityKind.PUBLISHER:
+        return entity.name in _BUILT_IN_TOPICS
+    return (
+        entity.kind is EntityKind.SERVICE and entity.name.rpartition("/")[2] in _BUILT_IN_SERVICES
+    )
+
+
 def _owner(trace: Trace, entity: Entity) -> str:
     owner = trace.entities.get(entity.node)
     return printable(owner.name) if owner is not None and owner.name else "-"
@@ -192,5 +209,17 @@ def _output_kind(number: int) -> str:
 
 
 _VALUE_MAX = 100
+_BUILT_IN_TOPICS = frozenset(("/rosout", "/parameter_events"))
+_BUILT_IN_SERVICES = frozenset(
+    (
+        "describe_parameters",
+        "get_parameter_types",
+        "get_parameters",
+        "get_type_description",
+        "list_parameters",
+        "set_parameters",
+        "set_parameters_atomically",
+    )
+)
 _EVENT_KINDS = frozenset(map(int, EventKind))
 _OUTPUT_KINDS = frozenset(map(int, OutputKind))

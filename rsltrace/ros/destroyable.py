@@ -1,8 +1,12 @@
-"""The life of a handle as rclpy's ``Destroyable`` has it: destroyed when no ``with`` uses it."""
+"""The life of a handle, as rclpy's ``Destroyable`` has it.
+
+rclpy puts a ``with handle:`` around every use so that C memory is not freed under it. Here there is
+no C memory: a destroyed handle is destroyed at once, and using it afterwards raises what rclpy
+expects. Entering and leaving happens on every publication, so it does no more than that.
+"""
 
 from __future__ import annotations
 
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -18,35 +22,25 @@ def set_invalid_handle(error: type[Exception]) -> None:
 
 
 class Destroyable:
-    """A handle that stays alive while a ``with`` block uses it."""
+    """A handle that can be used in ``with`` until it is destroyed."""
 
     def __init__(self) -> None:
-        self._uses = 0
         self._destroyed = False
 
     def __enter__(self) -> Self:
         if self._destroyed:
             raise _invalid_handle("cannot use Destroyable because destruction was requested")
-        self._uses += 1
         return self
 
-    def __exit__(
-        self,
-        exc_type: type[BaseException] | None,
-        exc: BaseException | None,
-        tb: TracebackType | None,
-    ) -> None:
-        self._uses -= 1
-        if self._destroyed and self._uses == 0:
-            self._destroy()
+    def __exit__(self, exc_type: object, exc: object, tb: object) -> None:
+        pass
 
     def destroy_when_not_in_use(self) -> None:
-        """Destroy now, or when the last ``with`` block ends. A second call is an error."""
+        """Destroy the handle. A second call is an error."""
         if self._destroyed:
             raise _invalid_handle("cannot use Destroyable because destruction was requested")
         self._destroyed = True
-        if self._uses == 0:
-            self._destroy()
+        self._destroy()
 
     @property
     def pointer(self) -> int:

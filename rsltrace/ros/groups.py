@@ -14,10 +14,10 @@ if TYPE_CHECKING:
 
 def is_busy(group: Any, wrapper: Any) -> bool:
     """Return whether ``group`` forbids to run ``wrapper``'s callback now."""
-    try:
-        return group._active_entity is not None
-    except AttributeError:
-        return group is not None and not group.can_execute(wrapper)
+    active = getattr(group, "_active_entity", group)  # a mutually exclusive group has one
+    if active is None:
+        return False
+    return active is not group or (group is not None and not group.can_execute(wrapper))
 
 
 def begin(group: Any, wrapper: Any) -> None:

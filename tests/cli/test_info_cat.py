@@ -126,6 +126,30 @@ def test_info_as_json_says_the_same(run: tuple[Path, Feeder]) -> None:
     assert {t["name"]: t["messages"] for t in data["topics"]}["/count"] == timer["events"]
 
 
+def test_info_leaves_out_what_every_node_has_and_nobody_used(tmp_path: Path) -> None:
+    path = tmp_path / "run.mcap"
+    with Opened(path, compression="") as feeder:
+        node = feeder.entity(EntityKind.NODE, "/n")
+        for name in ("/n/get_parameters", "/n/set_parameters", "/n/my_service"):
+            feeder.entity(EntityKind.SERVICE, name, node=node)
+        for name in ("/rosout", "/parameter_events", "/silent"):
+            feeder.entity(EntityKind.PUBLISHER, name, node=node)
+        feeder.output(OutputKind.LOG, 5, b"")
+        feeder.event(EventKind.SERVICE, 3, 1)  # set_parameters was called, and logged
+        feeder.writer.close(result={})
+    short, full = output("info", path), output("info", path, "--all")
+    for text in (short, full):
+        assert "entities: 7" in text
+        for name in ("set_parameters", "/n/my_service", "/rosout", "/silent"):
+            assert f" {name}" in text or f"/n/{name}" in text
+    assert "2 built-in ones that did nothing are left out; --all shows them" in short
+    assert "get_parameters" not in short
+    assert "/parameter_events" not in short
+    assert "get_parameters" in full
+    assert "/parameter_events" in full
+    assert len(json.loads(output("info", path, "--json"))["entities"]) == 7
+
+
 def test_info_check_finds_what_reading_does_not(run: tuple[Path, Feeder], tmp_path: Path) -> None:
     path, _ = run
     assert output("info", path, "--check") == output("info", path)
