@@ -176,9 +176,8 @@ def print_table(cases: list[Case]) -> None:
         rows = [case for case in cases if case.graph == graph.name]
         if not rows:
             continue
-        print(
-            f"\n{graph.title:<36}{'µs/callback':>12}  {'least .. most':<18}{'CPU µs':>8}{'× single':>10}"
-        )
+        heads = f"{'µs/callback':>12}  {'least .. most':<18}{'CPU µs':>8}{'× single':>10}"
+        print(f"\n{graph.title:<36}{heads}")
         base = medians.get(f"{graph.name}/single_threaded")
         for case in rows:
             if not case.us:
