@@ -154,7 +154,8 @@ def _log(trace: Trace, output: Output) -> tuple[str, str]:
 
 
 def _flag_names(flags: EventFlag) -> list[str]:
-    return [flag.name.lower() for flag in EventFlag if flag in flags and flag.name]
+    # Before Python 3.11, iterating gives the member that stands for no flag, too.
+    return [str(flag.name).lower() for flag in EventFlag if flag and flag in flags]
 
 
 def _owner_name(trace: Trace, entity: Entity) -> str:
