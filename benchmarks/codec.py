@@ -73,6 +73,7 @@ def best_us(calls: dict[str, Callable[[], Any]]) -> dict[str, float]:
     timers = {name: timeit.Timer(call) for name, call in calls.items()}
     numbers = {}
     for name, timer in timers.items():
+        timer.timeit(1)  # the first call generates code or imports type support
         number, seconds = 1, timer.timeit(1)
         while seconds < ROUND_S / 4:
             number *= 4

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 import numpy as np
@@ -26,7 +26,13 @@ _TOPIC_KINDS = frozenset(
 )
 
 
-class _Time(click.ParamType[int]):
+if TYPE_CHECKING:
+    _IntParam = click.ParamType[int]
+else:
+    _IntParam = click.ParamType  # not generic before click 8.2
+
+
+class _Time(_IntParam):
     """A simulated time: seconds, or a number with a unit, exactly as in a job."""
 
     name = "time"

@@ -40,6 +40,7 @@ class TimerOwner(Dispatchable, Protocol):
     """What a due timer dispatches."""
 
 
+NOTHING_LEFT = "nothing left to do"
 ORDER_BAG = 0
 ORDER_RELEASE = 1
 
@@ -89,6 +90,10 @@ class EventLoop:
             self.stopped = stop
         self._interrupt = True
 
+    def halt(self) -> None:
+        """Dispatch nothing more: the run is over, stacks that are left only unwind."""
+        self._interrupt = True
+
     def stop_after_step(self, stop: Stop) -> None:
         """End the run once the present time step has run fully. The first call wins."""
         if self.stopped is None:
@@ -112,7 +117,7 @@ class EventLoop:
                 self.stopped = stop
                 return stop
             if next_ns is None:
-                self.stopped = Stop("nothing left to do")
+                self.stopped = Stop(NOTHING_LEFT)
                 return self.stopped
             if self._between_steps is not None:
                 self._between_steps()

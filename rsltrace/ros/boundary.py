@@ -88,7 +88,7 @@ class Boundary:
         set_invalid_handle(real.InvalidHandle)
         self.Destroyable = Destroyable
         self.Clock = type("Clock", (ClockHandle,), {"boundary": self})
-        self.ClockEvent = ClockEventHandle
+        self.ClockEvent = type("ClockEvent", (ClockEventHandle,), {"boundary": self})
         self.rmw_request_id_t = RequestId
         self.rmw_service_info_t = ServiceInfo
         self.rmw_matched_status_t = MatchedStatus

@@ -5,7 +5,7 @@ from __future__ import annotations
 import weakref
 from typing import Any
 
-from rsltrace.errors import UnsupportedError
+from rsltrace.ros.blocking import SimEvent
 from rsltrace.ros.destroyable import Destroyable
 
 
@@ -88,21 +88,29 @@ class ClockHandle(Destroyable):
 
 
 class ClockEventHandle:
-    """Stands in for ``_rclpy.ClockEvent``, which blocks a thread."""
+    """Stands in for ``_rclpy.ClockEvent``: sleeping until a time, or until it is set."""
+
+    boundary: Any
+
+    def __init__(self) -> None:
+        self._event = SimEvent(self.boundary.core, "a time to come (Clock.sleep_until)")
 
     def set(self) -> None:
-        """Wake sleepers; there are none."""
+        """Wake sleepers."""
+        self._event.set()
+
+    def clear(self) -> None:
+        """Let sleepers sleep again."""
+        self._event.clear()
 
     def is_set(self) -> bool:
-        """Return False: nobody can be asleep."""
-        return False
+        """Return whether it is set."""
+        return self._event.is_set()
 
-    def _blocked(self, clock: Any, until: Any) -> None:
-        raise UnsupportedError(
-            "Clock.sleep_until and sleep_for block the one thread of a simulation; "
-            "use a timer (create_timer) instead"
-        )
+    def _wait_until(self, clock: Any, until: Any) -> bool:
+        left_ns = until.nanoseconds - self.boundary.now_ns()
+        return left_ns <= 0 or self._event.wait_ns(left_ns)
 
-    wait_until_steady = _blocked
-    wait_until_system = _blocked
-    wait_until_ros = _blocked
+    wait_until_steady = _wait_until
+    wait_until_system = _wait_until
+    wait_until_ros = _wait_until

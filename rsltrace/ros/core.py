@@ -13,16 +13,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import NodeError, OutputError, RsltraceError, RunError
-from rsltrace.loop.loop import Dispatchable, EventLoop
+from greenlet import getcurrent, greenlet
+
+from rsltrace.errors import EXIT_RUN, NodeError, OutputError, RsltraceError, RunError
+from rsltrace.loop.loop import NOTHING_LEFT, Dispatchable, EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
+from rsltrace.ros.blocking import RunEnded
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
 if TYPE_CHECKING:
     from rsltrace.ros.arguments import RosArguments
+    from rsltrace.ros.blocking import Wait
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.entity_handle import EntityHandle
     from rsltrace.ros.executor import SimExecutor
@@ -50,8 +54,19 @@ class Core:
         self.executor: SimExecutor
         self.current_node: NodeHandle | None = None
         self.current_entity = 0
+        self.current_handle: Dispatchable | None = None
+        self.kind = 0
+        self.cause_event = NO_EVENT
+        self.cause_output = 0
         self.input_hash = 0
         self.flags = 0
+        self.on_end: Callable[[], None] | None = None
+        self.blocked: dict[Wait, None] = {}
+        self.runners: list[greenlet] = []
+        self.main: greenlet | None = None
+        self.runner_error: BaseException | None = None
+        self.ending = False
+        self.stuck: list[str] = []
         self.error: RunError | None = None
         self.logs: Logs
         self.main_context: ContextHandle | None = None
@@ -82,23 +97,66 @@ class Core:
         input_hash: int,
     ) -> None:
         """Run one event: call ``callback(*args)`` and record what came of it."""
+        self.current_handle = handle
         self.current_entity = entity
         self.current_node = node
+        self.kind = kind
+        self.cause_event = cause_event
+        self.cause_output = cause_output
         self.input_hash = input_hash
         try:
             callback(*args)
         except BaseException as error:
             self._failed(error, handle)
+        self.end_event()
+        if self.on_end is not None:
+            on_end, self.on_end = self.on_end, None
+            on_end()
+
+    def end_event(self) -> None:
+        """Record the event under way, which may be a later part of the one ``execute`` began."""
         if self.pending:
             self.settle()
         loop = self.loop
         recorder = self.recorder
         if recorder is not None:
             recorder.end_event(
-                loop.now_ns, kind, self.flags, entity, cause_event, cause_output, input_hash
+                loop.now_ns,
+                self.kind,
+                self.flags,
+                self.current_entity,
+                self.cause_event,
+                self.cause_output,
+                self.input_hash,
             )
         loop.events += 1
         self.flags = 0
+
+    # -- blocked calls -------------------------------------------------------------------------
+
+    def take_over(self) -> None:
+        """Run the loop on a stack of its own, because its runner's callback has blocked.
+
+        When the loop ends, whatever stack it ran on, the stack that began the run goes on.
+        """
+        try:
+            self.loop.run()
+            self.note_stuck()
+        except RunEnded:
+            pass
+        except BaseException as error:
+            self.runner_error = error
+            self.loop.stop(Stop("the run failed", EXIT_RUN))
+        if any(blocked.stack is self.main for blocked in self.blocked):
+            self.ending = True
+        getcurrent().parent = self.main
+
+    def note_stuck(self) -> None:
+        """Remember who still waits if the run has ended because nothing can happen any more."""
+        stopped = self.loop.stopped
+        if stopped is not None and stopped.reason == NOTHING_LEFT and not self.stuck:
+            self.stuck = [run.waits_for() for run in self.suspended]
+            self.stuck += [blocked.waits_for() for blocked in self.blocked]
 
     # -- entities ----------------------------------------------------------------------------
 
@@ -201,9 +259,15 @@ class Core:
             for retry in reversed(waiting):
                 retry()
 
+    def waiting_for_group(self, group: object) -> int:
+        """Return how many events wait until ``group`` is free."""
+        return len(self._parked.get(group, ()))
+
     # -- failures ------------------------------------------------------------------------------
 
     def _failed(self, error: BaseException, handle: Dispatchable) -> None:
+        if isinstance(error, RunEnded):
+            return
         if isinstance(error, OutputError):
             raise error  # the trace cannot be written: no event may be lost quietly
         self.flags |= _RAISED

@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING, Any
 from rclpy.executors import Executor
 
 from rsltrace.errors import UnsupportedError
-from rsltrace.ros.tasks import Resume, create_task, is_coroutine_function
+from rsltrace.ros.blocking import FutureWake, SimEvent, wait
+from rsltrace.ros.tasks import Resume, create_task
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
 
 _SPIN = (
-    "spins an executor inside a simulation, where rsltrace's loop runs all callbacks. Let the "
-    "callback return instead: use call_async with add_done_callback or await, or a timer"
+    "an executor of its own spins inside a simulation, where rsltrace's loop runs all callbacks: "
+    "use rclpy.spin_until_future_complete(node, future), or let the callback return and use "
+    "call_async with add_done_callback or await"
 )
 
 
@@ -28,7 +30,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
         """Run a callback or coroutine right after the present event."""
-        if type(callback) is Resume:
+        if type(callback) in (Resume, FutureWake):
             callback(*args)
             return None
         if getattr(callback, "__func__", None) is _remove_pending_request():
@@ -59,13 +61,39 @@ class SimExecutor(Executor):  # type: ignore[misc]
     def wake(self) -> None:
         """Do nothing: the loop sees every change at once."""
 
-    def _refuse(self, *args: Any, **kwargs: Any) -> None:
-        raise UnsupportedError(_SPIN)
+    def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
+        """Wait in simulated time until the future is done; others run meanwhile."""
+        if future.done() or future.cancelled():
+            return
+        done = SimEvent(self._core, "a future to be completed")
+        future.add_done_callback(FutureWake(done))
+        done.wait(None if timeout_sec is None or timeout_sec < 0 else timeout_sec)
 
-    spin = _refuse
-    spin_once = _refuse
-    spin_until_future_complete = _refuse
-    spin_once_until_future_complete = _refuse
+    def spin_once(self, timeout_sec: float | None = None) -> None:
+        """Let everything that is ready run, or else what comes next within the timeout."""
+        core = self._core
+        loop = core.loop
+        if loop.tasks or loop.ready:
+            wait(core, "its turn", for_ns=0)
+            return
+        next_ns = loop.next_ns()
+        limit_ns = None
+        if timeout_sec is not None and timeout_sec >= 0:
+            limit_ns = int(timeout_sec * 1_000_000_000)
+        if next_ns is not None:
+            ahead_ns = max(next_ns - loop.now_ns, 0)
+            limit_ns = ahead_ns if limit_ns is None else min(limit_ns, ahead_ns)
+        wait(core, "anything to happen", for_ns=limit_ns)
+
+    def spin_once_until_future_complete(self, future: Any, timeout_sec: Any = None) -> None:
+        """Wait as ``spin_once`` does, unless the future is done."""
+        if not future.done():
+            self.spin_once(getattr(timeout_sec, "timeout", timeout_sec))
+
+    def spin(self) -> None:
+        """Let others run until the run ends."""
+        while self._context.ok():
+            wait(self._core, "the run to end")
 
 
 def _remove_pending_request() -> Any:
@@ -81,4 +109,4 @@ class WaitSetHandle:
         raise UnsupportedError(_SPIN)
 
 
-__all__ = ["SimExecutor", "WaitSetHandle", "is_coroutine_function"]
+__all__ = ["SimExecutor", "WaitSetHandle"]

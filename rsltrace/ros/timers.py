@@ -72,13 +72,12 @@ class TimerHandle(EntityHandle):
             self._coroutine = is_coroutine_function(callback)
         digest = hash64(_pack_deadline(state.deadline_ns)) if core.recorder is not None else 0
         state.call(core.loop.now_ns)
+        core.loop.timers.ran(state)
         if self._coroutine:
             begin(wrapper.callback_group, wrapper)
             start_coroutine(core, self, _TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             core.execute(self, self.entity_id, self.node, _TIMER, callback, (), NO_EVENT, 0, digest)
-        if not state.canceled and not self._destroyed:
-            core.loop.timers.ran(state)
 
     def _note(self, operation: int, value: int) -> None:
         if self.wrapper is not None:

@@ -3,18 +3,23 @@ run, and the destruction of the nodes."""
 
 from __future__ import annotations
 
+import gc
 import importlib
+import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from greenlet import getcurrent, greenlet
+
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import EventKind
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.ros.blocking import end_blocked, simulated_waiting
 from rsltrace.ros.boundary import Boundary, installed
 from rsltrace.ros.core import Core
 from rsltrace.ros.graph import Graph
@@ -61,8 +66,11 @@ class World:
 
             from rsltrace.ros.executor import SimExecutor
 
+            stack.enter_context(simulated_waiting(self.core))
             rclpy.init(args=[])
+            self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
+            setattr(rclpy, "__executor", self.core.executor)  # what rclpy.spin* use
             stack.callback(self._close)
             self.core.pending.clear()  # the executor's own guard conditions are no entities
             self._stack = stack.pop_all()
@@ -77,6 +85,11 @@ class World:
         self.core.main_context = None  # from here on a shutdown is ours
         self.core.executor.shutdown()
         rclpy.try_shutdown()
+        # What user code has left behind must meet its finalizers while rclpy is still simulated.
+        if self.core.error is not None and self.core.error.__cause__ is not None:
+            traceback.clear_frames(self.core.error.__cause__.__traceback__)
+        self.nodes.clear()
+        gc.collect()
 
     # -- the stages of a run ---------------------------------------------------------------------
 
@@ -89,8 +102,16 @@ class World:
             for node in made if isinstance(made, (list, tuple)) else [made]:
                 self._adopt(node, entry.name)
 
+        def construct() -> None:
+            name = f"constructing {entry.name}"
+            core.run_outside(lambda: name, EventKind.CONSTRUCT, 0, None, build)
+            # Whoever switched here goes on: this function, or the loop's runner after a wait.
+            getcurrent().parent = core.runners.pop()
+
+        # A constructor that blocks (on a service, say) is left waiting while others go on.
         core.node_arguments = entry.arguments
-        core.run_outside(lambda: f"constructing {entry.name}", EventKind.CONSTRUCT, 0, None, build)
+        core.runners.append(getcurrent())
+        greenlet(construct).switch()
         core.node_arguments = []
         return core.loop.stopped is None
 
@@ -125,10 +146,15 @@ class World:
     def run(self) -> Stop:
         """Run the loop to its end; a quiet end with somebody still waiting is a deadlock."""
         core = self.core
-        stop = core.loop.run()
-        waiting = list(core.suspended)
-        if stop.reason == "nothing left to do" and waiting and core.error is None:
-            lines = "\n".join(f"  {run.waits_for()}" for run in waiting[:20])
+        try:
+            stop = core.loop.run()
+            core.note_stuck()
+        finally:
+            end_blocked(core)
+        if core.runner_error is not None:
+            raise core.runner_error
+        if core.stuck and core.error is None:
+            lines = "\n".join(f"  {text}" for text in core.stuck[:20])
             core.error = DeadlockError(f"nothing can happen any more, but somebody waits:\n{lines}")
         return stop
 

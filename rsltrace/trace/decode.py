@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import re
+import struct
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,10 @@ _ARRAY_ITEMS_MAX = 1 << 32
 _UNROLLED_ITEMS_MAX = 4096
 """The generator writes a statement per element of a fixed array of strings or messages."""
 _NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
+
+
+_MISFITS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, MemoryError)
+"""What rosbags' decoders raise, some only in older versions, when data does not fit its type."""
 
 
 class Decoder:
@@ -72,7 +77,7 @@ class Decoder:
         """
         try:
             return self._store.deserialize_cdr(data, self._name)
-        except (SerdeError, IndexError, OverflowError, MemoryError, TypeError) as error:
+        except _MISFITS as error:
             raise TraceError(
                 f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "
                 f"{error}"
@@ -118,6 +123,9 @@ def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:
     if not _TYPE_NAME.fullmatch(name):
         raise _UnsafeSchema(f"{name!r} is no name of a type")
     fields: list[tuple[str, Any]] = types[name][1]
+    names = [field_name.rstrip("_") for field_name, _ in fields]
+    if len(set(names)) < len(names):
+        raise _UnsafeSchema(f"{name!r} has two fields of one name")
     for field_name, description in fields:
         if not _FIELD_NAME.fullmatch(field_name):
             raise _UnsafeSchema(f"{field_name!r} is no name of a field")

@@ -39,6 +39,10 @@ _FOOTER_BYTES = RECORD_HEAD.size + _FOOTER.size
 _CRC = struct.Struct("<I")
 _MESSAGE_INDEX_FIXED = RECORD_HEAD.size + 6
 _INDEX_ENTRY_BYTES = 16
+_CHUNK_INDEX = int(Opcode.CHUNK_INDEX)
+_CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
+_OFFSET_ENTRY = struct.Struct("<HQ")
+_U64 = struct.Struct("<Q")
 
 
 class Header(NamedTuple):
@@ -158,14 +162,21 @@ def read_summary(source: ByteSource) -> TraceIndex:
 
 def _parse_summary(index: TraceIndex, summary: bytes) -> None:
     schemas: Schemas = {}
-    chunk_bodies: list[bytes] = []
-    cursor = Cursor(summary)
-    while not cursor.at_end:
-        opcode, length = RECORD_HEAD.unpack(cursor.take(RECORD_HEAD.size))
-        body = cursor.take(length)
-        if opcode == Opcode.CHUNK_INDEX:
-            chunk_bodies.append(body)
-        elif opcode == Opcode.SCHEMA:
+    chunks: list[int] = []
+    position, head_bytes, unpack = 0, RECORD_HEAD.size, RECORD_HEAD.unpack_from
+    while position < len(summary):
+        if position + head_bytes > len(summary):
+            raise Damaged("its last record is cut off")
+        opcode, length = unpack(summary, position)
+        begin = position + head_bytes
+        position = begin + length
+        if opcode == _CHUNK_INDEX and position <= len(summary):
+            chunks.append(begin)  # there are thousands in a long run, and few are ever looked at
+            continue
+        if position > len(summary):
+            raise Damaged("its last record is cut off")
+        body = summary[begin:position]
+        if opcode == Opcode.SCHEMA:
             add_schema(schemas, body)
         elif opcode == Opcode.CHANNEL:
             add_channel(index, schemas, body)
@@ -179,7 +190,7 @@ def _parse_summary(index: TraceIndex, summary: bytes) -> None:
                 index.attachments[entry.text()] = span
             else:
                 index.metadata[entry.text()] = span
-    index.chunks = lambda: [_chunk_entry(body) for body in chunk_bodies]
+    index.chunks = lambda: [_chunk_entry(summary, begin) for begin in chunks]
 
 
 def add_schema(schemas: Schemas, body: bytes) -> None:
@@ -204,21 +215,34 @@ def _message_counts(statistics: bytes) -> dict[int, int]:
     return {row[0]: row[1] for row in cursor.integers("<HQ")}
 
 
-def _chunk_entry(body: bytes) -> ChunkEntry:
-    cursor = Cursor(body)
-    cursor.take(16)  # times
-    span = Span(cursor.u64(), cursor.u64())
+def _chunk_entry(summary: bytes, begin: int) -> ChunkEntry:
+    """Read the ChunkIndex whose body begins at ``begin`` (and is whole). Raises Damaged.
+
+    A run of ten million events has several thousand, so this is written for speed.
+    """
+    body_bytes = RECORD_HEAD.unpack_from(summary, begin - RECORD_HEAD.size)[1]
+    end = begin + body_bytes
+    if body_bytes < _CHUNK_INDEX_HEAD.size:
+        raise Damaged("an entry of the list of chunks is cut off")
+    _, _, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(summary, begin)
+    map_at = begin + _CHUNK_INDEX_HEAD.size
+    map_end = map_at + map_bytes
+    if map_bytes % _OFFSET_ENTRY.size or map_end + _U64.size > end:
+        raise Damaged("an entry of the list of chunks is cut off")
+    span = Span(offset, length)
     # Each index reaches to the next one: that gives its length, and so the number of messages.
-    starts = sorted((offset, channel_id) for channel_id, offset in cursor.integers("<HQ"))
-    ends = [offset for offset, _ in starts[1:]] + [sum(span) + cursor.u64()]
-    indexes = {
-        channel_id: Span(offset, end - offset)
-        for (offset, channel_id), end in zip(starts, ends, strict=True)
-    }
-    counts = {
-        channel_id: (span.length - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
-        for channel_id, span in indexes.items()
-    }
+    starts = [
+        (index_at, channel_id)
+        for channel_id, index_at in _OFFSET_ENTRY.iter_unpack(summary[map_at:map_end])
+    ]
+    starts.sort()
+    behind = offset + length + _U64.unpack_from(summary, map_end)[0]
+    indexes: dict[int, Span] = {}
+    counts: dict[int, int] = {}
+    for position, (index_at, channel_id) in enumerate(starts):
+        next_at = starts[position + 1][0] if position + 1 < len(starts) else behind
+        indexes[channel_id] = Span(index_at, next_at - index_at)
+        counts[channel_id] = (next_at - index_at - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
     return ChunkEntry(span, counts, indexes)
 
 

@@ -62,7 +62,11 @@ def interrupted(run: tuple[Path, Feeder], tmp_path_factory: pytest.TempPathFacto
 
 
 def call(*arguments: object) -> Result:
-    return CliRunner().invoke(cli, [str(argument) for argument in arguments])
+    try:
+        runner = CliRunner(mix_stderr=False)  # click before 8.2
+    except TypeError:
+        runner = CliRunner()
+    return runner.invoke(cli, [str(argument) for argument in arguments])
 
 
 def output(*arguments: object) -> str:

@@ -11,7 +11,7 @@ from rclpy.task import Future
 from std_msgs.msg import UInt64
 from std_srvs.srv import SetBool, Trigger
 
-from rsltrace.errors import DeadlockError, NodeError, RunError
+from rsltrace.errors import DeadlockError, NodeError
 
 pytestmark = pytest.mark.ros
 
@@ -240,27 +240,3 @@ def test_a_server_that_returns_nothing_ends_the_run_with_its_name(simulate: Any)
 
     with pytest.raises(NodeError, match=r"/forgetful: service /ask.* raised TypeError"):
         simulate(Forgetful, duration=2)
-
-
-@pytest.mark.parametrize("call", ["spin", "executor", "call"])
-def test_spinning_inside_a_callback_is_refused_with_advice(simulate: Any, call: str) -> None:
-    import rclpy
-
-    class Spinner(Node):
-        def __init__(self) -> None:
-            super().__init__("spinner")
-            self.client = self.create_client(Trigger, "ask")
-            self.create_timer(1.0, self.tick)
-
-        def tick(self) -> None:
-            future = self.client.call_async(Trigger.Request())
-            if call == "spin":
-                rclpy.spin_until_future_complete(self, future)
-            elif call == "executor":
-                assert self.executor is not None
-                self.executor.spin_once()
-            else:
-                rclpy.spin_once(self)
-
-    with pytest.raises(RunError, match=r"call_async.*\n.*/spinner: timer Spinner.tick|/spinner"):
-        simulate(Server, Spinner, duration=1)

@@ -1,0 +1,246 @@
+"""Calls that block become simulated waiting: time passes, other callbacks run, then they return.
+
+There is one thread, so whoever blocks gives its call stack up for a while: greenlets do that. The
+loop runs on the stack of whoever runs it; when a callback blocks deep inside it, another stack
+takes the loop over, and when the wait is over the loop's present runner switches back to the
+callback, which finishes and goes on as the loop's runner. Callbacks that do not block (nearly all)
+never meet any of this.
+
+In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RESUME`` event.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.ros import groups
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+_RESUME = int(EventKind.RESUME)
+_SUSPENDED = int(EventFlag.SUSPENDED)
+
+
+class RunEnded(BaseException):
+    """Raised in a blocked call when the run ends, so that ``finally`` blocks run."""
+
+
+class Wait:
+    """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
+
+    def __init__(self, core: Core, what: str, group: object) -> None:
+        self.core = core
+        self.what = what
+        self._group = group
+        self.stack = getcurrent()
+        self.timed_out = False
+        self._woken = False
+        self._event = (core.current_handle, core.current_entity, core.current_node)
+        self._arguments = core.node_arguments
+        self._end_group = core.on_end
+        self._cause = (NO_EVENT, 0)
+        self._input_hash = 0
+
+    def wake(self) -> None:
+        """Let the call return: because of the event under way."""
+        if not self._woken:
+            self._woken = True
+            core = self.core
+            self._cause = (core.loop.events, core.note(OutputKind.TASK, self._event[1], 2))
+            self._input_hash = core.input_hash
+            core.loop.tasks.append(self)
+
+    def time_out(self) -> None:
+        """Let the call return: because its time is up."""
+        if not self._woken:
+            self._woken = self.timed_out = True
+            self.core.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Give the loop's runner up to the blocked call (called on the runner's stack)."""
+        runners = self.core.runners
+        runner = getcurrent()
+        runners.append(runner)
+        self.stack.switch()
+
+    def resumed(self) -> None:
+        """Begin the RESUME event (called on the blocked call's own stack)."""
+        core = self.core
+        core.current_handle, core.current_entity, core.current_node = self._event
+        core.kind = _RESUME
+        core.cause_event, core.cause_output = self._cause
+        core.input_hash = self._input_hash
+        core.node_arguments = self._arguments
+        core.on_end = self._end_group
+
+    def describe(self) -> str:
+        """Name the callback that waits."""
+        return self._event[0].describe() if self._event[0] is not None else "the run"
+
+    def waits_for(self) -> str:
+        """Say who waits for what, with the lines of user code that led there."""
+        frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
+        own = [f for f in frames if "/rsltrace/" not in f.filename and "/rclpy/" not in f.filename]
+        where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
+        hint = ""
+        if self._group is not None and self.core.waiting_for_group(self._group):
+            hint = (
+                ", which may be among the events that wait for its callback group: a blocked "
+                "callback keeps a mutually exclusive group busy, so give the client, timer or "
+                "subscription it waits for a callback group of its own"
+            )
+        return f"{self.describe()} waits for {self.what}{hint}{where}"
+
+
+def wait(
+    core: Core, what: str, *, until: Callable[[Wait], None] | None = None, for_ns: int | None = None
+) -> bool:
+    """Block the present callback in simulated time; return whether it was woken (not timed out).
+
+    ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
+    wait. ``what`` completes "… waits for".
+
+    :raises RunEnded: when the run ends before the wait does.
+    """
+    group = _hold_group(core)
+    blocked = Wait(core, what, group)
+    core.flags |= _SUSPENDED
+    if until is not None:
+        until(blocked)
+    if for_ns is not None:
+        core.loop.schedule(core.loop.now_ns + max(for_ns, 0), blocked.time_out)
+    core.end_event()
+    core.blocked[blocked] = None
+    core.on_end = None
+    runner = core.runners.pop() if core.runners else greenlet(core.take_over, core.main)
+    runner.switch()
+    core.blocked.pop(blocked, None)
+    blocked.resumed()
+    if core.ending:
+        raise RunEnded
+    return not blocked.timed_out
+
+
+def _hold_group(core: Core) -> object:
+    """Keep the callback's group busy while it is blocked, as an executor would; return it."""
+    handle = core.current_handle
+    wrapper: Any = getattr(handle, "wrapper", None)
+    group = getattr(wrapper, "callback_group", None)
+    if core.on_end is None and group is not None and not groups.is_busy(group, wrapper):
+        groups.begin(group, wrapper)
+        core.on_end = lambda: groups.end(core, group, wrapper)
+    return group
+
+
+class SimEvent:
+    """Stands in for ``threading.Event`` where rclpy waits for what a callback will set."""
+
+    def __init__(self, core: Core, what: str = "an event to be set") -> None:
+        self._core = core
+        self._what = what
+        self._set = False
+        self._waits: list[Wait] = []
+
+    def is_set(self) -> bool:
+        """Return whether the event is set."""
+        return self._set
+
+    def set(self) -> None:
+        """Set the event and wake everybody who waits for it."""
+        self._set = True
+        waits, self._waits = self._waits, []
+        for blocked in waits:
+            blocked.wake()
+
+    def clear(self) -> None:
+        """Reset the event."""
+        self._set = False
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Wait in simulated time until the event is set; return whether it is."""
+        return self.wait_ns(None if timeout is None else int(timeout * 1_000_000_000))
+
+    def wait_ns(self, timeout_ns: int | None) -> bool:
+        """Do ``wait`` with a timeout in nanoseconds."""
+        if not self._set:
+            wait(self._core, self._what, until=self._waits.append, for_ns=timeout_ns)
+        return self._set
+
+
+def end_blocked(core: Core) -> None:
+    """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
+    core.ending = True
+    core.loop.halt()
+    here = getcurrent()
+    for blocked in list(core.blocked):
+        core.runners.append(here)
+        blocked.stack.switch()
+    for runner in core.runners:
+        if runner is not here and not runner.dead:
+            runner.throw(RunEnded)
+    core.runners.clear()
+
+
+class FutureWake:
+    """The done callback of a future that sets an event at once, without becoming a task."""
+
+    def __init__(self, event: SimEvent) -> None:
+        self._event = event
+
+    def __call__(self, future: Any) -> None:
+        self._event.set()
+
+
+@contextmanager
+def simulated_waiting(core: Core) -> Iterator[None]:
+    """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
+    import rclpy.client
+    import rclpy.node
+    import rclpy.timer
+
+    real_sleep = time.sleep
+    thread = threading.get_ident()
+
+    def sleep(seconds: float) -> None:
+        if core.current_handle is None or threading.get_ident() != thread:
+            real_sleep(seconds)
+            return
+        if seconds < 0:
+            raise ValueError("sleep length must be non-negative")
+        wait(core, f"{seconds} s to pass", for_ns=int(seconds * 1_000_000_000))
+
+    def now() -> float:
+        return core.loop.now_ns / 1_000_000_000
+
+    replaced = [
+        (time, "sleep", sleep),
+        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=sleep)),
+        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=sleep)),
+        (rclpy.client, "threading", _threading(core, "the response to a service call")),
+        (rclpy.timer, "threading", _threading(core, "the next period of a Rate")),
+    ]
+    saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
+    for module, name, value in replaced:
+        setattr(module, name, value)
+    try:
+        yield
+    finally:
+        for module, name, value in saved:
+            setattr(module, name, value)
+
+
+def _threading(core: Core, what: str) -> SimpleNamespace:
+    return SimpleNamespace(
+        Event=partial(SimEvent, core, what), Lock=threading.Lock, RLock=threading.RLock
+    )
