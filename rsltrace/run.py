@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace._version import __version__
-from rsltrace.errors import JobError, RsltraceError, RunError
+from rsltrace.errors import BagError, JobError, RsltraceError, RunError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import (
@@ -180,10 +180,10 @@ def _run_world(
             stop = world.run()
         else:
             stop = loop.stopped
-    except RunError as error:
-        # Raised by the loop itself (a livelock), not by a callback.
-        core.error = error
-        stop = Stop(str(error).splitlines()[0], error.exit_code)
+    except (RunError, BagError) as error:
+        # Raised by the loop itself (a livelock) or the bag player, not by a callback.
+        core.error = error if isinstance(error, RunError) else RunError(str(error))
+        stop = Stop(str(error).splitlines()[0], core.error.exit_code)
     world.destroy()
     return stop
 

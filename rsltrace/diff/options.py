@@ -1,4 +1,4 @@
-"""What a comparison is asked for: one frozen value that the engine, the bags and the reports read."""
+"""What a comparison is asked for: one value that the engine, the bags and the reports read."""
 
 from __future__ import annotations
 

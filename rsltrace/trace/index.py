@@ -64,8 +64,7 @@ class ChannelInfo:
     metadata: Mapping[str, str]
 
 
-@dataclass(frozen=True, slots=True)
-class ChunkEntry:
+class ChunkEntry(NamedTuple):
     """A chunk: where it is, how many messages of each channel it holds, where their indexes are.
 
     A channel without an index (the file was cut off behind the chunk) is found by walking.
@@ -231,12 +230,14 @@ def _chunk_entry(summary: bytes, begin: int) -> ChunkEntry:
         raise Damaged("an entry of the list of chunks is cut off")
     span = Span(offset, length)
     # Each index reaches to the next one: that gives its length, and so the number of messages.
-    starts = [
-        (index_at, channel_id)
-        for channel_id, index_at in _OFFSET_ENTRY.iter_unpack(summary[map_at:map_end])
-    ]
-    starts.sort()
+    entries = _OFFSET_ENTRY.iter_unpack(summary[map_at:map_end])
+    starts = [(index_at, channel_id) for channel_id, index_at in entries]
     behind = offset + length + _U64.unpack_from(summary, map_end)[0]
+    if len(starts) == 1:  # events or outputs: most chunks
+        index_at, channel_id = starts[0]
+        count = (behind - index_at - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
+        return ChunkEntry(span, {channel_id: count}, {channel_id: Span(index_at, behind - index_at)})
+    starts.sort()
     indexes: dict[int, Span] = {}
     counts: dict[int, int] = {}
     for position, (index_at, channel_id) in enumerate(starts):

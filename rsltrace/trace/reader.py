@@ -46,7 +46,7 @@ from rsltrace.trace.index import (
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.scan import scan
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
-from rsltrace.trace.source import ByteSource, FileSource
+from rsltrace.trace.source import ByteSource, open_source
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder
@@ -91,12 +91,13 @@ class Trace:
 
     @classmethod
     def open(cls, path: Path | str) -> Trace:
-        """Open the trace at ``path``.
+        """Open the trace at ``path``, or at an address (``https://…``) given as a string.
 
         Raises TraceError if it is missing or damaged, TraceFormatError if it is something else
-        (a plain recording, no MCAP) or of another format version.
+        (a plain recording, no MCAP) or of another format version, SetupError for an address if
+        fsspec is not installed.
         """
-        return cls(FileSource(Path(path)))
+        return cls(open_source(path))
 
     def close(self) -> None:
         """Let go of the file. Arrays handed out stay valid."""
@@ -124,6 +125,11 @@ class Trace:
     def size(self) -> int:
         """Size of the file in bytes."""
         return self._source.size
+
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were fetched from the file so far."""
+        return self._source.bytes_read
 
     @property
     def complete(self) -> bool:

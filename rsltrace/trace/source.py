@@ -29,6 +29,11 @@ class ByteSource(Protocol):
         """Length in bytes."""
         ...
 
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were fetched from the storage so far."""
+        ...
+
     def read_at(self, offset: int, length: int) -> bytes:
         """Return exactly ``length`` bytes from ``offset``. Raises TraceError if it cannot."""
         ...
@@ -45,6 +50,7 @@ class FileSource:
         """Open ``path``. Raises TraceError if it is missing, not a file or not readable."""
         self._path = path
         self._lock = threading.Lock()
+        self._bytes_read = 0
         try:
             # Looked at before it is opened: opening a named pipe would wait for a writer.
             status = path.stat()
@@ -72,6 +78,11 @@ class FileSource:
         """Length in bytes when the file was opened."""
         return self._size
 
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were read from the file so far."""
+        return self._bytes_read
+
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``. Raises TraceError if the file ends before."""
         if offset + length > self._size:
@@ -83,6 +94,7 @@ class FileSource:
             data = self._read(offset, length)
         except (OSError, ValueError) as error:
             raise TraceError(f"{self._path} cannot be read at offset {offset}: {error}") from error
+        self._bytes_read += len(data)
         if len(data) < length:
             raise TraceError(f"{self._path} became shorter while it was read; open it again")
         return data
@@ -107,6 +119,18 @@ class FileSource:
             offset += len(piece)
             length -= len(piece)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
+
+
+def open_source(place: Path | str) -> ByteSource:
+    """Open a file, or an address such as ``https://…`` or ``s3://…``. Raises TraceError.
+
+    Raises SetupError for an address when fsspec, which reads it, is not installed.
+    """
+    if isinstance(place, str) and "://" in place:
+        from rsltrace.trace.remote import open_remote  # a library that local files do not need
+
+        return open_remote(place)
+    return FileSource(Path(place))
 
 
 def _folder_hint(path: Path) -> str:

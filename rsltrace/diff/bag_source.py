@@ -1,0 +1,294 @@
+"""Where the messages of a recording come from: a bag, a bag that was cut off, or a trace.
+
+All are the same to the comparison: topics with types and counts, messages in order, a decoder.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.bag import open_bag
+from rsltrace.errors import BagError, RsltraceError, TraceError
+from rsltrace.trace.format import MCAP_MAGIC, METADATA_FORMAT, PREFIX_OWN, SCHEMA_ENCODING
+
+if TYPE_CHECKING:
+    from rsltrace.trace.reader import Trace
+
+_HEAD_BYTES = 4096
+_RECORD_HEAD = struct.Struct("<BQ")
+_METADATA_HEAD = struct.Struct("<BQI")
+_METADATA = 0x0C
+_SQLITE_MAGIC = b"SQLite format 3\0"
+
+
+@dataclass(frozen=True, slots=True)
+class SourceTopic:
+    """A topic and how to decode its messages: ``schema`` is its ros2msg text, or empty."""
+
+    name: str
+    type: str
+    schema: str = ""
+
+
+@dataclass(slots=True)
+class Source:
+    """A recording to compare; a context manager. Reading may raise BagError or TraceError.
+
+    ``read`` yields (log time in ns, index in ``topics``, CDR) of the topics whose indexes it is
+    given, each topic's messages in the order of time.
+    """
+
+    path: str
+    kind: str
+    topics: tuple[SourceTopic, ...]
+    read: Callable[[Collection[int]], Iterator[tuple[int, int, bytes]]]
+    close: Callable[[], None]
+    complete: bool = True
+    notes: tuple[str, ...] = ()
+    _decoders: dict[int, Callable[[bytes], object]] = field(default_factory=dict)
+
+    def __enter__(self) -> Source:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def decode(self, topic: int, data: bytes) -> object:
+        """Return a decoded message. Raises TraceError saying why it cannot be."""
+        if topic not in self._decoders:
+            self._decoders[topic] = _decoder(self.topics[topic])
+        return self._decoders[topic](data)
+
+
+def is_trace(path: str | os.PathLike[str]) -> bool:
+    """Whether a local file is a trace of rsltrace, by its first records; whole or cut off."""
+    try:
+        with open(path, "rb") as file:
+            head = file.read(_HEAD_BYTES)
+    except OSError:
+        return False
+    if not head.startswith(MCAP_MAGIC):
+        return False
+    # The format has it that this metadata is the first record after the header.
+    name = METADATA_FORMAT.encode()
+    with suppress(struct.error):
+        _, header_length = _RECORD_HEAD.unpack_from(head, len(MCAP_MAGIC))
+        place = len(MCAP_MAGIC) + _RECORD_HEAD.size + header_length
+        opcode, _, length = _METADATA_HEAD.unpack_from(head, place)
+        place += _METADATA_HEAD.size
+        return bool(opcode == _METADATA and head[place : place + length] == name)
+    return False
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Whether a local path is a recording that is no trace: a folder, an MCAP or sqlite3 file."""
+    if Path(path).is_dir():
+        return True
+    try:
+        with open(path, "rb") as file:
+            head = file.read(16)
+    except OSError:
+        return False
+    known = (MCAP_MAGIC, _SQLITE_MAGIC, b"\x28\xb5\x2f\xfd", b"#ROSBAG")
+    return head.startswith(known) and not is_trace(path)
+
+
+def open_source(path: str | os.PathLike[str]) -> Source:
+    """Open a recording: a bag's folder, one of its files, or a trace.
+
+    Raises BagError or TraceError naming the file and what is wrong with it.
+    """
+    if is_trace(path):
+        return _trace_source(path)
+    if _is_cut_off(Path(path)):
+        return _cut_off_source(Path(path))
+    bag = open_bag(path)
+    return Source(
+        path=os.fspath(path),
+        kind=bag.storage_id,
+        topics=tuple(
+            SourceTopic(
+                topic.name,
+                topic.type_name,
+                (topic.schema_text or "") if topic.schema_encoding == SCHEMA_ENCODING else "",
+            )
+            for topic in bag.topics
+        ),
+        read=lambda wanted: (m for m in bag.messages() if m[1] in wanted),
+        close=bag.close,
+    )
+
+
+def _trace_source(path: str | os.PathLike[str]) -> Source:
+    from rsltrace.trace.reader import Trace
+
+    trace = Trace.open(os.fspath(path))
+    topics_by_name: dict[str, SourceTopic] = {}
+    for channel in trace.channels.values():
+        if not channel.topic.startswith(PREFIX_OWN):
+            topic = SourceTopic(channel.topic, channel.type, channel.schema_text)
+            topics_by_name.setdefault(channel.topic, topic)
+    topics = tuple(topics_by_name.values())
+
+    def read(wanted: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        for number in sorted(wanted):
+            for stamp_ns, _, data in trace.messages(topics[number].name):
+                yield stamp_ns, number, data
+
+    return Source(
+        path=os.fspath(path),
+        kind="trace",
+        topics=topics,
+        read=read,
+        close=trace.close,
+        complete=trace.complete,
+        notes=_payload_notes(trace),
+    )
+
+
+def _payload_notes(trace: Trace) -> tuple[str, ...]:
+    """Say so where the job had messages left out: what is missing is not missing in the run."""
+    import json
+
+    with suppress(ValueError, AttributeError, TypeError):
+        record = json.loads(trace.job.get("resolved", "{}")).get("record") or {}
+        if not record.get("payloads", True):
+            return (f"{trace.name} was recorded without payloads (record.payloads is false)",)
+        if record.get("topics", ["*"]) != ["*"] or record.get("exclude"):
+            return (
+                f"{trace.name} holds the messages of some topics only (record.topics, "
+                "record.exclude)",
+            )
+    return ()
+
+
+# -- recordings that were cut off ------------------------------------------------------------------
+
+
+def _is_cut_off(path: Path) -> bool:
+    """Whether ``path`` is an MCAP file without the end of one."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
+                return False
+            file.seek(max(path.stat().st_size - len(MCAP_MAGIC), 0))
+            return file.read() != MCAP_MAGIC
+    except OSError:
+        return False
+
+
+def _cut_off_source(path: Path) -> Source:
+    """Open an MCAP file that ends in the middle, as a recorder leaves it that was killed."""
+    topics: dict[tuple[str, str], SourceTopic] = {}
+    count = 0
+    for channel, schema, _ in _walk(path):
+        key = (channel.topic, schema.name if schema else "")
+        if key not in topics:
+            usable = schema is not None and schema.encoding == SCHEMA_ENCODING
+            text = schema.data.decode("utf-8", "replace") if usable else ""
+            topics[key] = SourceTopic(*key, text)
+        count += 1
+    if not count:
+        raise BagError(
+            f"{path}: the recording was cut off before its first whole chunk: nothing can be read"
+        )
+    numbers = {key: number for number, key in enumerate(topics)}
+
+    def read(wanted: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        for channel, schema, message in _walk(path):
+            number = numbers[channel.topic, schema.name if schema else ""]
+            if number in wanted:
+                yield message.log_time, number, message.data
+
+    return Source(
+        path=str(path),
+        kind="mcap",
+        topics=tuple(topics.values()),
+        read=read,
+        close=lambda: None,
+        complete=False,
+        notes=(
+            f"{path} was cut off: {count} messages before the cut are compared ('mcap recover' "
+            "repairs it)",
+        ),
+    )
+
+
+def _walk(path: Path) -> Iterator[tuple[Any, Any, Any]]:
+    """Yield (channel, schema or None, message) of every whole record, in file order."""
+    from mcap.exceptions import EndOfFile, McapError
+    from mcap.records import Channel, Header, Message, Schema
+    from mcap.stream_reader import StreamReader
+
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    with path.open("rb") as file:
+        records = StreamReader(file, validate_crcs=True).records
+        try:
+            for record in records:
+                if isinstance(record, Header) and record.profile not in ("ros2", ""):
+                    raise BagError(
+                        f"{path}: not a ROS 2 recording: its MCAP profile is {record.profile!r}"
+                    )
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel):
+                    channels[record.id] = record
+                elif isinstance(record, Message):
+                    channel = channels[record.channel_id]
+                    yield channel, schemas.get(channel.schema_id), record
+        except EndOfFile:
+            return
+        except (McapError, KeyError, ValueError) as error:
+            # A record cut in the middle of its own fields shows as one of these, at the very end.
+            if file.read(1):
+                raise BagError(f"{path}: damaged near byte {file.tell()}: {error}") from error
+
+
+# -- decoding --------------------------------------------------------------------------------------
+
+
+def _decoder(topic: SourceTopic) -> Callable[[bytes], object]:
+    if topic.schema:
+        from rsltrace.trace.decode import Decoder
+        from rsltrace.trace.index import ChannelInfo
+
+        return Decoder(
+            ChannelInfo(0, topic.name, topic.type, SCHEMA_ENCODING, topic.schema, {})
+        ).decode
+    store = _known_types()
+    if topic.type not in store.types:
+        raise TraceError(
+            f"messages on {topic.name} cannot be decoded: the recording does not define "
+            f"{topic.type or 'their type'}, and it is no type that ROS 2 brings along"
+        )
+
+    def decode(data: bytes) -> object:
+        try:
+            decoded: object = store.deserialize_cdr(data, topic.type)
+        except RsltraceError:
+            raise
+        except Exception as error:  # what its generated code raises has no common base
+            raise TraceError(
+                f"a message on {topic.name} does not fit its type {topic.type}: {error}"
+            ) from error
+        return decoded
+
+    return decode
+
+
+@lru_cache(maxsize=1)
+def _known_types() -> Any:
+    """Return the types of ROS 2 Jazzy, for recordings that do not carry their schemas."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_JAZZY)

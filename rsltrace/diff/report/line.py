@@ -1,0 +1,112 @@
+"""Lines of a report as pieces of styled text, so that one layout serves terminal and pipe.
+
+A style says what a piece is, not what it looks like; without colours the text alone must do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from textwrap import wrap
+
+PLAIN = ""
+TITLE = "title"
+GOOD = "good"
+BAD = "bad"
+SIDE_A = "a"
+SIDE_B = "b"
+FAINT = "faint"
+COMMAND = "command"
+
+Piece = tuple[str, str]
+"""(text, style)"""
+Line = tuple[Piece, ...]
+
+BLANK: Line = ()
+
+
+def line(*pieces: str | Piece) -> Line:
+    """Return a line of pieces; a bare text has no style."""
+    return tuple((piece, PLAIN) if isinstance(piece, str) else piece for piece in pieces)
+
+
+def plain_text(lines: Iterable[Line]) -> str:
+    """Return the lines as text that ends in a newline, without any colour."""
+    return "".join(f"{''.join(text for text, _ in row).rstrip()}\n" for row in lines)
+
+
+def wrapped(text: str, width: int, *, style: str = PLAIN, indent: str = "") -> list[Line]:
+    """Return a sentence as lines of at most ``width`` characters; paths are not broken."""
+    rows = wrap(
+        text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
+    )
+    return [line((row, style)) for row in rows]
+
+
+def in_columns(
+    rows: Sequence[Sequence[Piece]], *, indent: str = "  ", widest: int = 40
+) -> list[Line]:
+    """Return rows with aligned columns, two spaces apart; the last column has any width.
+
+    A cell wider than ``widest`` pushes the rest of its row to the right instead of all rows.
+    """
+    if not rows:
+        return []
+    count = max(map(len, rows))
+    widths = [
+        max((min(len(row[at][0]), widest) for row in rows if at < len(row) - 1), default=0)
+        for at in range(count)
+    ]
+    lines = []
+    for row in rows:
+        pieces: list[Piece] = [(indent, PLAIN)]
+        for at, (text, style) in enumerate(row):
+            last = at == len(row) - 1
+            pieces.append((text if last else f"{text:<{widths[at]}}", style))
+            if not last:
+                pieces.append(("  ", PLAIN))
+        lines.append(tuple(pieces))
+    return lines
+
+
+@dataclass(slots=True)
+class Section:
+    """Some lines under a title that may be shortened to ``keep`` of them when space is short.
+
+    ``noun`` names what the lines show: ``… 7 more fields``.
+    """
+
+    title: Line
+    rows: list[Line]
+    keep: int
+    noun: str
+    hidden: int = field(default=0)
+
+    @property
+    def height(self) -> int:
+        """Lines it takes, the blank one before it included."""
+        if not (self.title or self.rows):
+            return 0
+        return 1 + bool(self.title) + len(self.rows) + bool(self.hidden)
+
+    def lines(self) -> list[Line]:
+        """Return the lines, a blank one first."""
+        if not self.height:
+            return []
+        more = [line((f"  … {self.hidden} more {self.noun}", FAINT))] if self.hidden else []
+        return [BLANK, *([self.title] if self.title else []), *self.rows, *more]
+
+
+def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:
+    """Return head and sections in at most ``height`` lines (None: all of them), if they can be.
+
+    The section that has most to spare is shortened first; every section says what it leaves out.
+    """
+    while height is not None and len(head) + sum(part.height for part in sections) > height:
+        spare = [part for part in sections if len(part.rows) > part.keep]
+        if not spare:
+            break
+        widest = max(spare, key=lambda part: len(part.rows) - part.keep)
+        widest.rows.pop()
+        widest.hidden += 1
+    return [*head, *(row for part in sections for row in part.lines())]

@@ -1,0 +1,149 @@
+"""How reports call things: events, entities, differences of fields."""
+
+from __future__ import annotations
+
+from rsltrace.diff.model import EntityKey, EventView, FieldDifference, MessageDifference
+from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, in_columns, line
+from rsltrace.model.event import EventFlag, OutputKind
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_seconds
+
+_INLINE_MAX = 26
+_PATH_MAX = 36
+_VERBS = {
+    OutputKind.MESSAGE: "message on",
+    OutputKind.REQUEST: "request to",
+    OutputKind.RESPONSE: "response of",
+    OutputKind.LOG: "log record of",
+}
+
+
+def entity_text(entity: EntityKey) -> str:
+    """Return ``/filter: subscription /scan``."""
+    return printable(str(entity)).rstrip()
+
+
+def event_text(event: EventView) -> str:
+    """Return ``/filter: subscription /scan``, or what else ran."""
+    text = entity_text(event.entity)
+    kind = event.kind.label.replace("_", " ")
+    return text if kind in text else f"{text} ({kind})"
+
+
+def event_cells(event: EventView) -> list[Piece]:
+    """Return an event as cells of a table: index, time, what ran, what it did."""
+    flags = [flag.name.lower() for flag in EventFlag if flag and flag in event.flags and flag.name]
+    done = ", ".join(filter(None, [printable(event.summary), *(f"[{name}]" for name in flags)]))
+    return [
+        (str(event.index), FAINT),
+        (format_seconds(event.stamp_ns), FAINT),
+        (event_text(event), ""),
+        (f"-> {done}" if done else "", ""),
+    ]
+
+
+def same_event(a: EventView, b: EventView) -> bool:
+    """Whether two events are the same but for their place in the run."""
+    return (
+        a.entity == b.entity
+        and a.stamp_ns == b.stamp_ns
+        and a.kind is b.kind
+        and (a.input_hash, a.output_hash, a.flags) == (b.input_hash, b.output_hash, b.flags)
+    )
+
+
+def message_title(message: MessageDifference) -> str:
+    """Return ``output 0: message on /odom (nav_msgs/msg/Odometry)``, with who has it."""
+    if message.kind is None:
+        what = "input"
+    else:
+        verb = _VERBS.get(message.kind, message.kind.label)
+        what = f"output {message.position}: {verb}" if message.position >= 0 else f"input: {verb}"
+    text = f"{what} {printable(message.topic)}".rstrip()
+    if message.type:
+        text += f" ({printable(message.type)})"
+    if message.presence != "both":
+        text += f", {message.presence}"
+    return text
+
+
+def hashes_text(message: MessageDifference) -> str:
+    """Return the hashes of both sides, for what has no payload."""
+    sides = ("absent" if h is None else f"{h:016x}" for h in (message.hash_a, message.hash_b))
+    return " | ".join(sides)
+
+
+def distance_text(difference: FieldDifference) -> str:
+    """Return how far apart the values are, and what is special about them."""
+    parts = []
+    if difference.elements is not None and difference.elements[0] > 1:
+        parts.append(f"{difference.elements[0]} of {difference.elements[1]} differ")
+    if difference.absolute is not None:
+        parts.append(f"|a-b| {difference.absolute:.6g}")
+    if difference.smallest is not None and difference.largest is not None:
+        if difference.smallest == difference.largest:
+            parts.append(f"|a-b| {difference.largest:.6g}")
+        else:
+            parts.append(f"|a-b| {difference.smallest:.6g} to {difference.largest:.6g}")
+    if difference.ulp is not None:
+        several = difference.elements is not None and difference.elements[0] > 1
+        parts.append(f"{'up to ' if several else ''}{difference.ulp} ulp")
+    if difference.note:
+        parts.append(difference.note)
+    if difference.within_tolerance:
+        parts.append("within tolerance")
+    return ", ".join(parts)
+
+
+def field_lines(
+    differences: tuple[FieldDifference, ...], width: int, indent: str = "    "
+) -> list[Line]:
+    """Return lines for differing fields: short values side by side, others below each other."""
+    rows = []
+    for found in differences:
+        path = (printable(found.path), "")
+        if found.first:
+            rows.append([path, (distance_text(found), "")])
+            rows += _element_rows(found)
+        elif max(len(found.a), len(found.b)) <= _INLINE_MAX:
+            distance = (distance_text(found), FAINT)
+            rows.append([path, (found.a, SIDE_A), ("|", FAINT), (found.b, SIDE_B), distance])
+        else:
+            rows.append([path, (distance_text(found), FAINT)])
+            room = max(width - len(indent) - 6, 20)
+            rows.append([(f"  a {shortened(found.a, room)}", SIDE_A)])
+            rows.append([(f"  b {shortened(found.b, room)}", SIDE_B)])
+    return [_cut(row, width) for row in in_columns(rows, indent=indent, widest=_PATH_MAX)]
+
+
+def _element_rows(found: FieldDifference) -> list[list[Piece]]:
+    """Return the first elements that differ; bytes below each other, as in a hex dump."""
+    long = any(max(len(a), len(b)) > _INLINE_MAX for _, a, b in found.first)
+    if long:
+        rows: list[list[Piece]] = []
+        for place, a, b in found.first:
+            rows.append([(f"  {place:#06x} a {a}" if "bytes" in found.a else f"  [{place}] a {a}", SIDE_A)])
+            rows.append([(f"  {' ' * len(f'{place:#06x}')} b {b}" if "bytes" in found.a else f"  [{place}] b {b}", SIDE_B)])
+        return rows
+    texts = [f"[{place}] {a} | {b}" for place, a, b in found.first]
+    return [[(f"  {',  '.join(texts)}", "")]]
+
+
+def _cut(row: Line, width: int) -> Line:
+    """Return a line without what is beyond ``width``; an ellipsis marks the cut."""
+    length = sum(len(text) for text, _ in row)
+    if length <= width:
+        return row
+    pieces: list[Piece] = []
+    room = width
+    for text, style in row:
+        if len(text) >= room:
+            pieces.append((shortened(text, room) if len(text) > room else text, style))
+            if len(text) > room:
+                break
+        else:
+            pieces.append((text, style))
+        room -= len(text)
+        if room <= 0:
+            break
+    return line(*pieces)

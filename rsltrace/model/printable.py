@@ -1,0 +1,25 @@
+"""Names and texts out of a file that anybody may have made, safe to show on a terminal."""
+
+from __future__ import annotations
+
+import re
+
+_NOT_PRINTABLE = re.compile(
+    r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
+)
+_SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
+
+
+def printable(text: str) -> str:
+    """Return ``text`` on one line, with what could steer a terminal written as escapes."""
+    return _NOT_PRINTABLE.sub(_escaped, text)
+
+
+def shortened(text: str, width: int) -> str:
+    """Return ``text`` with at most ``width`` characters; an ellipsis stands for what is cut."""
+    return text if len(text) <= width else text[: max(width - 1, 0)] + "…"
+
+
+def _escaped(match: re.Match[str]) -> str:
+    character = match.group()
+    return _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")

@@ -1,0 +1,184 @@
+"""Traces that lie elsewhere: ranges fetched through fsspec, as few and as small as will do.
+
+A request costs a round trip however little it brings, and a trace is read in many small pieces that
+lie close together. So whole blocks are fetched and kept, several at once when they follow each
+other, and a reader that goes through the file from front to back gets ever larger pieces.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.errors import SetupError, TraceError
+
+BLOCK_BYTES = 32 << 10
+"""Small: what is fetched around a piece for nothing is half a block on either side."""
+
+CACHE_BYTES = 24 << 20
+"""Of a file that is diffed with another, all that matters fits in here."""
+
+_AHEAD_BYTES_MAX = 4 << 20
+_IN_A_ROW = 4
+"""After so many fetches that follow each other the reader is taken to go on like that."""
+
+_WHOLE_BYTES_MAX = 64 << 20
+"""A server may know no ranges and send all; what is larger has to be downloaded by its owner."""
+
+Fetch = Callable[[int, int], bytes]
+"""``fetch(begin, end)`` returns the bytes ``begin <= offset < end``; may raise anything."""
+
+
+class RemoteSource:
+    """A ByteSource in blocks over ``fetch``. ``requests`` counts the calls of it."""
+
+    def __init__(self, name: str, size: int, fetch: Fetch) -> None:
+        self._name = name
+        self._size = size
+        self._fetch = fetch
+        self._blocks: OrderedDict[int, bytes] = OrderedDict()
+        self._whole: bytes | None = None
+        self._last_end = -1
+        self._in_a_row = 0
+        self._ahead = 0
+        self._bytes_read = 0
+        self.requests = 0
+
+    @property
+    def name(self) -> str:
+        """The address as it was given."""
+        return self._name
+
+    @property
+    def size(self) -> int:
+        """Length in bytes when it was opened."""
+        return self._size
+
+    @property
+    def bytes_read(self) -> int:
+        """How many bytes were fetched so far."""
+        return self._bytes_read
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """Return ``length`` bytes from ``offset``. Raises TraceError if they cannot be had."""
+        end = offset + length
+        if end > self._size:
+            raise TraceError(
+                f"{self._name}: {length} bytes at offset {offset} reach beyond the end of the file "
+                f"({self._size} bytes); the file is damaged"
+            )
+        if self._whole is not None:
+            return self._whole[offset:end]
+        first, last = offset // BLOCK_BYTES, -(-end // BLOCK_BYTES)
+        pieces = self._collect(first, last)
+        begin = first * BLOCK_BYTES
+        if len(pieces) == 1:
+            return pieces[0][offset - begin : end - begin]
+        return b"".join(pieces)[offset - begin : end - begin]
+
+    def close(self) -> None:
+        """Forget what was fetched."""
+        self._blocks.clear()
+        self._whole = None
+
+    def _collect(self, first: int, last: int) -> list[bytes]:
+        """Return the blocks ``first <= number < last``; those that are missing are fetched."""
+        pieces: dict[int, bytes] = {}
+        missing: list[int] = []
+        for number in range(first, last):
+            block = self._blocks.get(number)
+            if block is None:
+                missing.append(number)
+            else:
+                self._blocks.move_to_end(number)
+                pieces[number] = block
+        while missing:
+            run = 1
+            while run < len(missing) and missing[run] == missing[0] + run:
+                run += 1
+            for number, block in self._fetch_blocks(missing[0], missing[0] + run):
+                self._blocks[number] = block
+                if first <= number < last:
+                    pieces[number] = block
+            del missing[:run]
+        while len(self._blocks) * BLOCK_BYTES > CACHE_BYTES:
+            self._blocks.popitem(last=False)
+        return [pieces[number] for number in range(first, last)]
+
+    def _fetch_blocks(self, first: int, last: int) -> list[tuple[int, bytes]]:
+        begin = first * BLOCK_BYTES
+        end = min(last * BLOCK_BYTES, self._size)
+        self._in_a_row = self._in_a_row + 1 if begin == self._last_end else 0
+        if self._in_a_row >= _IN_A_ROW:
+            self._ahead = min(max(2 * self._ahead, 2 * BLOCK_BYTES), _AHEAD_BYTES_MAX)
+            end = min(max(end, begin + self._ahead), self._size)
+        else:
+            self._ahead = 0
+        self._last_end = end
+        data = self._range(begin, end)
+        return [
+            (first + place // BLOCK_BYTES, data[place : place + BLOCK_BYTES])
+            for place in range(0, len(data), BLOCK_BYTES)
+        ]
+
+    def _range(self, begin: int, end: int) -> bytes:
+        self.requests += 1
+        try:
+            data = self._fetch(begin, end)
+        except Exception as error:  # whatever the storage's library raises: there are many
+            raise TraceError(
+                f"{self._name} cannot be read at offset {begin}: {_reason(error)}"
+            ) from error
+        self._bytes_read += len(data)
+        if len(data) == end - begin:
+            return data
+        if len(data) == self._size:
+            if self._size > _WHOLE_BYTES_MAX:
+                raise TraceError(
+                    f"the server of {self._name} sends the whole file ({self._size} bytes) instead "
+                    "of the range asked for; download it and compare the copy"
+                )
+            self._whole = data
+            return data[begin:end]
+        raise TraceError(
+            f"{self._name} became shorter or longer while it was read ({len(data)} bytes at offset "
+            f"{begin} instead of {end - begin}); try again"
+        )
+
+
+def open_remote(address: str) -> RemoteSource:
+    """Open an address that fsspec knows. Raises TraceError if it is not there.
+
+    Raises SetupError if fsspec, or what it needs for this kind of address, is not installed.
+    """
+    scheme = address.partition("://")[0]
+    try:
+        import fsspec
+    except ImportError as error:
+        raise SetupError(
+            f"reading {address} needs fsspec: pip install 'rsltrace[remote]', or download the file"
+        ) from error
+    try:
+        filesystem, path = fsspec.core.url_to_fs(address)
+    except ImportError as error:
+        raise SetupError(
+            f"fsspec needs another package for {scheme}:// addresses: {error}; install it, or "
+            "download the file"
+        ) from error
+    except ValueError as error:
+        raise TraceError(f"{address} is no address that can be read: {error}") from error
+    try:
+        size = filesystem.info(path)["size"]
+    except FileNotFoundError as error:
+        raise TraceError(f"{address} does not exist, or cannot be reached") from error
+    except Exception as error:  # as above
+        raise TraceError(f"{address} cannot be opened: {_reason(error)}") from error
+    if size is None:
+        raise TraceError(f"{address} does not say how large it is; download it first")
+    fetch: Any = filesystem.cat_file
+    return RemoteSource(address, int(size), lambda begin, end: fetch(path, start=begin, end=end))
+
+
+def _reason(error: Exception) -> str:
+    return str(error) or type(error).__name__

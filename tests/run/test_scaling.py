@@ -1,0 +1,82 @@
+"""Memory does not grow with the length of a run, nor an event's work with the number of nodes.
+
+No wall times: memory is the peak of a process, work is counted in calls of Python functions.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+CODE = """
+import json, resource, sys
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+from rsltrace import Job, NodeSpec, StopSpec, record
+
+class Pair(Node):
+    def __init__(self, number):
+        super().__init__(f'pair_{number}')
+        publisher = self.create_publisher(UInt64, f'n_{number}', 10)
+        self.create_subscription(UInt64, f'n_{number}', lambda m: None, 10)
+        self.create_timer(0.001, lambda: publisher.publish(UInt64(data=number)))
+
+def pairs(count):
+    return [Pair(number) for number in range(count)]
+
+events, nodes, profile = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == 'profile'
+job = Job(nodes=[NodeSpec(node=pairs, arguments={'count': nodes})], stop=StopSpec(events=events))
+calls = 0
+if profile:
+    def count(frame, event, argument):
+        global calls
+        calls += event == 'call'
+    short = Job(nodes=job.nodes, stop=StopSpec(events=1))
+    record(short, sys.argv[4], force=True)
+    sys.setprofile(count)
+    record(short, sys.argv[4], force=True)
+    begun = calls
+    calls = 0
+    result = record(job, sys.argv[4], force=True)
+    sys.setprofile(None)
+    calls -= begun
+else:
+    result = record(job, sys.argv[4], force=True)
+print(json.dumps({
+    'events': result.events,
+    'peak_mib': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+    'calls': calls,
+}))
+"""
+
+
+def measure(events: int, nodes: int, mode: str, path: Any) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-c", CODE, str(events), str(nodes), mode, str(path)],
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    values: dict[str, Any] = json.loads(done.stdout)
+    return values
+
+
+def test_memory_does_not_grow_with_the_length_of_the_run(tmp_path: Any) -> None:
+    short = measure(100_000, 1, "memory", tmp_path / "run.mcap")
+    long = measure(1_000_000, 1, "memory", tmp_path / "run.mcap")
+    assert long["events"] >= 1_000_000
+    assert long["peak_mib"] - short["peak_mib"] < 10
+
+
+def test_an_event_takes_the_same_work_whatever_the_number_of_nodes(tmp_path: Any) -> None:
+    few = measure(20_000, 8, "profile", tmp_path / "run.mcap")
+    many = measure(20_000, 200, "profile", tmp_path / "run.mcap")
+    assert many["calls"] / many["events"] < 1.1 * few["calls"] / few["events"]

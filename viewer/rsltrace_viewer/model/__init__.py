@@ -1,0 +1,1 @@
+"""What the viewer shows, as pure functions and frozen values; nothing here knows a terminal."""

@@ -1,0 +1,230 @@
+"""One opened trace as the viewer needs it: names at hand, a few segments in memory, no more.
+
+Everything on screen comes through here. A segment (a few thousand events) is read when something
+in it is looked at and forgotten when others were looked at since, so a trace of ten million events
+needs no more memory than a small one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import Event, EventKind, Output
+from rsltrace.model.printable import printable
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.segments import event_of
+
+RUN_LABEL = "(run)"
+"""The node column of what belongs to no node."""
+
+_SEGMENTS_KEPT = 24
+"""About 0.4 MB each with outputs."""
+
+KIND_WORDS = {
+    EventKind.CONSTRUCT: "init",
+    EventKind.TIMER: "timer",
+    EventKind.SUBSCRIPTION: "sub",
+    EventKind.SERVICE: "srv",
+    EventKind.CLIENT: "client",
+    EventKind.GUARD_CONDITION: "guard",
+    EventKind.TASK: "task",
+    EventKind.RESUME: "resume",
+    EventKind.QOS_EVENT: "qos",
+    EventKind.BAG: "bag",
+    EventKind.SHUTDOWN: "end",
+    EventKind.ACTION: "action",
+    EventKind.CLOCK_JUMP: "jump",
+}
+"""Kinds in at most six letters, for columns; the inspector writes them out."""
+
+WITH_TOPIC = frozenset(
+    (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
+)
+"""Kinds of entities whose name is that of a topic or service."""
+
+
+@dataclass(frozen=True, slots=True)
+class Segment:
+    """The events of a segment: EVENT_DTYPE, shape (n,); ``first`` is the index of the first."""
+
+    number: int
+    first: int
+    events: npt.NDArray[np.void]
+
+    @property
+    def last(self) -> int:
+        """The index after the last event."""
+        return self.first + len(self.events)
+
+
+class Run:
+    """A trace with the look-ups of a viewer. Reading methods may raise TraceError for damage.
+
+    Methods may be called from several threads.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self.trace = trace
+        self.count = trace.event_count
+        self.segments = trace.segments
+        self.segment = lru_cache(maxsize=_SEGMENTS_KEPT)(self._segment)
+        self.segment_outputs = lru_cache(maxsize=_SEGMENTS_KEPT)(self._segment_outputs)
+
+    @classmethod
+    def open(cls, path: Path | str) -> Run:
+        """Open a trace. Raises TraceError, TraceFormatError."""
+        return cls(Trace.open(path))
+
+    @property
+    def name(self) -> str:
+        """The file's name without its folder."""
+        return printable(Path(self.trace.name).name)
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self.trace.close()
+
+    # Names.
+
+    @cached_property
+    def entities(self) -> Mapping[int, Entity]:
+        """All entities by id."""
+        return self.trace.entities
+
+    @cached_property
+    def nodes(self) -> tuple[Entity, ...]:
+        """The nodes in the order they were created."""
+        return tuple(e for e in self.entities.values() if e.kind is EntityKind.NODE)
+
+    @cached_property
+    def _labels(self) -> dict[int, tuple[str, str]]:
+        """By entity id: (node, name), printable."""
+        result = {}
+        for entity in self.entities.values():
+            owner = self.entities.get(entity.node)
+            node = printable(owner.name) if owner is not None and owner.name else RUN_LABEL
+            result[entity.id] = node, printable(entity.name) or entity.kind.label
+        return result
+
+    def node_name(self, entity_id: int) -> str:
+        """Return the name of the node that an entity belongs to."""
+        return self._labels.get(entity_id, (RUN_LABEL, ""))[0]
+
+    def entity_name(self, entity_id: int) -> str:
+        """Return the name of an entity; ``#7`` if the trace does not describe it."""
+        if entity_id == 0:
+            return ""
+        return self._labels.get(entity_id, ("", f"#{entity_id}"))[1]
+
+    @cached_property
+    def topics(self) -> tuple[str, ...]:
+        """Names of all topics and services, sorted."""
+        return tuple(sorted({e.name for e in self.entities.values() if e.kind in WITH_TOPIC}))
+
+    @cached_property
+    def entity_node(self) -> npt.NDArray[np.int64]:
+        """By entity id: its node's place in ``nodes``, -1 for the run. Shape (largest id + 1,)."""
+        places = {node.id: place for place, node in enumerate(self.nodes)}
+        table = np.full(max(self.entities) + 1, -1, dtype=np.int64)
+        for entity in self.entities.values():
+            table[entity.id] = places.get(entity.node, -1)
+        return table
+
+    def ids_where(self, name: str | None = None, node: int | None = None) -> list[int]:
+        """Return the ids of entities of that name, or of that node (by its id)."""
+        return [
+            e.id
+            for e in self.entities.values()
+            if (name is None or (e.name == name and e.kind in WITH_TOPIC))
+            and (node is None or e.node == node)
+        ]
+
+    # Events.
+
+    def segment_of(self, index: int) -> int:
+        """Return the number of the segment with event ``index`` (which must exist)."""
+        firsts = self.segments["first_event"]
+        return int(np.searchsorted(firsts, np.uint64(index), side="right")) - 1
+
+    def row(self, index: int) -> np.void:
+        """Return event ``index`` as a row of EVENT_DTYPE. Raises IndexError if there is none."""
+        if not 0 <= index < self.count:
+            raise IndexError(f"{self.trace.name} has no event {index}")
+        segment = self.segment(self.segment_of(index))
+        row: np.void = segment.events[index - segment.first]
+        return row
+
+    def event(self, index: int) -> Event:
+        """Return event ``index``. Raises IndexError, TraceError."""
+        return event_of(self.row(index))
+
+    def outputs(self, index: int) -> list[Output]:
+        """Return the outputs of event ``index``, in order. Raises IndexError, TraceError."""
+        from rsltrace.trace.segments import output_of
+
+        if not 0 <= index < self.count:
+            raise IndexError(f"{self.trace.name} has no event {index}")
+        outputs = self.segment_outputs(self.segment_of(index))
+        bounds = np.array([index, index + 1], dtype=np.uint64)
+        low, high = np.searchsorted(outputs["event"], bounds).tolist()
+        return [output_of(row) for row in outputs[low:high]]
+
+    def stamp(self, index: int) -> int:
+        """Return when event ``index`` happened, in ns."""
+        return int(self.row(index)["stamp"])
+
+    def index_at(self, stamp_ns: int) -> int:
+        """Return the first event at ``stamp_ns`` or later; the last event if there is none later.
+
+        Raises IndexError if there is no event at all.
+        """
+        if not self.count:
+            raise IndexError(f"{self.trace.name} has no event")
+        stamp = np.uint64(max(stamp_ns, 0))
+        number = int(np.searchsorted(self.segments["end_stamp"], stamp))
+        if number >= len(self.segments):
+            return self.count - 1
+        segment = self.segment(number)
+        place = int(np.argmax(segment.events["stamp"] >= stamp))
+        return segment.first + place
+
+    @cached_property
+    def start_ns(self) -> int:
+        """Stamp of the earliest event (0: none)."""
+        return int(self.segments["start_stamp"].min()) if len(self.segments) else 0
+
+    @cached_property
+    def end_ns(self) -> int:
+        """Stamp of the latest event (0: none)."""
+        return int(self.segments["end_stamp"].max()) if len(self.segments) else 0
+
+    def input_of(self, event: Event) -> Output | None:
+        """Return the output that was the input of ``event``, or None if no event caused it."""
+        if not 0 <= event.cause_event < self.count:
+            return None
+        outputs = self.outputs(event.cause_event)
+        if event.cause_output >= len(outputs):
+            raise TraceError(
+                f"event {event.index} names output {event.cause_output} of event "
+                f"{event.cause_event} as its cause, which has {len(outputs)}; the trace is damaged"
+            )
+        return outputs[event.cause_output]
+
+    def _segment(self, number: int) -> Segment:
+        row = self.segments[number]
+        first = int(row["first_event"])
+        events = next(self.trace.events(first, first + int(row["events"])))
+        return Segment(number, first, np.ascontiguousarray(events))
+
+    def _segment_outputs(self, number: int) -> npt.NDArray[np.void]:
+        row = self.segments[number]
+        first = int(row["first_event"])
+        return np.ascontiguousarray(next(self.trace.outputs(first, first + int(row["events"]))))

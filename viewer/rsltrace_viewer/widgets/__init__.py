@@ -1,0 +1,1 @@
+"""One widget per file; each draws what ``rsltrace_viewer.model`` computed."""
