@@ -242,12 +242,12 @@ class Trace:
         The arrays look into the file's bytes: they are read-only and not contiguous.
         """
         for segment, begin, end in self._pieces(first, last):
-            yield self._segments.events(segment)[begin:end]
+            yield self._segments.cached_events(segment)[begin:end]
 
     def outputs(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]:
         """Yield the outputs of the events ``first <= index < last``: OUTPUT_DTYPE, per segment."""
         for segment, begin, end in self._pieces(first, last):
-            outputs = self._segments.outputs(segment)
+            outputs = self._segments.cached_outputs(segment)
             start = int(self.segments["first_event"][segment])
             bounds = np.array([start + begin, start + end], dtype=np.uint64)
             low, high = np.searchsorted(outputs["event"], bounds).tolist()

@@ -113,23 +113,24 @@ def field_lines(
             room = max(width - len(indent) - 6, 20)
             rows.append([(f"  a {shortened(found.a, room)}", SIDE_A)])
             rows.append([(f"  b {shortened(found.b, room)}", SIDE_B)])
-    return [_cut(row, width) for row in in_columns(rows, indent=indent, widest=_PATH_MAX)]
+    return [cut(row, width) for row in in_columns(rows, indent=indent, widest=_PATH_MAX)]
 
 
 def _element_rows(found: FieldDifference) -> list[list[Piece]]:
     """Return the first elements that differ; bytes below each other, as in a hex dump."""
-    long = any(max(len(a), len(b)) > _INLINE_MAX for _, a, b in found.first)
-    if long:
+    if any(max(len(a), len(b)) > _INLINE_MAX for _, a, b in found.first):
         rows: list[list[Piece]] = []
+        binary = found.a.endswith(" bytes")
         for place, a, b in found.first:
-            rows.append([(f"  {place:#06x} a {a}" if "bytes" in found.a else f"  [{place}] a {a}", SIDE_A)])
-            rows.append([(f"  {' ' * len(f'{place:#06x}')} b {b}" if "bytes" in found.a else f"  [{place}] b {b}", SIDE_B)])
+            label = f"{place:#06x}" if binary else f"[{place}]"
+            rows.append([(f"  {label} a {a}", SIDE_A)])
+            rows.append([(f"  {' ' * len(label)} b {b}", SIDE_B)])
         return rows
     texts = [f"[{place}] {a} | {b}" for place, a, b in found.first]
     return [[(f"  {',  '.join(texts)}", "")]]
 
 
-def _cut(row: Line, width: int) -> Line:
+def cut(row: Line, width: int) -> Line:
     """Return a line without what is beyond ``width``; an ellipsis marks the cut."""
     length = sum(len(text) for text, _ in row)
     if length <= width:

@@ -18,7 +18,6 @@ import numpy as np
 
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
-from rsltrace.trace.decode import to_plain
 from rsltrace_viewer.model import match
 from rsltrace_viewer.model.match import Condition
 from rsltrace_viewer.model.run import KIND_WORDS, WITH_TOPIC, Run
@@ -354,6 +353,8 @@ def _read_text(run: Run, token: _Token) -> Condition:
 
 def _contains(run: Run, index: int, folded: str) -> bool:
     """Whether the input or an output of an event has ``folded`` in its decoded text."""
+    from rsltrace.trace.decode import to_plain  # its library takes as long as opening a trace
+
     try:
         event = run.event(index)
         found = run.input_of(event)

@@ -1,0 +1,108 @@
+"""Which entity of one run is which of the other.
+
+Ids count up in creation order, so one entity more shifts all ids after it. Entities are therefore
+matched by what they are: node, kind, name and type, and their number among those that are alike.
+Everything behind this module speaks of *numbers*, which mean the same entity in both runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.diff.model import EntityKey
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity
+from rsltrace.trace.reader import Trace
+
+
+@dataclass(frozen=True)
+class Identity:
+    """The entities of two runs. Numbers count from 0, which is the run itself.
+
+    ``keys`` and ``nodes`` (the number of the owning node) go by number; ``numbers_a`` and
+    ``numbers_b`` give the number of an id, shape (largest id + 1,), -1 where there is no entity.
+    ``same_ids`` says that no id means something else in the other run.
+    """
+
+    keys: tuple[EntityKey, ...]
+    nodes: tuple[int, ...]
+    numbers_a: npt.NDArray[np.int64]
+    numbers_b: npt.NDArray[np.int64]
+    only_a: tuple[int, ...]
+    only_b: tuple[int, ...]
+    same_ids: bool
+    by_key: Mapping[EntityKey, int] = field(repr=False)
+
+    def numbers(self, ids: npt.NDArray[np.uint32], *, of_b: bool) -> npt.NDArray[np.int64]:
+        """Return the numbers of entity ids. Raises TraceError if the trace has no such entity."""
+        table = self.numbers_b if of_b else self.numbers_a
+        if len(ids) and int(ids.max()) >= len(table):
+            raise TraceError(f"{'b' if of_b else 'a'}: there is no entity {int(ids.max())}")
+        numbers = table[ids]
+        if (numbers < 0).any():
+            unknown = int(ids[int(np.argmax(numbers < 0))])
+            raise TraceError(f"{'b' if of_b else 'a'}: there is no entity {unknown}")
+        return numbers
+
+    @property
+    def nothing_in_common(self) -> bool:
+        """Whether the two graphs share no entity at all: they are of different jobs."""
+        own_a = len(self.keys) - 1 - len(self.only_b)
+        return bool(self.only_a and self.only_b) and own_a == len(self.only_a)
+
+
+def identify(a: Trace, b: Trace) -> Identity:
+    """Match the entities of two runs. Reads all entities of both."""
+    keys_a, keys_b = _keys(a), _keys(b)
+    by_key: dict[EntityKey, int] = {}
+    for key in (*keys_a.values(), *keys_b.values()):
+        by_key.setdefault(key, len(by_key))
+    numbers_a, numbers_b = _table(keys_a, by_key), _table(keys_b, by_key)
+    shared = min(len(numbers_a), len(numbers_b))
+    both = (numbers_a[:shared] >= 0) & (numbers_b[:shared] >= 0)
+    in_a, in_b = set(keys_a.values()), set(keys_b.values())
+    nodes = [0] * len(by_key)
+    for trace, keys in ((a, keys_a), (b, keys_b)):
+        for entity_id, key in keys.items():
+            owner = trace.entities[entity_id].node
+            nodes[by_key[key]] = by_key[keys[owner]] if owner in keys else 0
+    return Identity(
+        keys=tuple(by_key),
+        nodes=tuple(nodes),
+        numbers_a=numbers_a,
+        numbers_b=numbers_b,
+        only_a=tuple(number for key, number in by_key.items() if key not in in_b),
+        only_b=tuple(number for key, number in by_key.items() if key not in in_a),
+        same_ids=bool((numbers_a[:shared] == numbers_b[:shared])[both].all()),
+        by_key=by_key,
+    )
+
+
+def _keys(trace: Trace) -> dict[int, EntityKey]:
+    """Return the key of every entity, by id, in creation order."""
+    seen: dict[tuple[str, str, str, str], int] = {}
+    keys: dict[int, EntityKey] = {}
+    for entity in trace.entities.values():
+        what = (_node_name(trace, entity), entity.kind.label, entity.name, entity.type)
+        ordinal = seen.get(what, 0)
+        seen[what] = ordinal + 1
+        keys[entity.id] = EntityKey(*what, ordinal)
+    return keys
+
+
+def _node_name(trace: Trace, entity: Entity) -> str:
+    owner = trace.entities.get(entity.node)
+    return owner.name if owner is not None else ""
+
+
+def _table(
+    keys: Mapping[int, EntityKey], by_key: Mapping[EntityKey, int]
+) -> npt.NDArray[np.int64]:
+    table = np.full(max(keys) + 1, -1, dtype=np.int64)
+    for entity_id, key in keys.items():
+        table[entity_id] = by_key[key]
+    return table
