@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -37,15 +38,15 @@ class Identity:
     same_ids: bool
     by_key: Mapping[EntityKey, int] = field(repr=False)
 
-    def numbers(self, ids: npt.NDArray[np.uint32], *, of_b: bool) -> npt.NDArray[np.int64]:
+    def numbers(self, trace: Trace, ids: npt.NDArray[Any], *, of_b: bool) -> npt.NDArray[np.int64]:
         """Return the numbers of entity ids. Raises TraceError if the trace has no such entity."""
         table = self.numbers_b if of_b else self.numbers_a
-        if len(ids) and int(ids.max()) >= len(table):
-            raise TraceError(f"{'b' if of_b else 'a'}: there is no entity {int(ids.max())}")
-        numbers = table[ids]
-        if (numbers < 0).any():
-            unknown = int(ids[int(np.argmax(numbers < 0))])
-            raise TraceError(f"{'b' if of_b else 'a'}: there is no entity {unknown}")
+        places = ids.astype(np.int64)
+        unknown = places >= len(table)
+        numbers: npt.NDArray[np.int64] = table[np.where(unknown, 0, places)]
+        unknown |= numbers < 0
+        if unknown.any():
+            raise TraceError(f"{trace.name} has no entity {int(places[int(np.argmax(unknown))])}")
         return numbers
 
     @property
@@ -99,9 +100,7 @@ def _node_name(trace: Trace, entity: Entity) -> str:
     return owner.name if owner is not None else ""
 
 
-def _table(
-    keys: Mapping[int, EntityKey], by_key: Mapping[EntityKey, int]
-) -> npt.NDArray[np.int64]:
+def _table(keys: Mapping[int, EntityKey], by_key: Mapping[EntityKey, int]) -> npt.NDArray[np.int64]:
     table = np.full(max(keys) + 1, -1, dtype=np.int64)
     for entity_id, key in keys.items():
         table[entity_id] = by_key[key]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from rsltrace.errors import RunError
 
@@ -17,8 +17,7 @@ class Stop:
     exit_code: int = 0
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
+class Progress(NamedTuple):
     """What a stop condition may look at: times in ns, and counts since the start of the run.
 
     ``activity_ns`` is the last time at which anything was published, called or answered.

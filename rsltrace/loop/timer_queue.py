@@ -7,7 +7,7 @@ heap; it exists to compare runs with RSLCPP, and is part of no other promise.
 
 from __future__ import annotations
 
-from heapq import heappop, heappush
+from heapq import heappop, heappush, heapreplace
 from typing import Protocol
 
 from rsltrace.loop.timer import TimerState
@@ -45,7 +45,15 @@ class CreationOrderQueue:
         heappush(self._heap, entry)
 
     moved = add
-    ran = add
+
+    def ran(self, timer: TimerState) -> None:
+        heap = self._heap
+        first = timer.ticket
+        timer.ticket = entry = (timer.deadline_ns, timer.order, timer)
+        if heap and heap[0] is first:
+            heapreplace(heap, entry)
+        else:
+            heappush(heap, entry)
 
     def remove(self, timer: TimerState) -> None:
         timer.ticket = None

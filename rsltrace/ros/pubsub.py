@@ -197,7 +197,7 @@ class SubscriptionHandle(EntityHandle):
         if wrapper is None or self._destroyed:
             return
         group = wrapper.callback_group
-        if is_busy(group, wrapper):
+        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
             return
         data, event, position, digest, *_ = delivery = queue.popleft()

@@ -136,7 +136,7 @@ class ServiceHandle(_End):
         if not self.queue or wrapper is None or self._destroyed:
             return
         group = wrapper.callback_group
-        if is_busy(group, wrapper):
+        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
             return
         data, event, position, digest, header = self.queue.popleft()
@@ -241,7 +241,7 @@ class ClientHandle(_End):
         if not self.queue or wrapper is None or self._destroyed:
             return
         group = wrapper.callback_group
-        if is_busy(group, wrapper):
+        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
             return
         data, event, position, digest, header = self.queue.popleft()

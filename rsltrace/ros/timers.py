@@ -62,9 +62,10 @@ class TimerHandle(EntityHandle):
         wrapper = self.wrapper
         core = self.core
         state = self.state
-        if is_busy(wrapper.callback_group, wrapper):
+        group = wrapper.callback_group
+        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             core.loop.timers.remove(state)
-            core.park(wrapper.callback_group, self.activate)
+            core.park(group, self.activate)
             return
         callback = wrapper.callback
         if callback is not self._callback:
@@ -74,7 +75,7 @@ class TimerHandle(EntityHandle):
         state.call(core.loop.now_ns)
         core.loop.timers.ran(state)
         if self._coroutine:
-            begin(wrapper.callback_group, wrapper)
+            begin(group, wrapper)
             start_coroutine(core, self, _TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             core.execute(self, self.entity_id, self.node, _TIMER, callback, (), NO_EVENT, 0, digest)

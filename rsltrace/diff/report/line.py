@@ -73,13 +73,14 @@ def in_columns(
 class Section:
     """Some lines under a title that may be shortened to ``keep`` of them when space is short.
 
-    ``noun`` names what the lines show: ``… 7 more fields``.
+    ``noun`` names what the lines show: ``… 7 more fields``. With ``newest_last`` the first rows go.
     """
 
     title: Line
     rows: list[Line]
     keep: int
     noun: str
+    newest_last: bool = False
     hidden: int = field(default=0)
 
     @property
@@ -94,7 +95,13 @@ class Section:
         if not self.height:
             return []
         more = [line((f"  … {self.hidden} more {self.noun}", FAINT))] if self.hidden else []
-        return [BLANK, *([self.title] if self.title else []), *self.rows, *more]
+        rows = [*more, *self.rows] if self.newest_last else [*self.rows, *more]
+        return [BLANK, *([self.title] if self.title else []), *rows]
+
+    def shorten(self) -> None:
+        """Leave out the row that matters least."""
+        self.rows.pop(0 if self.newest_last else -1)
+        self.hidden += 1
 
 
 def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:
@@ -106,7 +113,5 @@ def fitted(head: list[Line], sections: Sequence[Section], height: int | None) ->
         spare = [part for part in sections if len(part.rows) > part.keep]
         if not spare:
             break
-        widest = max(spare, key=lambda part: len(part.rows) - part.keep)
-        widest.rows.pop()
-        widest.hidden += 1
+        max(spare, key=lambda part: len(part.rows) - part.keep).shorten()
     return [*head, *(row for part in sections for row in part.lines())]

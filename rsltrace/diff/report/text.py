@@ -222,23 +222,19 @@ def _listed(
     alike = len(a) == len(b) and all(map(same_event, a, b))
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
-        return Section(line((f"{title} (the same in both)", TITLE)), rows[::-1], keep, "events")
+        heading = line((f"{title} (the same in both)", TITLE))
+        return Section(heading, rows, keep, "events", newest_last=True)
     half = (width - 5) // 2
-    rows = [line("  ", (f"{'a':<{half}}", SIDE_A), " ", ("b", SIDE_B))]
-    missing = max(len(a), len(b))
-    left = [None] * (missing - len(a)) + list(a)
-    right = [None] * (missing - len(b)) + list(b)
-    for one, other in reversed(list(zip(left, right, strict=True))):
+    longest = max(len(a), len(b))
+    left = [None] * (longest - len(a)) + list(a)
+    right = [None] * (longest - len(b)) + list(b)
+    rows = []
+    for one, other in zip(left, right, strict=True):
         mark = " " if one and other and same_event(one, other) else "|"
-        rows.append(
-            line(
-                "  ",
-                f"{_brief(one, half):<{half}}",
-                (mark, BAD),
-                f" {_brief(other, half)}".rstrip(),
-            )
-        )
-    return Section(line((title, TITLE)), rows, keep + 1, "events")
+        first = f"{_brief(one, half):<{half}}"
+        rows.append(line("  ", first, (mark, BAD), f" {_brief(other, half)}".rstrip()))
+    heading = line((f"{title} ", TITLE), ("(a left, b right)", FAINT))
+    return Section(heading, rows, keep, "events", newest_last=True)
 
 
 def _brief(event: EventView | None, width: int) -> str:

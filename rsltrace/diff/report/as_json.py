@@ -1,0 +1,94 @@
+"""A diff as JSON, for programs. ``docs/diff.md`` describes it; keys are only ever added.
+
+Times are integers of nanoseconds; hashes are 16 hex digits, since JSON readers lose digits of
+64-bit numbers; what is not there is null.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from enum import Enum
+from typing import Any
+
+from rsltrace.diff.bag_model import BagDiff
+from rsltrace.diff.model import Diff, EntityKey, EventView
+from rsltrace.diff.report.text import within_tolerance
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.model.stamp import format_seconds
+
+FORMAT = "rsltrace-diff"
+VERSION = 1
+_HASHES = frozenset(("input_hash", "output_hash", "state_hash", "hash_a", "hash_b"))
+
+
+def as_json(diff: Diff | BagDiff) -> dict[str, Any]:
+    """Return one diff as what ``json`` writes (without NaN: those are texts)."""
+    kind = "traces" if isinstance(diff, Diff) else "bags"
+    result = {"format": FORMAT, "version": VERSION, "kind": kind, **_fields(diff)}
+    result["identical"] = diff.identical
+    result["exit_code"] = diff.exit_code
+    if isinstance(diff, Diff):
+        result["within_tolerance"] = within_tolerance(diff)
+        result["resync_index"] = _sides(diff.resync_index)
+        result["aligned_to"] = _sides(diff.aligned_to)
+    else:
+        result["within_tolerance"] = diff.verdict.value == "equal-within-tolerance"
+    return result
+
+
+def several_as_json(diffs: Sequence[Diff | BagDiff]) -> dict[str, Any]:
+    """Return the diffs of several runs against one."""
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "kind": "several",
+        "golden": diffs[0].a.path,
+        "exit_code": max(diff.exit_code for diff in diffs),
+        "runs": [as_json(diff) for diff in diffs],
+    }
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    return {
+        field.name: _plain(field.name, getattr(value, field.name))
+        for field in dataclasses.fields(value)
+    }
+
+
+def _plain(name: str, value: Any) -> Any:
+    if isinstance(value, EventView):
+        return _event(value)
+    if isinstance(value, (EventKind, OutputKind)):
+        return value.label
+    if isinstance(value, EventFlag):
+        return [flag.name.lower() for flag in EventFlag if flag and flag in value and flag.name]
+    if isinstance(value, Enum):
+        return value.value
+    if dataclasses.is_dataclass(value):
+        return _fields(value)
+    if isinstance(value, tuple):
+        return [_plain(name, item) for item in value]
+    if name in _HASHES and isinstance(value, int):
+        return f"{value:016x}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
+def _event(event: EventView) -> dict[str, Any]:
+    result = _fields(event)
+    result["entity"] = _entity(event.entity)
+    result["time"] = format_seconds(event.stamp_ns)
+    if event.cause_event == NO_EVENT:
+        result["cause_event"] = result["cause_output"] = None
+    return result
+
+
+def _entity(key: EntityKey) -> dict[str, Any]:
+    return _fields(key)
+
+
+def _sides(pair: tuple[int, int] | None) -> dict[str, int] | None:
+    return None if pair is None else {"a": pair[0], "b": pair[1]}

@@ -1,0 +1,87 @@
+"""Diffs for continuous integration: JUnit XML and GitHub's annotations."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from xml.sax.saxutils import escape, quoteattr
+
+from rsltrace.diff.bag_model import BagDiff
+from rsltrace.diff.model import Diff
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report.bag_text import bag_report
+from rsltrace.diff.report.line import plain_text
+from rsltrace.diff.report.text import trace_report, within_tolerance
+from rsltrace.model.printable import printable
+
+_NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+
+
+def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
+    """Return a JUnit test suite with one test case per comparison."""
+    failures = sum(diff.exit_code != 0 for diff in diffs)
+    counts = f'tests="{len(diffs)}" failures="{failures}" errors="0" skipped="0"'
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites {counts}>"]
+    lines.append(f'  <testsuite name="rsltrace diff" {counts}>')
+    for diff in diffs:
+        name = _attribute(f"{diff.b.path} agrees with {diff.a.path}")
+        lines.append(f'    <testcase classname="rsltrace.diff" name={name}>')
+        report = _xml(plain_text(_report(diff, options)))
+        if diff.exit_code:
+            lines.append(
+                f"      <failure type={_attribute(diff.verdict.value)} "
+                f"message={_attribute(_message(diff))}>{report}</failure>"
+            )
+        else:
+            lines.append(f"      <system-out>{report}</system-out>")
+        lines.append("    </testcase>")
+    lines += ["  </testsuite>", "</testsuites>"]
+    return "\n".join(lines) + "\n"
+
+
+def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
+    """Return workflow commands: an error per comparison that failed, a notice per other one."""
+    lines = []
+    for diff in diffs:
+        level = "error" if diff.exit_code else "notice"
+        title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
+        text = plain_text(_report(diff, options)) if diff.exit_code else _message(diff)
+        file = _property(printable(diff.a.path))
+        lines.append(f"::{level} file={file},title={_property(printable(title))}::{_data(text)}")
+        if isinstance(diff, Diff):
+            for setting in diff.settings:
+                name, colon, number = setting.place.rpartition(":")
+                if colon and number.isdigit():
+                    change = f"{_side(setting.a)} became {_side(setting.b)}"
+                    place = f"file={_property(printable(name))},line={number}"
+                    lines.append(f"::notice {place},title=rsltrace%3A job differs::{_data(change)}")
+    return "".join(f"{row}\n" for row in lines)
+
+
+def _report(diff: Diff | BagDiff, options: DiffOptions) -> list[tuple[tuple[str, str], ...]]:
+    return trace_report(diff, options) if isinstance(diff, Diff) else bag_report(diff, options)
+
+
+def _message(diff: Diff | BagDiff) -> str:
+    tolerated = isinstance(diff, Diff) and within_tolerance(diff)
+    return diff.sentence + (" Equal within tolerance, not identical." if tolerated else "")
+
+
+def _side(text: str | None) -> str:
+    return "nothing" if text is None else printable(text.strip())
+
+
+def _xml(text: str) -> str:
+    return escape(_NOT_IN_XML.sub("\ufffd", text))
+
+
+def _attribute(text: str) -> str:
+    return quoteattr(_NOT_IN_XML.sub("\ufffd", printable(text)))
+
+
+def _data(text: str) -> str:
+    return text.rstrip("\n").replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+
+
+def _property(text: str) -> str:
+    return _data(text).replace(":", "%3A").replace(",", "%2C")

@@ -1,0 +1,61 @@
+"""Several runs against one golden run: who parts where, as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsltrace.diff.bag_model import BagDiff
+from rsltrace.diff.model import Diff
+from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
+from rsltrace.diff.report.text import within_tolerance
+from rsltrace.diff.report.words import cut, event_text
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_seconds
+
+COLUMNS = ("run", "verdict", "event", "time", "where")
+
+
+def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
+    """Return what the table says of one run, in the order of ``COLUMNS``."""
+    path = printable(diff.b.path)
+    if isinstance(diff, BagDiff):
+        if diff.first is None:
+            lone = (*diff.topics_only_a, *diff.topics_only_b)
+            where = printable(lone[0].topic) if lone else ""
+            return path, diff.verdict.value, "", "", where
+        shown = diff.first.a or diff.first.b
+        index = "" if shown is None else str(shown.index)
+        time = format_seconds(diff.first.after_ns)
+        return path, diff.verdict.value, index, time, printable(diff.first.topic)
+    if not diff.divergences:
+        return path, diff.verdict.value, "", "", ""
+    found = diff.divergences[0]
+    event = found.b or found.a
+    verdict = f"{diff.verdict.value}{' (within tolerance)' if within_tolerance(diff) else ''}"
+    if event is None:
+        return path, verdict, str(diff.agreeing), "", ""
+    return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
+
+
+def several_report(diffs: Sequence[Diff | BagDiff], width: int = 100) -> list[Line]:
+    """Return the table of several runs, with a sentence that counts them first."""
+    parted = sum(diff.exit_code != 0 for diff in diffs)
+    golden = printable(diffs[0].a.path)
+    if parted:
+        sentence = f"{parted} of {len(diffs)} runs part from {golden}."
+    else:
+        sentence = f"All {len(diffs)} runs agree with {golden}."
+    rows: list[list[Piece]] = [[(name, FAINT) for name in COLUMNS]]
+    for diff in diffs:
+        path, *rest = several_cells(diff)
+        style = BAD if diff.exit_code else GOOD
+        rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
+    lines = [line((sentence, BAD if parted else GOOD)), line()]
+    lines += [cut(row, max(width, 100)) for row in in_columns(rows, indent="")]
+    first = next((diff for diff in diffs if diff.exit_code), None)
+    if first is not None:
+        import shlex
+
+        command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
+        lines += [line(), line(("next: ", TITLE), printable(command))]
+    return lines

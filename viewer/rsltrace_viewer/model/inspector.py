@@ -1,0 +1,279 @@
+"""Everything about one event, as lines: its input and outputs decoded, its cause, its effects.
+
+Messages are decoded when their section is open; nothing else of the trace is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    Event,
+    EventFlag,
+    EventKind,
+    Output,
+    OutputKind,
+)
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace_viewer.model.lines import Line, Openness, Role
+from rsltrace_viewer.model.parameters import parameters_at
+from rsltrace_viewer.model.run import KIND_WORDS, Run
+from rsltrace_viewer.model.text import LEVEL_WARN, log_of, output_text, outputs_text
+from rsltrace_viewer.model.timeline import entity_of, node_of
+from rsltrace_viewer.model.tree import bytes_lines, message_lines, preview
+
+_OUTPUTS_OPEN = 3
+"""More outputs than this are listed closed: a constructor has dozens."""
+_MESSAGE_OPEN_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Effects:
+    """Events that an event caused, as far as one has looked: up to event ``searched``."""
+
+    event: int
+    found: tuple[int, ...] = ()
+    searched: int = 0
+    done: bool = False
+
+
+def inspect(
+    run: Run, index: int, openness: Openness, effects: Effects | None = None
+) -> list[Line]:
+    """Return the lines for event ``index``. Raises IndexError; damage becomes a line."""
+    try:
+        event = run.event(index)
+        outputs = run.outputs(index)
+    except TraceError as error:
+        return [Line(0, "", printable(str(error)), Role.ERROR, "error")]
+    lines = [*_title_lines(run, event)]
+    for make in (_input_lines, _output_lines):
+        try:
+            lines += make(run, event, outputs, openness)
+        except TraceError as error:
+            lines.append(Line(0, "", printable(str(error)), Role.ERROR, f"error.{make.__name__}"))
+    lines += _cause_lines(run, event, effects)
+    lines += _parameter_lines(run, event, openness)
+    lines += _detail_lines(run, event, openness)
+    return lines
+
+
+def _title_lines(run: Run, event: Event) -> Iterator[Line]:
+    entity = entity_of(run, event) or event.kind.label
+    title = f"{node_of(run, event)}  {event.kind.label} {entity}"
+    yield Line(0, f"event {event.index}", title, Role.SECTION, "event")
+    yield Line(1, "at", f"{format_seconds(event.stamp_ns)} s", Role.FIELD, "event.at")
+    for flag, text in ((EventFlag.RAISED, "raised an exception"), (EventFlag.SUSPENDED, "waits")):
+        if flag in event.flags:
+            role = Role.ERROR if flag is EventFlag.RAISED else Role.NOTE
+            yield Line(1, "!", text, role, f"event.{flag.name}")
+
+
+def _input_lines(
+    run: Run, event: Event, outputs: list[Output], openness: Openness
+) -> Iterator[Line]:
+    is_open = openness.is_open("in", True)
+    source = run.input_of(event)
+    if source is None:
+        yield Line(0, "input", _plain_input(event), Role.SECTION, "in")
+        return
+    yield Line(0, "input", _channel_text(run, source), Role.SECTION, "in", is_open)
+    if is_open:
+        yield from content_lines(run, source, "in", 1, openness)
+
+
+def _plain_input(event: Event) -> str:
+    if event.kind is EventKind.TIMER:
+        return "none (a timer's deadline)"
+    if event.kind is EventKind.CONSTRUCT:
+        return "none (the node was constructed)"
+    return f"hash {event.input_hash:016x}, from outside of the run" if event.input_hash else "none"
+
+
+def _output_lines(
+    run: Run, event: Event, outputs: list[Output], openness: Openness
+) -> Iterator[Line]:
+    if not outputs:
+        yield Line(0, "outputs", "none", Role.SECTION, "out")
+        return
+    is_open = openness.is_open("out", True)
+    summary = str(len(outputs))
+    yield Line(0, "outputs", summary, Role.SECTION, "out", is_open)
+    if not is_open:
+        return
+    for place, output in enumerate(outputs):
+        path = f"out.{place}"
+        role = _output_role(run, output)
+        inside = output.sequence != NO_SEQUENCE and output.kind is not OutputKind.LOG
+        small = len(outputs) <= _OUTPUTS_OPEN
+        opened = openness.is_open(path, small) if inside else None
+        yield Line(1, str(place), _output_title(run, output), role, path, opened)
+        if opened:
+            yield from content_lines(run, output, path, 2, openness)
+
+
+def _output_title(run: Run, output: Output) -> str:
+    if output.kind in (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE):
+        return _channel_text(run, output)
+    return output_text(run, output)
+
+
+def _output_role(run: Run, output: Output) -> Role:
+    if output.kind in (OutputKind.EXCEPTION, OutputKind.GUARD):
+        return Role.ERROR
+    if output.kind is OutputKind.LOG:
+        record = log_of(run, output)
+        return Role.WARNING if record is not None and record.level >= LEVEL_WARN else Role.FIELD
+    return Role.FIELD
+
+
+def _channel_text(run: Run, output: Output) -> str:
+    entity = run.entities.get(output.entity)
+    kind = printable(entity.type) if entity is not None else ""
+    return f"{output_text(run, output)}  {kind}".rstrip()
+
+
+def content_lines(
+    run: Run, output: Output, path: str, depth: int, openness: Openness
+) -> Iterator[Line]:
+    """Yield the decoded payload of an output; where that fails, the reason and the bytes."""
+    if output.sequence == NO_SEQUENCE:
+        text = f"not recorded (hash {output.hash:016x}); record: in the job says what is"
+        yield Line(depth, "", text, Role.NOTE, f"{path}.absent")
+        return
+    data = b""
+    try:
+        found = run.trace.payload(output)
+        channel = run.trace.channel_of(output)
+        if found is None or channel is None:
+            yield Line(depth, "", "its channel is not in the trace", Role.NOTE, f"{path}.absent")
+            return
+        data = found[2]
+        detail = run.trace.detail(output)
+        if detail is not None:
+            for number, text in enumerate(detail.rstrip("\n").split("\n")):
+                yield Line(depth, "", printable(text), Role.FIELD, f"{path}.text{number}")
+            return
+        message = run.trace.decode(channel, data)
+    except TraceError as error:
+        yield Line(depth, "", printable(str(error)), Role.ERROR, f"{path}.error")
+        yield from bytes_lines(data, path, depth)
+        return
+    yield from message_lines(message, path, depth, openness)
+
+
+def _cause_lines(run: Run, event: Event, effects: Effects | None) -> Iterator[Line]:
+    if event.cause_event == NO_EVENT:
+        yield Line(0, "cause", "no other event", Role.SECTION, "cause")
+    else:
+        yield Line(0, "cause", "", Role.SECTION, "cause")
+        yield event_link(run, event.cause_event, "cause.event", since_ns=event.stamp_ns)
+    if effects is None or effects.event != event.index:
+        yield Line(0, "effects", "…", Role.SECTION, "effects")
+        return
+    if effects.done:
+        text = str(len(effects.found)) if effects.found else f"none up to event {effects.searched}"
+    else:
+        text = f"{len(effects.found)} so far, looking at event {effects.searched} …"
+    yield Line(0, "effects", text, Role.SECTION, "effects")
+    for place, index in enumerate(effects.found[:_EFFECTS_SHOWN]):
+        yield event_link(run, index, f"effects.{place}", since_ns=event.stamp_ns)
+    if len(effects.found) > _EFFECTS_SHOWN:
+        more = f"… and {len(effects.found) - _EFFECTS_SHOWN} more"
+        yield Line(1, "", more, Role.NOTE, "effects.more")
+
+
+_EFFECTS_SHOWN = 50
+
+
+def event_link(run: Run, index: int, path: str, since_ns: int | None = None) -> Line:
+    """Return a line that leads to an event: ``→ 17  /ekf sub /odom  +0.2 ms``."""
+    try:
+        other = run.event(index)
+    except (TraceError, IndexError) as error:
+        return Line(1, "→", printable(f"{index} ({error})"), Role.ERROR, path)
+    text = f"{index}  {node_of(run, other)} {KIND_WORDS[other.kind]} {entity_of(run, other)}"
+    if since_ns is not None and other.stamp_ns != since_ns:
+        sign = "+" if other.stamp_ns > since_ns else "-"
+        text += f"  {sign}{format_duration(abs(other.stamp_ns - since_ns))}"
+    return Line(1, "→", text.rstrip(), Role.LINK, path, link=index)
+
+
+def _parameter_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+    node = node_of(run, event)
+    entity = run.entities.get(event.entity)
+    if entity is None or entity.kind is EntityKind.SYSTEM:
+        return
+    is_open = openness.is_open("parameters", False)
+    yield Line(0, "parameters", f"of {node} now", Role.SECTION, "parameters", is_open)
+    if not is_open:
+        return
+    try:
+        values = parameters_at(run, node, event.stamp_ns)
+    except TraceError as error:
+        yield Line(1, "", printable(str(error)), Role.ERROR, "parameters.error")
+        return
+    if not values:
+        yield Line(1, "", "none known", Role.NOTE, "parameters.none")
+    for name, value in values.items():
+        path = f"parameters.{name}"
+        yield Line(1, printable(name), preview(value), Role.FIELD, path)
+
+
+def _detail_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
+    is_open = openness.is_open("details", False)
+    yield Line(0, "details", "timing, hashes, entity", Role.SECTION, "details", is_open)
+    if not is_open:
+        return
+    for label, text in _details(run, event):
+        yield Line(1, label, printable(text), Role.FIELD, f"details.{label}")
+
+
+def _details(run: Run, event: Event) -> Sequence[tuple[str, str]]:
+    rows = [("since start", format_duration(event.stamp_ns - run.start_ns))]
+    if event.index:
+        before = event.stamp_ns - run.stamp(event.index - 1)
+        rows.append(("since the event before", format_duration(before)))
+    if 0 <= event.cause_event < run.count:
+        cause = event.stamp_ns - run.stamp(event.cause_event)
+        rows.append(("since its cause", format_duration(cause)))
+    rows += [
+        ("input hash", f"{event.input_hash:016x}"),
+        ("output hash", f"{event.output_hash:016x}"),
+        ("chain hash", f"{event.chain_hash:016x}"),
+    ]
+    if event.state_hash:
+        rows.append(("state hash", f"{event.state_hash:016x}"))
+    entity = run.entities.get(event.entity)
+    if entity is not None and entity.id:
+        rows += _entity_details(entity)
+    return rows
+
+
+def _entity_details(entity: Entity) -> list[tuple[str, str]]:
+    rows = [("entity", f"#{entity.id} {entity.kind.label} {entity.name}")]
+    if entity.type:
+        rows.append(("type", entity.type))
+    rows.append(("created", f"{format_seconds(entity.created_ns)} s"))
+    for key, value in entity.detail.items():
+        if key == "period_ns" and isinstance(value, int):
+            rows.append(("period", format_duration(value)))
+        elif isinstance(value, dict):
+            rows += [(f"{key} {inner}", str(text)) for inner, text in value.items()]
+        else:
+            rows.append((key, str(value)))
+    return rows
+
+
+def summary_line(run: Run, index: int) -> str:
+    """Return an event as one line, for lists: what it is and what it did."""
+    event = run.event(index)
+    did = outputs_text(run, run.outputs(index), 60)
+    text = f"{index}  {node_of(run, event)} {KIND_WORDS[event.kind]} {entity_of(run, event)}"
+    return f"{text}  {did}".rstrip()

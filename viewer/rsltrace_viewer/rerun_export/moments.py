@@ -1,0 +1,135 @@
+"""Which event a message came from: what puts messages on the timeline of events.
+
+Rerun's MCAP reader hands out messages with their times only. The outputs of the trace say which
+event published on which topic, and an event has a stamp; so the events that published on a topic
+at one time, in order, belong to the messages of that topic and time, in order. Only the segments
+around the messages at hand are read, whatever the length of the run.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_DETAILS, TOPIC_ROSOUT
+from rsltrace.trace.reader import Trace
+
+Senders = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.int64]]
+"""Stamps, event indexes and sending entities of what was published, each of shape (n,)."""
+
+_SEGMENTS_CACHED = 16
+
+
+class Moments:
+    """Finds the events behind messages of one trace."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._trace = trace
+        self._topic_of = _topics(trace)
+        table = trace.segments
+        self._starts = table["start_stamp"].astype(np.int64)
+        self._ends = table["end_stamp"].astype(np.int64)
+        # Stamps do not go backwards, and neither do these, whatever a damaged table says.
+        self._ends_sorted = np.maximum.accumulate(self._ends) if len(table) else self._ends
+        self._segment = lru_cache(maxsize=_SEGMENTS_CACHED)(self._read_segment)
+        self._seen: dict[object, tuple[int, int]] = {}
+
+    def senders(self, topic: str, first_ns: int, last_ns: int) -> Senders:
+        """Return what was published on ``topic`` from ``first_ns`` to ``last_ns``, both included."""
+        low = int(np.searchsorted(self._ends_sorted, first_ns, side="left"))
+        parts = []
+        for segment in range(low, len(self._starts)):
+            if self._starts[segment] > last_ns:
+                break
+            found = self._segment(segment).get(topic)
+            if found is not None:
+                keep = (found[0] >= first_ns) & (found[0] <= last_ns)
+                parts.append(tuple(column[keep] for column in found))
+        if not parts:
+            nothing = np.zeros(0, dtype=np.int64)
+            return nothing, nothing, nothing
+        stamps, events, entities = (np.concatenate(column) for column in zip(*parts, strict=True))
+        return stamps, events, entities
+
+    def of_messages(
+        self, topic: str, stream: object, stamps_ns: npt.NDArray[np.int64]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return (event indexes, sending entities) of messages, both of shape (n,).
+
+        ``stream`` names the sequence of rows that these continue: messages of one time may be
+        split over two calls. A message that no event published (there is none in a whole trace)
+        is given to the last event that could have, and entity 0.
+        """
+        rows = len(stamps_ns)
+        if rows == 0:
+            return stamps_ns, stamps_ns
+        stamps, events, entities = self.senders(topic, int(stamps_ns.min()), int(stamps_ns.max()))
+        starts = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[0] - 1))
+        place = np.arange(rows) - np.repeat(starts, np.diff(starts, append=rows))
+        last_ns, count = self._seen.get(stream, (-1, 0))
+        if last_ns == stamps_ns[0]:
+            place[stamps_ns == last_ns] += count  # only its first run: stamps are sorted
+        self._seen[stream] = (int(stamps_ns[-1]), int(place[-1]) + 1)
+        if len(stamps) == 0:
+            return np.full(rows, self._event_before(int(stamps_ns[0]))), np.zeros_like(stamps_ns)
+        first = np.searchsorted(stamps, stamps_ns, side="left")
+        past = np.searchsorted(stamps, stamps_ns, side="right")
+        # One message may make several rows (the transforms of a /tf): those past the end stay.
+        chosen = np.clip(np.minimum(first + place, past - 1), 0, len(stamps) - 1)
+        return events[chosen], entities[chosen]
+
+    def _event_before(self, stamp_ns: int) -> int:
+        segment = max(int(np.searchsorted(self._starts, stamp_ns, side="right")) - 1, 0)
+        return int(self._trace.segments["first_event"][segment]) if len(self._starts) else 0
+
+    def _read_segment(self, segment: int) -> dict[str, Senders]:
+        row = self._trace.segments[segment]
+        first = int(row["first_event"])
+        last = first + int(row["events"])
+        events = next(self._trace.events(first, last))
+        outputs = next(self._trace.outputs(first, last))
+        outputs = outputs[outputs["sequence"] != NO_SEQUENCE]
+        owners = outputs["event"].astype(np.int64)
+        stamps = events["stamp"][owners - first].astype(np.int64)
+        entities = outputs["entity"].astype(np.int64)
+        kinds = outputs["kind"].astype(np.int64)
+        result: dict[str, list[tuple[npt.NDArray[np.int64], ...]]] = {}
+        places: dict[str, list[npt.NDArray[np.int64]]] = {}
+        keys = entities * 256 + kinds
+        for key in np.unique(keys).tolist():
+            topic = self._topic_of.get(divmod(key, 256))
+            if topic is not None:
+                places.setdefault(topic, []).append(np.flatnonzero(keys == key))
+        del result
+        found = {}
+        for topic, parts in places.items():
+            order = np.sort(np.concatenate(parts))
+            found[topic] = (stamps[order], owners[order], entities[order])
+        return found
+
+
+def _topics(trace: Trace) -> dict[tuple[int, int], str]:
+    """Return, by (entity, kind of output), the topic on which such outputs are recorded."""
+    topics: dict[tuple[int, int], str] = {}
+    for entity in trace.entities.values():
+        for kind in OutputKind:
+            topic = _topic(entity, kind)
+            if topic:
+                topics[entity.id, int(kind)] = topic
+    return topics
+
+
+def _topic(entity: Entity, kind: OutputKind) -> str:
+    if kind is OutputKind.LOG:
+        return TOPIC_ROSOUT
+    if kind is OutputKind.MESSAGE:
+        return entity.name if entity.kind is EntityKind.PUBLISHER else ""
+    if kind is OutputKind.REQUEST:
+        return PREFIX_REQUEST + entity.name
+    if kind is OutputKind.RESPONSE:
+        return PREFIX_RESPONSE + entity.name
+    return TOPIC_DETAILS

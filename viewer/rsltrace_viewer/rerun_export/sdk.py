@@ -1,0 +1,41 @@
+"""The one place that knows whether Rerun is installed, and in which version.
+
+Rerun changes its Python interface with every minor version, so the extra pins one; another version
+is refused here with a sentence instead of failing somewhere inside with a traceback.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+
+from rsltrace.errors import SetupError
+
+VERSION = "0.41"
+INSTALL = "pip install 'rsltrace[rerun]'"
+APPLICATION_ID = "rsltrace"
+
+
+def require() -> None:
+    """Raise SetupError unless Rerun's SDK is installed in the version this was written for.
+
+    Also turns off Rerun's usage statistics, unless ``RERUN_ANALYTICS_ENABLED`` says otherwise:
+    looking at a trace should not open a connection to anybody.
+    """
+    try:
+        found = importlib.metadata.version("rerun-sdk")
+    except importlib.metadata.PackageNotFoundError:
+        raise SetupError(f"Rerun is not installed; install it with: {INSTALL}") from None
+    if not found.startswith(f"{VERSION}."):
+        raise SetupError(
+            f"rerun-sdk {found} is installed, this rsltrace works with {VERSION}; "
+            f"install that with: {INSTALL}"
+        )
+    os.environ.setdefault("RERUN_ANALYTICS_ENABLED", "0")
+    try:
+        import rerun  # noqa: F401 - whether it loads is the question
+    except ImportError as error:
+        raise SetupError(
+            f"rerun-sdk {found} is installed, but it cannot be loaded ({error}); "
+            f"install it again with: {INSTALL}"
+        ) from error
