@@ -112,7 +112,7 @@ class _Group:
         self._pairs = pairs
         self.free_a = list(range(len(self.places_a)))
         self.free_b = list(range(len(self.places_b)))
-        for signs in (_SIGNS[:2] if surest_only else _SIGNS):
+        for signs in _SIGNS[:2] if surest_only else _SIGNS:
             if not self.free_a or not self.free_b:
                 return
             self._tier(*signs)
@@ -262,7 +262,7 @@ def _nearest(a: list[int], b: list[int], limit: int) -> list[tuple[int, int]]:
     result = []
     chosen = best[-1][2]
     while chosen:
-        chosen, i, j = chosen  # type: ignore[assignment, misc]
+        chosen, i, j = chosen  # type: ignore[assignment]
         result.append((i, j))
     return result[::-1]
 

@@ -6,7 +6,6 @@ All are the same to the comparison: topics with types and counts, messages in or
 from __future__ import annotations
 
 import os
-import struct
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -15,17 +14,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.bag import open_bag
+from rsltrace.diff.kinds import is_trace
 from rsltrace.errors import BagError, RsltraceError, TraceError
-from rsltrace.trace.format import MCAP_MAGIC, METADATA_FORMAT, PREFIX_OWN, SCHEMA_ENCODING
+from rsltrace.trace.format import MCAP_MAGIC, PREFIX_OWN, SCHEMA_ENCODING
 
 if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
-
-_HEAD_BYTES = 4096
-_RECORD_HEAD = struct.Struct("<BQ")
-_METADATA_HEAD = struct.Struct("<BQI")
-_METADATA = 0x0C
-_SQLITE_MAGIC = b"SQLite format 3\0"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,39 +59,6 @@ class Source:
         if topic not in self._decoders:
             self._decoders[topic] = _decoder(self.topics[topic])
         return self._decoders[topic](data)
-
-
-def is_trace(path: str | os.PathLike[str]) -> bool:
-    """Whether a local file is a trace of rsltrace, by its first records; whole or cut off."""
-    try:
-        with open(path, "rb") as file:
-            head = file.read(_HEAD_BYTES)
-    except OSError:
-        return False
-    if not head.startswith(MCAP_MAGIC):
-        return False
-    # The format has it that this metadata is the first record after the header.
-    name = METADATA_FORMAT.encode()
-    with suppress(struct.error):
-        _, header_length = _RECORD_HEAD.unpack_from(head, len(MCAP_MAGIC))
-        place = len(MCAP_MAGIC) + _RECORD_HEAD.size + header_length
-        opcode, _, length = _METADATA_HEAD.unpack_from(head, place)
-        place += _METADATA_HEAD.size
-        return bool(opcode == _METADATA and head[place : place + length] == name)
-    return False
-
-
-def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Whether a local path is a recording that is no trace: a folder, an MCAP or sqlite3 file."""
-    if Path(path).is_dir():
-        return True
-    try:
-        with open(path, "rb") as file:
-            head = file.read(16)
-    except OSError:
-        return False
-    known = (MCAP_MAGIC, _SQLITE_MAGIC, b"\x28\xb5\x2f\xfd", b"#ROSBAG")
-    return head.startswith(known) and not is_trace(path)
 
 
 def open_source(path: str | os.PathLike[str]) -> Source:

@@ -224,7 +224,7 @@ def _sentence(
     lone_b: tuple[LoneTopic, ...],
 ) -> str:
     messages = sum(topic.equal + topic.tolerated for topic in topics)
-    counted = f"{messages} messages on {len(topics)} topics"
+    counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
     if verdict is BagVerdict.EQUAL:
         return f"The recordings are equal: {counted} say the same."
     if verdict is BagVerdict.WITHIN_TOLERANCE:
@@ -254,9 +254,13 @@ def _sentence(
     elif differing == 1:
         what = f"has another {first.fields[0].path}"
     else:
-        other = "field" if differing == 2 else "fields"
-        what = f"has another {first.fields[0].path} (and {differing - 1} other {other})"
+        others = _number(differing - 1, "other field")
+        what = f"has another {first.fields[0].path} (and {others})"
     return f"The recordings first part {at}: message {first.a.index} {what}."
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
 
 
 def _next_step(

@@ -102,6 +102,7 @@ class Trace:
     def close(self) -> None:
         """Let go of the file. Arrays handed out stay valid."""
         self._source.close()
+        self._segments.forget()
 
     def __enter__(self) -> Trace:
         return self

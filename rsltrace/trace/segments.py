@@ -90,6 +90,11 @@ class SegmentReader:
         self.cached_events = lru_cache(maxsize=_SEGMENTS_CACHED)(self.events)
         self.cached_outputs = lru_cache(maxsize=_SEGMENTS_CACHED)(self.outputs)
 
+    def forget(self) -> None:
+        """Drop what is cached."""
+        self.cached_events.cache_clear()
+        self.cached_outputs.cache_clear()
+
     def segment_of(self, event: int) -> int:
         """Return the number of the segment that holds ``event`` (which must exist)."""
         return int(np.searchsorted(self._first_events, np.uint64(event), side="right")) - 1

@@ -31,9 +31,11 @@ def run(name: str, capfd: pytest.CaptureFixture[str]) -> tuple[Any, str]:
 def test_a_job_is_valid_and_its_readme_names_it(name: str) -> None:
     from rsltrace import load_job
 
-    assert load_job(EXAMPLES / name).nodes
     readme = (EXAMPLES / name).parent / "README.md"
     assert f"rsltrace record examples/{name}" in readme.read_text()
+    if "husky" in name and not HUSKY.exists():
+        pytest.skip("the Husky recording is not here")
+    assert load_job(EXAMPLES / name).nodes
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from rsltrace.diff.report.line import (
     COMMAND,
     FAINT,
     GOOD,
+    NOTHING,
     SIDE_A,
     SIDE_B,
     TITLE,
@@ -92,16 +93,16 @@ def _message(found: MessageDivergence, width: int) -> Section:
             rows.append(line(f"    {shortened(printable(only.preview), width - 4)}"))
     if found.reason:
         rows += wrapped(f"    {printable(found.reason)}", width, style=FAINT, indent="    ")
-    return Section(line((title, TITLE)), rows, 4, "lines of differences")
+    return Section(line((title, TITLE)), rows, 14, "lines of differences", least=6)
 
 
 def _before(found: MessageDivergence, width: int) -> Section:
     if not found.before:
-        return Section((), [], 0, "")
+        return NOTHING
     side = "a" if found.a is not None else "b"
     rows = [cut(_brief(message), width) for message in found.before]
     title = line((f"before it on {printable(found.topic)}", TITLE), (f" (of {side})", FAINT))
-    return Section(title, rows, 1, "messages", newest_last=True)
+    return Section(title, rows, 1, "messages", least=0, newest_last=True)
 
 
 def _brief(message: BagMessage) -> Line:
@@ -117,7 +118,7 @@ def _topics(diff: BagDiff, width: int) -> Section:
     for lone, at in ((diff.topics_only_a, 4), (diff.topics_only_b, 5)):
         cells += [_lone_cells(topic, at) for topic in lone]
     rows = [cut(row, width) for row in in_columns(cells)]
-    return Section(rows[0], rows[1:], 2, "topics")
+    return Section(rows[0], rows[1:], 4, "topics")
 
 
 def _first_place(topic: TopicDiff) -> tuple[bool, int]:
@@ -144,4 +145,4 @@ def _lone_cells(topic: LoneTopic, at: int) -> list[Piece]:
 
 def _notes(diff: BagDiff, width: int) -> Section:
     rows = [row for note in diff.notes for row in wrapped(f"note: {printable(note)}", width)]
-    return Section((), rows, min(len(rows), 3), "notes")
+    return Section((), rows, min(len(rows), 3), "notes", min(len(rows), 2))

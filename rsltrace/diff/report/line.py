@@ -71,22 +71,25 @@ def in_columns(
 
 @dataclass(slots=True)
 class Section:
-    """Some lines under a title that may be shortened to ``keep`` of them when space is short.
+    """Some lines under a title that may be shortened when space is short.
 
-    ``noun`` names what the lines show: ``… 7 more fields``. With ``newest_last`` the first rows go.
+    ``keep`` rows are kept if that is possible at all, ``least`` in any case; a section shortened
+    to no row disappears. ``noun`` names what the rows show: ``… 7 more fields``. With
+    ``newest_last`` the first rows go first.
     """
 
     title: Line
     rows: list[Line]
     keep: int
     noun: str
+    least: int = 1
     newest_last: bool = False
     hidden: int = field(default=0)
 
     @property
     def height(self) -> int:
         """Lines it takes, the blank one before it included."""
-        if not (self.title or self.rows):
+        if not self.rows and (self.hidden or not self.title):
             return 0
         return 1 + bool(self.title) + len(self.rows) + bool(self.hidden)
 
@@ -104,14 +107,23 @@ class Section:
         self.hidden += 1
 
 
+NOTHING = Section((), [], 0, "")
+"""A section without lines."""
+
+
 def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:
     """Return head and sections in at most ``height`` lines (None: all of them), if they can be.
 
-    The section that has most to spare is shortened first; every section says what it leaves out.
+    The section that has most to spare is shortened first; each says how much it leaves out.
     """
-    while height is not None and len(head) + sum(part.height for part in sections) > height:
-        spare = [part for part in sections if len(part.rows) > part.keep]
-        if not spare:
-            break
-        max(spare, key=lambda part: len(part.rows) - part.keep).shorten()
+
+    def too_high() -> bool:
+        return height is not None and len(head) + sum(part.height for part in sections) > height
+
+    for floor in (lambda part: part.keep, lambda part: min(part.keep, part.least)):
+        while too_high():
+            part = max(sections, key=lambda part: len(part.rows) - floor(part))
+            if len(part.rows) <= floor(part):
+                break
+            part.shorten()
     return [*head, *(row for part in sections for row in part.lines())]

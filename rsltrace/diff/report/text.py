@@ -10,6 +10,7 @@ from rsltrace.diff.report.line import (
     COMMAND,
     FAINT,
     GOOD,
+    NOTHING,
     SIDE_A,
     SIDE_B,
     TITLE,
@@ -145,7 +146,7 @@ def _event(found: Divergence, width: int) -> Section:
         title = ""
     for message in found.messages:
         rows += _message(message, width)
-    return Section(line((title, TITLE)) if title else (), rows, 4, "lines of differences")
+    return Section(line((title, TITLE)) if title else (), rows, 12, "lines of differences", least=5)
 
 
 def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> list[Line]:
@@ -174,13 +175,13 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
 
 def _cause(found: Divergence, width: int) -> Section:
     if not found.root_sentence and len(found.chain) < 2:
-        return Section((), [], 0, "")
+        return NOTHING
     rows = [
         cut(_step(step, depth, last=depth == len(found.chain) - 1), width)
         for depth, step in enumerate(found.chain)
     ]
     title: Line = line(("cause: ", TITLE), shortened(printable(found.root_sentence), width - 7))
-    return Section(title, rows, 3, "steps")
+    return Section(title, rows, 4, "steps", least=2)
 
 
 def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
@@ -204,26 +205,26 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
 
 def _before(found: Divergence, width: int) -> list[Section]:
     """Return the last events before: of both runs, and of the node where that says more."""
-    sections = [_listed("before it", found.before_a, found.before_b, width, keep=2)]
+    sections = [_listed("before it", found.before_a, found.before_b, width, least=1)]
     seen = {event.index for event in (*found.before_a, *found.before_b)}
     own = (*found.same_node_a, *found.same_node_b)
     some = found.a or found.b
     if some is not None and any(event.index not in seen for event in own):
         title = f"before it in {printable(some.entity.node) or 'the run'}"
-        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, keep=1))
+        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, least=0))
     return sections
 
 
 def _listed(
-    title: str, a: tuple[EventView, ...], b: tuple[EventView, ...], width: int, keep: int
+    title: str, a: tuple[EventView, ...], b: tuple[EventView, ...], width: int, least: int
 ) -> Section:
     if not a and not b:
-        return Section((), [], 0, "")
+        return NOTHING
     alike = len(a) == len(b) and all(map(same_event, a, b))
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
         heading = line((f"{title} (the same in both)", TITLE))
-        return Section(heading, rows, keep, "events", newest_last=True)
+        return Section(heading, rows, 2, "events", least, newest_last=True)
     half = (width - 5) // 2
     longest = max(len(a), len(b))
     left = [None] * (longest - len(a)) + list(a)
@@ -234,7 +235,7 @@ def _listed(
         first = f"{_brief(one, half):<{half}}"
         rows.append(line("  ", first, (mark, BAD), f" {_brief(other, half)}".rstrip()))
     heading = line((f"{title} ", TITLE), ("(a left, b right)", FAINT))
-    return Section(heading, rows, keep, "events", newest_last=True)
+    return Section(heading, rows, 2, "events", least, newest_last=True)
 
 
 def _brief(event: EventView | None, width: int) -> str:
@@ -247,7 +248,7 @@ def _brief(event: EventView | None, width: int) -> str:
 
 def _reaches(found: Divergence, width: int) -> Section:
     if not found.reaches:
-        return Section((), [], 0, "")
+        return NOTHING
     parts = []
     for reach in found.reaches:
         when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "at once"
@@ -256,12 +257,12 @@ def _reaches(found: Divergence, width: int) -> Section:
     rows = (
         rows[:2] if len(rows) <= 2 else [*rows[:1], line("  ", (f"… {len(parts)} topics", FAINT))]
     )
-    return Section((), rows, 2, "topics")
+    return Section((), rows, 2, "topics", 2)
 
 
 def _afterwards(diff: Diff, width: int) -> Section:
     if not diff.counts:
-        return Section((), [], 0, "")
+        return NOTHING
     total = [
         sum(getattr(count, name) for count in diff.counts)
         for name in ("matching", "differing", "only_a", "only_b")
@@ -274,18 +275,19 @@ def _afterwards(diff: Diff, width: int) -> Section:
         a, b = diff.resync_index
         text += f"; they agree again from event {a} of a, {b} of b on"
     rows = wrapped(text, width, indent="  ")
+    least = len(rows)
     worst = sorted(diff.counts, key=lambda c: c.differing + c.only_a + c.only_b, reverse=True)
     for count in worst:
         parted = count.differing + count.only_a + count.only_b
         if parted:
             of = parted + count.matching
             rows.append(cut(line(f"  {parted} of {of}  {printable(str(count.entity))}"), width))
-    return Section((), rows, min(len(rows), 3), "entities")
+    return Section((), rows, least, "entities", least)
 
 
 def _settings(diff: Diff, width: int) -> Section:
     if not diff.settings:
-        return Section((), [], 0, "")
+        return NOTHING
     room = max((width - 40) // 2, 16)
     rows = in_columns(
         [
@@ -308,7 +310,7 @@ def _value(text: str | None, room: int) -> str:
 
 def _notes(diff: Diff, width: int) -> Section:
     rows = [row for note in diff.notes for row in wrapped(f"note: {printable(note)}", width)]
-    return Section((), rows, min(len(rows), 2), "notes")
+    return Section((), rows, min(len(rows), 2), "notes", min(len(rows), 2))
 
 
 def _next(found: Divergence, others: int, width: int) -> Section:
@@ -318,4 +320,4 @@ def _next(found: Divergence, others: int, width: int) -> Section:
         rows.append(line(f"{others} more independent {word}: --all shows them"))
     if found.next_step:
         rows.append(line(("next: ", TITLE), (printable(found.next_step), COMMAND)))
-    return Section((), rows, len(rows), "")
+    return Section((), rows, len(rows), "", len(rows))

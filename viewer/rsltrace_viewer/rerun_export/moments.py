@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_DETAILS, TOPIC_ROSOUT
 from rsltrace.trace.reader import Trace
@@ -97,14 +97,12 @@ class Moments:
         stamps = events["stamp"][owners - first].astype(np.int64)
         entities = outputs["entity"].astype(np.int64)
         kinds = outputs["kind"].astype(np.int64)
-        result: dict[str, list[tuple[npt.NDArray[np.int64], ...]]] = {}
         places: dict[str, list[npt.NDArray[np.int64]]] = {}
         keys = entities * 256 + kinds
         for key in np.unique(keys).tolist():
             topic = self._topic_of.get(divmod(key, 256))
             if topic is not None:
                 places.setdefault(topic, []).append(np.flatnonzero(keys == key))
-        del result
         found = {}
         for topic, parts in places.items():
             order = np.sort(np.concatenate(parts))
@@ -127,7 +125,7 @@ def _topic(entity: Entity, kind: OutputKind) -> str:
     if kind is OutputKind.LOG:
         return TOPIC_ROSOUT
     if kind is OutputKind.MESSAGE:
-        return entity.name if entity.kind is EntityKind.PUBLISHER else ""
+        return entity.name
     if kind is OutputKind.REQUEST:
         return PREFIX_REQUEST + entity.name
     if kind is OutputKind.RESPONSE:

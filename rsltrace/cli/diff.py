@@ -1,0 +1,222 @@
+"""``rsltrace diff``: where two runs part, and why."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
+from rsltrace.errors import EXIT_USAGE, RsltraceError
+
+if TYPE_CHECKING:
+    from rsltrace.diff.bag_model import BagDiff
+    from rsltrace.diff.model import Diff
+    from rsltrace.diff.report.line import Line
+
+_FORMATS = ("text", "json", "markdown", "junit", "github")
+_WIDTH = 100
+_ASCII = {ord("└"): "`-", ord("…"): "..."}
+
+
+class _Tolerance(click.ParamType[tuple[str, float]]):
+    """``FIELD=TOL``: a glob of fields and a number."""
+
+    name = "tolerance"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, float]:
+        """Return the glob and the tolerance, or end with a usage error."""
+        if isinstance(value, tuple):
+            return value
+        field, equals, text = str(value).rpartition("=")
+        try:
+            if not (equals and field):
+                raise ValueError
+            return field, float(text)
+        except ValueError:
+            self.fail(f"{value!r} is not FIELD=TOL, as in pose.*=1e-6", param, ctx)
+
+
+@click.command()
+@click.argument("golden", metavar="A")
+@click.argument("others", metavar="B...", nargs=-1, required=True)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(_FORMATS),
+    default="text",
+    show_default=True,
+    help="What to print: a report for people, or one for programs.",
+)
+@click.option(
+    "--context",
+    type=click.IntRange(min=0),
+    default=5,
+    show_default=True,
+    metavar="N",
+    help="Show N events (of recordings: messages) before the divergence.",
+)
+@click.option("--all", "everything", is_flag=True, help="Every independent divergence, in full.")
+@click.option("--node", "nodes", multiple=True, metavar="GLOB", help="Only events of such nodes.")
+@click.option(
+    "--topic", "topics", multiple=True, metavar="GLOB", help="Only such topics and services."
+)
+@click.option(
+    "--ignore",
+    multiple=True,
+    metavar="FIELD",
+    help="Do not compare such fields: header.stamp, *.covariance, /odom:twist.",
+)
+@click.option(
+    "--abs",
+    "absolute",
+    multiple=True,
+    type=_Tolerance(),
+    metavar="FIELD=TOL",
+    help="Tolerate |a-b| <= TOL in such fields (times: in seconds).",
+)
+@click.option(
+    "--rel",
+    "relative",
+    multiple=True,
+    type=_Tolerance(),
+    metavar="FIELD=TOL",
+    help="Tolerate |a-b| <= TOL * max(|a|, |b|) in such fields.",
+)
+@click.option(
+    "--by",
+    type=click.Choice((BY_ORDER, BY_STAMP)),
+    default=BY_ORDER,
+    show_default=True,
+    help="Match the messages of recordings by their order or by their log time.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Write the report to FILE, and only its first sentence here.",
+)
+def diff(
+    golden: str,
+    others: tuple[str, ...],
+    form: str,
+    context: int,
+    everything: bool,
+    nodes: tuple[str, ...],
+    topics: tuple[str, ...],
+    ignore: tuple[str, ...],
+    absolute: tuple[tuple[str, float], ...],
+    relative: tuple[tuple[str, float], ...],
+    by: str,
+    output: Path | None,
+) -> int:
+    """Find where A and B first part, and why.
+
+    A and B are traces (files or addresses: https://, s3://, ...), rosbag2 recordings (folders,
+    .mcap or .db3 files), or one of each. With more than two, A is the golden one that all others
+    are compared with, and the report is a table.
+
+    FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
+    topics and a colon. A tolerance never makes two traces identical.
+
+    The exit status is 0 if nothing differs (recordings: also within tolerance), 1 if the runs part,
+    2 for trouble.
+    """
+    options = DiffOptions(
+        context=context,
+        everything=everything,
+        nodes=nodes,
+        topics=topics,
+        ignore=ignore,
+        absolute=absolute,
+        relative=relative,
+        by=by,
+    )
+    done: list[Diff | BagDiff] = []
+    trouble = False
+    for other in others:
+        try:
+            done.append(_compare(golden, other, options))
+        except RsltraceError as error:
+            if len(others) == 1:
+                raise
+            # One bad file among many must not hide what the others say.
+            click.echo(f"rsltrace: error: {error}", err=True)
+            trouble = True
+    if done:
+        _print(done, form, options, output)
+    return EXIT_USAGE if trouble else max(one.exit_code for one in done)
+
+
+def _compare(a: str, b: str, options: DiffOptions) -> Diff | BagDiff:
+    from rsltrace.diff.kinds import is_recording
+
+    if is_recording(a) or is_recording(b):
+        if options.nodes:
+            raise click.UsageError("--node needs two traces; a recording does not know the nodes")
+        from rsltrace.diff.bags import diff_bags
+
+        return diff_bags(a, b, options)
+    if options.by != BY_ORDER:
+        raise click.UsageError("--by is for recordings; the events of two traces are aligned")
+    from rsltrace.diff.engine import diff_traces
+    from rsltrace.trace.reader import Trace
+
+    with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
+        return diff_traces(trace_a, trace_b, options)
+
+
+def _print(
+    diffs: Sequence[Diff | BagDiff], form: str, options: DiffOptions, output: Path | None
+) -> None:
+    from rsltrace.diff.report import render, report_lines
+
+    one_or_all = diffs[0] if len(diffs) == 1 else diffs
+    if output is not None:
+        output.write_text(render(one_or_all, form, options), encoding="utf-8")
+        click.echo(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
+    elif form != "text":
+        click.echo(render(one_or_all, form, options), nl=False)
+    elif sys.stdout.isatty():
+        _show(report_lines(one_or_all, options, width=_terminal_width()))
+    else:
+        click.echo(_encodable(render(one_or_all, "text", options)), nl=False)
+
+
+def _terminal_width() -> int:
+    return min(max(shutil.get_terminal_size((_WIDTH, 40)).columns, 60), 140)
+
+
+def _encodable(text: str) -> str:
+    """Return text with plain signs in place of those a terminal without Unicode cannot show."""
+    encoding = (sys.stdout.encoding or "").lower()
+    return text if encoding.startswith("utf") else text.translate(_ASCII)
+
+
+def _show(lines: list[Line]) -> None:
+    """Print on a terminal, in colour unless NO_COLOR or the terminal says otherwise."""
+    from rich.console import Console
+    from rich.text import Text
+
+    from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
+
+    styles = {
+        TITLE: "bold",
+        GOOD: "bold green",
+        BAD: "bold red",
+        SIDE_A: "cyan",
+        SIDE_B: "magenta",
+        FAINT: "dim",
+        COMMAND: "bold",
+    }
+    console = Console(highlight=False, soft_wrap=True)
+    for row in lines:
+        pieces = ((_encodable(text), styles.get(style, "")) for text, style in row)
+        console.print(Text.assemble(*pieces))

@@ -1,0 +1,225 @@
+"""Both runs from their first difference on, a stretch at a time, as one list of matched events.
+
+A stretch is a few thousand events of both runs, cut where both have reached the same time; beyond
+the cut some more are loaded, so that an event near the cut finds its counterpart behind it.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from rsltrace.diff.align import Pairs, align
+from rsltrace.diff.rows import SHUTDOWN, Rows, Run, load_rows
+
+NOTHING = -1
+
+
+@dataclass(slots=True)
+class Item:
+    """An event of one run with its counterpart in the other; indexes, or -1 where there is none.
+
+    ``same`` if both did the same at the same time; ``inverted`` if another event at that time
+    comes before it in one run and after it in the other. ``beyond`` if the other run had ended.
+    """
+
+    a: int
+    b: int
+    same: bool
+    inverted: bool = False
+    beyond: bool = False
+
+    @property
+    def plain(self) -> bool:
+        """Whether there is nothing to say about it."""
+        return self.same and not self.inverted
+
+
+@dataclass
+class Stretch:
+    """A part of both runs. ``items`` are in the order of events; ``end_a`` and ``end_b`` are the
+    indexes up to which the runs are aligned after it. ``rows`` reach a little further."""
+
+    rows_a: Rows
+    rows_b: Rows
+    items: list[Item]
+    end_a: int
+    end_b: int
+
+    @property
+    def at_end(self) -> bool:
+        """Whether both runs are over."""
+        return (
+            self.rows_a.at_end
+            and self.rows_b.at_end
+            and self.end_a == self.rows_a.end
+            and self.end_b == self.rows_b.end
+        )
+
+    def stamp(self, item: Item) -> int:
+        """Return when an item happened: in a, or in b if only that has it."""
+        if item.a >= 0:
+            return self.rows_a.stamp[item.a - self.rows_a.first]
+        return self.rows_b.stamp[item.b - self.rows_b.first]
+
+
+@dataclass
+class Stretches:
+    """Iterates over the stretches from index ``start`` on, which is the same event in both runs."""
+
+    run_a: Run
+    run_b: Run
+    start: int
+    events: int
+    partners: dict[int, int] = field(default_factory=dict)
+    """By index in b the index in a, of the present stretch and what reaches into the next one."""
+
+    def __iter__(self) -> Iterator[Stretch]:
+        first_a = first_b = self.start
+        taken_a: set[int] = set()
+        taken_b: set[int] = set()
+        while True:
+            stretch, pairs = self._next(first_a, first_b, taken_a, taken_b)
+            rows_a, rows_b = stretch.rows_a, stretch.rows_b
+            self.partners.update(
+                (rows_b.first + place, rows_a.first + partner)
+                for place, partner in enumerate(pairs.b)
+                if partner >= 0
+            )
+            yield stretch
+            if stretch.at_end:
+                return
+            first_a, first_b = stretch.end_a, stretch.end_b
+            taken_a = {i.a for i in stretch.items if i.a >= first_a}
+            taken_b = {i.b for i in stretch.items if i.b >= first_b}
+            # Causes are mostly recent; what is older than a stretch is forgotten.
+            self.partners = {b: a for b, a in self.partners.items() if b >= rows_b.first}
+
+    def _next(
+        self, first_a: int, first_b: int, taken_a: set[int], taken_b: set[int]
+    ) -> tuple[Stretch, Pairs]:
+        events, margin = self.events, max(256, self.events // 4)
+        while True:
+            rows_a = load_rows(self.run_a, first_a, first_a + events + margin)
+            rows_b = load_rows(self.run_b, first_b, first_b + events + margin)
+            end_a, end_b = _cuts(rows_a, rows_b, events)
+            if end_a > 0 or end_b > 0:
+                break
+            events *= 4  # everything at one time: look further, or there would be no progress
+        pairs = align(rows_a, rows_b, self.start, self.partners, taken_a, taken_b)
+        items = _items(rows_a, rows_b, pairs, end_a, end_b, taken_a, taken_b)
+        stretch = Stretch(rows_a, rows_b, items, first_a + end_a, first_b + end_b)
+        _mark_inversions(stretch)
+        if stretch.at_end or rows_a.at_end or rows_b.at_end:
+            _mark_beyond(stretch)
+        return stretch, pairs
+
+
+def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
+    """Return how many events of each belong to the stretch: all before some common time."""
+    limits = []
+    for rows in (a, b):
+        if not (rows.at_end and len(rows) <= events):
+            limits.append(rows.stamp[min(events, len(rows) - 1)])
+        if not rows.at_end:
+            limits.append(rows.stamp[-1])
+    if not limits:
+        return len(a), len(b)
+    limit = min(limits)
+    # Stamps never go back, except for the one jump from construction to the start.
+    return _before(a, limit), _before(b, limit)
+
+
+def _before(rows: Rows, limit: int) -> int:
+    return bisect_left(rows.stamp, limit)
+
+
+def _items(
+    a: Rows,
+    b: Rows,
+    pairs: Pairs,
+    end_a: int,
+    end_b: int,
+    taken_a: set[int],
+    taken_b: set[int],
+) -> list[Item]:
+    keyed: list[tuple[float, int, Item]] = []
+    last = -1
+    for place in range(end_b):
+        partner = pairs.b[place]
+        if 0 <= partner < end_a:
+            if partner > last and a.stamp[partner] == b.stamp[place]:
+                last = partner
+            elif b.stamp[place] < a.stamp[partner]:  # it came earlier in b: so it stands earlier
+                keyed.append((last + 0.5, place, _pair(a, b, partner, place)))
+                continue
+            keyed.append((partner, place, _pair(a, b, partner, place)))
+        elif b.first + place not in taken_b:
+            item = _pair(a, b, partner, place) if partner >= 0 else Item(-1, b.first + place, False)
+            keyed.append((last + 0.5, place, item))
+    for place in range(end_a):
+        partner = pairs.a[place]
+        if partner >= end_b:
+            keyed.append((place, partner, _pair(a, b, place, partner)))
+        elif partner < 0 and a.first + place not in taken_a:
+            keyed.append((place, -1, Item(a.first + place, -1, False)))
+    keyed.sort(key=lambda entry: entry[:2])
+    return [item for _, _, item in keyed]
+
+
+def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> Item:
+    same = (
+        a.stamp[place_a] == b.stamp[place_b]
+        and a.input[place_a] == b.input[place_b]
+        and a.content[place_a] == b.content[place_b]
+        and a.flags[place_a] == b.flags[place_b]
+        and a.state[place_a] == b.state[place_b]
+    )
+    return Item(a.first + place_a, b.first + place_b, same)
+
+
+def _mark_inversions(stretch: Stretch) -> None:
+    """Mark events that changed places with others at the same simulated time."""
+    a, b = stretch.rows_a, stretch.rows_b
+    moments: dict[int, list[Item]] = {}
+    for item in stretch.items:
+        if item.a >= 0 and item.b >= 0:
+            stamp = a.stamp[item.a - a.first]
+            if stamp == b.stamp[item.b - b.first]:
+                moments.setdefault(stamp, []).append(item)
+    for items in moments.values():
+        mark_inverted(items)
+
+
+def mark_inverted(items: list[Item]) -> None:
+    """Set ``inverted`` of pairs of one time that stand in another order in b than in a."""
+    items.sort(key=lambda item: item.a)
+    order = [item.b for item in items]
+    if all(early < late for early, late in zip(order, order[1:], strict=False)):
+        return
+    latest = -1
+    for item in items:
+        item.inverted = latest > item.b
+        latest = max(latest, item.b)
+    earliest = 1 << 62
+    for item in reversed(items):
+        item.inverted = item.inverted or earliest < item.b
+        earliest = min(earliest, item.b)
+
+
+def _mark_beyond(stretch: Stretch) -> None:
+    """Mark what one run did after the other had ended. Shutting nodes down is not doing."""
+    for rows, other, end, of_b in (
+        (stretch.rows_a, stretch.rows_b, stretch.end_b, False),
+        (stretch.rows_b, stretch.rows_a, stretch.end_a, True),
+    ):
+        if not other.at_end or end < other.end:
+            continue
+        for item in reversed(stretch.items):
+            theirs, mine = (item.a, item.b) if of_b else (item.b, item.a)
+            if theirs >= 0:
+                if other.kind[theirs - other.first] != SHUTDOWN:
+                    break
+            elif rows.kind[mine - rows.first] != SHUTDOWN:
+                item.beyond = True
