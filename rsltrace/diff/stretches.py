@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from rsltrace.diff.align import Pairs, align
-from rsltrace.diff.rows import SHUTDOWN, Rows, Run, load_rows
+from rsltrace.diff.rows import CONSTRUCT, SHUTDOWN, Rows, Run, load_rows
 
 NOTHING = -1
 
@@ -119,20 +119,23 @@ class Stretches:
 def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
     """Return how many events of each belong to the stretch: all before some common time."""
     limits = []
-    for rows in (a, b):
+    times_a, times_b = _times(a), _times(b)
+    for rows, times in ((a, times_a), (b, times_b)):
         if not (rows.at_end and len(rows) <= events):
-            limits.append(rows.stamp[min(events, len(rows) - 1)])
+            limits.append(times[min(events, len(rows) - 1)])
         if not rows.at_end:
-            limits.append(rows.stamp[-1])
+            limits.append(times[-1])
     if not limits:
         return len(a), len(b)
-    limit = min(limits)
-    # Stamps never go back, except for the one jump from construction to the start.
-    return _before(a, limit), _before(b, limit)
+    return bisect_left(times_a, min(limits)), bisect_left(times_b, min(limits))
 
 
-def _before(rows: Rows, limit: int) -> int:
-    return bisect_left(rows.stamp, limit)
+def _times(rows: Rows) -> list[int]:
+    """Return the stamps, with nodes constructed before all: from there the clock may jump back."""
+    return [
+        -1 if kind == CONSTRUCT else stamp
+        for kind, stamp in zip(rows.kind, rows.stamp, strict=True)
+    ]
 
 
 def _items(
@@ -144,28 +147,31 @@ def _items(
     taken_a: set[int],
     taken_b: set[int],
 ) -> list[Item]:
-    keyed: list[tuple[float, int, Item]] = []
+    times_a, times_b = _times(a), _times(b)
+    keyed: list[tuple[int, float, int, Item]] = []
     last = -1
     for place in range(end_b):
-        partner = pairs.b[place]
-        if 0 <= partner < end_a:
-            if partner > last and a.stamp[partner] == b.stamp[place]:
-                last = partner
-            elif b.stamp[place] < a.stamp[partner]:  # it came earlier in b: so it stands earlier
-                keyed.append((last + 0.5, place, _pair(a, b, partner, place)))
+        partner, time = pairs.b[place], times_b[place]
+        if partner >= 0:
+            item = _pair(a, b, partner, place)
+            if times_a[partner] <= time:  # it stands where it is in a, like whatever is only in a
+                keyed.append((times_a[partner], partner, place, item))
+                last = max(last, partner)
                 continue
-            keyed.append((partner, place, _pair(a, b, partner, place)))
-        elif b.first + place not in taken_b:
-            item = _pair(a, b, partner, place) if partner >= 0 else Item(-1, b.first + place, False)
-            keyed.append((last + 0.5, place, item))
+        elif b.first + place in taken_b:
+            continue
+        else:
+            item = Item(NOTHING, b.first + place, False)
+        keyed.append((time, last + 0.5, place, item))
     for place in range(end_a):
         partner = pairs.a[place]
         if partner >= end_b:
-            keyed.append((place, partner, _pair(a, b, place, partner)))
+            time = min(times_a[place], times_b[partner])
+            keyed.append((time, place, partner, _pair(a, b, place, partner)))
         elif partner < 0 and a.first + place not in taken_a:
-            keyed.append((place, -1, Item(a.first + place, -1, False)))
-    keyed.sort(key=lambda entry: entry[:2])
-    return [item for _, _, item in keyed]
+            keyed.append((times_a[place], place, NOTHING, Item(a.first + place, NOTHING, False)))
+    keyed.sort(key=lambda entry: entry[:3])
+    return [item for _, _, _, item in keyed]
 
 
 def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> Item:

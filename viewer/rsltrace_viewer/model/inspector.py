@@ -30,7 +30,8 @@ from rsltrace_viewer.model.tree import bytes_lines, message_lines, preview
 
 _OUTPUTS_OPEN = 3
 """More outputs than this are listed closed: a constructor has dozens."""
-_MESSAGE_OPEN_BYTES = 4096
+_EFFECTS_SHOWN = 12
+"""Longer lists are in the choice that ``e`` offers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +53,12 @@ def inspect(
         outputs = run.outputs(index)
     except TraceError as error:
         return [Line(0, "", printable(str(error)), Role.ERROR, "error")]
-    lines = [*_title_lines(run, event)]
+    lines = [*_title_lines(run, event), *_cause_lines(run, event, effects)]
     for make in (_input_lines, _output_lines):
         try:
             lines += make(run, event, outputs, openness)
         except TraceError as error:
             lines.append(Line(0, "", printable(str(error)), Role.ERROR, f"error.{make.__name__}"))
-    lines += _cause_lines(run, event, effects)
     lines += _parameter_lines(run, event, openness)
     lines += _detail_lines(run, event, openness)
     return lines
@@ -187,9 +187,6 @@ def _cause_lines(run: Run, event: Event, effects: Effects | None) -> Iterator[Li
     if len(effects.found) > _EFFECTS_SHOWN:
         more = f"… and {len(effects.found) - _EFFECTS_SHOWN} more"
         yield Line(1, "", more, Role.NOTE, "effects.more")
-
-
-_EFFECTS_SHOWN = 50
 
 
 def event_link(run: Run, index: int, path: str, since_ns: int | None = None) -> Line:

@@ -100,6 +100,8 @@ class LaneMaker:
         self._counts = np.zeros((count, rows, self._pieces), dtype=np.uint16)
         self._raised = np.zeros((count, rows), dtype=np.bool_)
         self._known = np.zeros(count, dtype=np.bool_)
+        self.summaries = 0
+        """How many segments have their summary: lanes of the same window may differ by it."""
 
     @property
     def whole(self) -> Window:
@@ -132,7 +134,7 @@ class LaneMaker:
         try:
             segment = self._run.segment(number)
         except TraceError:
-            self._known[number] = True
+            self._done(number)
             return
         row = self._run.segments[number]
         start, end = int(row["start_stamp"]), int(row["end_stamp"])
@@ -140,7 +142,11 @@ class LaneMaker:
         counts, raised = self._bin(segment, window, self._pieces)
         self._counts[number] = np.minimum(counts, 65535)
         self._raised[number] = raised.any(axis=1)
+        self._done(number)
+
+    def _done(self, number: int) -> None:
         self._known[number] = True
+        self.summaries += 1
 
     def make(self, window: Window, columns: int, selected: int = -1) -> Lanes:
         """Return the lanes of a window in ``columns`` cells."""
@@ -267,13 +273,13 @@ class LaneMaker:
         known: float,
     ) -> Lanes:
         lanes = []
+        most = max(int(counts.max(initial=0)), 1)
         for row, label in enumerate(self.labels):
             own = counts[row]
-            most = int(own.max(initial=0))
-            if label == RUN_LABEL and not most:
+            if label == RUN_LABEL and not own.any():
                 continue
-            # At least one eighth for anything at all: a single event must be seen.
-            levels = -(-own * LEVELS // most) if most else own
+            # Roots, rounded up: a busy node must not flatten the others, a single event is seen.
+            levels = np.ceil(np.sqrt(own / most) * LEVELS).astype(np.int64)
             lanes.append(
                 Lane(label, tuple(levels.tolist()), frozenset(np.flatnonzero(raised[row]).tolist()))
             )

@@ -6,7 +6,7 @@ numbers; those that must read messages are given a mask of the events still in q
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -21,6 +21,11 @@ from rsltrace_viewer.model.text import log_of, output_text
 
 Mask = npt.NDArray[np.bool_]
 Ids = npt.NDArray[np.uint32]
+
+
+def ids(found: Iterable[int]) -> Ids:
+    """Return entity ids as ``OfEntities`` wants them."""
+    return np.array(sorted(found), dtype=np.uint32)
 
 
 class Condition(Protocol):

@@ -192,10 +192,6 @@ def _named(pattern: str, name: str) -> bool:
     return pattern.casefold() in name.casefold()
 
 
-def _ids(found: set[int]) -> match.Ids:
-    return np.array(sorted(found), dtype=np.uint32)
-
-
 def _read_node(run: Run, token: _Token) -> Condition:
     owners = set()
     for part in _values(token):
@@ -204,7 +200,7 @@ def _read_node(run: Run, token: _Token) -> Condition:
             names = ", ".join(node.name for node in run.nodes[:8])
             raise QueryError(f"no node matches; there are {names}", part.start, part.end)
         owners |= matching
-    ids = _ids({e.id for e in run.entities.values() if e.node in owners})
+    ids = match.ids({e.id for e in run.entities.values() if e.node in owners})
     made = frozenset((OutputKind.ENTITY,))
     constructors = match.WithOutput(made, lambda run, o: run.entities[o.entity].node in owners)
     kinds = np.array([EventKind.CONSTRUCT], dtype=np.uint8)
@@ -223,7 +219,7 @@ def _read_entity(run: Run, token: _Token) -> Condition:
         if not matching:
             raise QueryError("no entity has such a name or number", part.start, part.end)
         found |= matching
-    return match.OfEntities(_ids(found))
+    return match.OfEntities(match.ids(found))
 
 
 def _read_topic(run: Run, token: _Token) -> Condition:
@@ -240,7 +236,7 @@ def _read_topic(run: Run, token: _Token) -> Condition:
                 f"no topic or service matches; there are {names}", part.start, part.end
             )
         found |= matching
-    return match.OfEntities(_ids(found), outputs=True)
+    return match.OfEntities(match.ids(found), outputs=True)
 
 
 def _read_type(run: Run, token: _Token) -> Condition:
@@ -250,7 +246,7 @@ def _read_type(run: Run, token: _Token) -> Condition:
     }
     if not found:
         raise QueryError("no interface of the trace matches", token.start, token.end)
-    return match.OfEntities(_ids(found), outputs=True)
+    return match.OfEntities(match.ids(found), outputs=True)
 
 
 def _choose(token: _Token, choices: dict[str, int], what: str) -> list[int]:
@@ -380,7 +376,7 @@ def _bare_word(run: Run, word: str) -> Condition:
         for e in run.entities.values()
         if _named(word, e.name) or _named(word, run.node_name(e.id))
     }
-    return match.Any((match.OfEntities(_ids(named), outputs=True), match.says(word)))
+    return match.Any((match.OfEntities(match.ids(named), outputs=True), match.says(word)))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from rsltrace.errors import TraceError
 from rsltrace_viewer.model.match import Condition, mask_of
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.view import View
 
 
 class Rows(Protocol):
@@ -21,11 +22,11 @@ class Rows(Protocol):
         ...
 
     def at(self, row: int) -> int:
-        """Return what row ``row`` stands for (must exist): the index of an event."""
+        """Return the place that row ``row`` (must exist) stands for."""
         ...
 
-    def near(self, index: int) -> int:
-        """Return the row of event ``index``, or of the next one shown; the last if none is."""
+    def near(self, place: int) -> int:
+        """Return the row of ``place``, or of the next one shown; the last if none is."""
         ...
 
 
@@ -39,9 +40,9 @@ class AllRows:
         """Return ``row``."""
         return row
 
-    def near(self, index: int) -> int:
-        """Return ``index``, or the last row."""
-        return max(min(index, self.count - 1), 0)
+    def near(self, place: int) -> int:
+        """Return ``place``, or the last row."""
+        return max(min(place, self.count - 1), 0)
 
 
 class FilteredRows:
@@ -50,9 +51,10 @@ class FilteredRows:
     One bit per event is kept, so a filter of ten million events takes little over a megabyte.
     """
 
-    def __init__(self, run: Run, condition: Condition) -> None:
+    def __init__(self, run: Run, condition: Condition, view: View) -> None:
         self._run = run
         self._condition = condition
+        self._view = view
         self._bits: list[npt.NDArray[np.uint8] | None] = []
         self._ends: list[int] = []
 
@@ -87,15 +89,19 @@ class FilteredRows:
         self._bits.append(bits)
 
     def at(self, row: int) -> int:
-        """Return the index of the event in a row."""
+        """Return the place of a row."""
         ends = np.asarray(self._ends)
         number = int(np.searchsorted(ends, row, side="right"))
         before = self._ends[number - 1] if number else 0
-        return int(self._indexes(number)[row - before])
+        return self._view.place_of(int(self._indexes(number)[row - before]))
 
-    def near(self, index: int) -> int:
-        """Return the row of an event or of the next one shown."""
-        if not self._ends:
+    def near(self, place: int) -> int:
+        """Return the row of a place or of the next one shown."""
+        index = self._view.a(place) if self._ends else None
+        while index is None and place and self._ends:
+            place -= 1
+            index = self._view.a(place)
+        if index is None:
             return 0
         number = min(self._run.segment_of(index), len(self._bits) - 1)
         before = self._ends[number - 1] if number else 0

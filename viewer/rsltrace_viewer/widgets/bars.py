@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from textual import events
 from textual.content import Content
 from textual.widgets import Static
 
@@ -32,20 +33,31 @@ class FooterBar(Static):
     FooterBar { height: 1; background: $panel; color: $text; padding: 0 1; }
     """
 
+    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+        super().__init__(id=id)
+        self._places: list[tuple[int, str]] = []
+
     def show(self, *, two: bool, searching: str, status: str) -> None:
         """Show the keys, and a status at the right."""
-        room = self.size.width - 2 - (cells(status) + 2 if status else 0)
-        parts: list[Content] = []
+        width = self.size.width - 2
+        room = width - (cells(status) + 2 if status else 0)
+        parts: list[Content | tuple[str, str] | str] = []
+        self._places = []
+        used = 0
         for shown, words, action in footer_keys(two=two, searching=searching):
             length = cells(shown) + cells(words) + 3
-            if length > room:
+            if used + length > room:
                 continue
-            room -= length
-            key = Content.styled(shown, "bold $text-accent")
-            item = Content.assemble(key, " ", words, "  ")
-            parts.append(item.stylize(f"@click=app.{action}") if "'" not in action else item)
-        text = Content.assemble(*parts)
+            used += length
+            parts += [(shown, "bold $text-accent"), f" {words}  "]
+            self._places.append((used, action))
         if status:
-            fill = max(self.size.width - 2 - text.cell_length - cells(status), 1)
-            text = Content.assemble(text, " " * fill, (status, "$text-warning"))
-        self.update(text, layout=False)
+            parts += [" " * max(width - used - cells(status), 1), (status, "bold $text-warning")]
+        self.update(Content.assemble(*parts), layout=False)
+
+    async def on_click(self, event: events.Click) -> None:
+        """Do what the key does that was clicked."""
+        for end, action in self._places:
+            if event.x - 1 < end:
+                await self.app.run_action(f"app.{action}")
+                return

@@ -64,10 +64,10 @@ class LanesView(Widget, can_focus=True):
         """How many columns there are for events."""
         return max(self.size.width - self._label_width - 2, 1)
 
-    def fit_labels(self, labels: list[str]) -> None:
-        """Make room for the names of the lanes."""
+    def fit_labels(self, labels: list[str], width: int) -> None:
+        """Make room for the names of the lanes in ``width`` cells."""
         longest = max((cells(printable(label)) for label in labels), default=4)
-        self._label_width = max(4, min(longest, _LABEL_MAX, self.size.width // 5 or 4))
+        self._label_width = max(4, min(longest, _LABEL_MAX, width // 6))
 
     def show(
         self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None

@@ -1,0 +1,99 @@
+"""What differs outside of the events: the job, the environment, the entities of the graph.
+
+None of it is a divergence by itself, and any of it may be why there is one.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator
+from typing import Any
+
+from rsltrace.diff.identity import Identity
+from rsltrace.diff.model import Setting
+from rsltrace.trace.reader import Trace
+
+_ENTITIES_MAX = 50
+_LINES_MAX = 20_000
+"""Longer job files are compared as a whole: difflib takes time with the square of the lines."""
+
+
+def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
+    """Return the lines of the job files that differ, and what differs in the jobs as resolved."""
+    found = list(_job_lines(a, b))
+    resolved_a, resolved_b = _resolved(a), _resolved(b)
+    # A job file says what was written, the resolved job what was meant: an override on the command
+    # line (--seed) is only there. What the lines show already is not said twice.
+    shown = " ".join(f"{setting.a} {setting.b}" for setting in found)
+    for path, value_a, value_b in _differences("", resolved_a, resolved_b):
+        key = path.rpartition(".")[2].partition("[")[0]
+        if key not in shown:
+            found.append(Setting(f"job: {path}", value_a, value_b))
+    return tuple(found)
+
+
+def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
+    """Return the versions that differ, by name."""
+    names = sorted({*a.environment, *b.environment})
+    pairs = ((name, a.environment.get(name), b.environment.get(name)) for name in names)
+    return tuple(Setting(f"environment: {name}", x, y) for name, x, y in pairs if x != y)
+
+
+def entity_settings(identity: Identity) -> tuple[Setting, ...]:
+    """Return the entities that only one run has; of many, the first ones and how many more."""
+    found = [Setting("entity", str(identity.keys[n]), None) for n in identity.only_a]
+    found += [Setting("entity", None, str(identity.keys[n])) for n in identity.only_b]
+    if len(found) > _ENTITIES_MAX:
+        more = found[_ENTITIES_MAX:]
+        only_a = sum(setting.b is None for setting in more)
+        rest = (f"{n} more" if n else None for n in (only_a, len(more) - only_a))
+        found[_ENTITIES_MAX:] = [Setting("entity", *rest)]
+    return tuple(found)
+
+
+def _job_lines(a: Trace, b: Trace) -> Iterator[Setting]:
+    if a.job_text == b.job_text:
+        return
+    name = a.job.get("name") or b.job.get("name") or "job.yaml"
+    lines_a, lines_b = a.job_text.splitlines(), b.job_text.splitlines()
+    if max(len(lines_a), len(lines_b)) > _LINES_MAX:
+        yield Setting(name, f"{len(lines_a)} lines", f"{len(lines_b)} lines")
+        return
+    matcher = difflib.SequenceMatcher(None, lines_a, lines_b, autojunk=False)
+    for tag, begin_a, end_a, begin_b, end_b in matcher.get_opcodes():
+        if tag == "equal":
+            continue
+        for nth in range(max(end_a - begin_a, end_b - begin_b)):
+            line_a = lines_a[begin_a + nth] if begin_a + nth < end_a else None
+            line_b = lines_b[begin_b + nth] if begin_b + nth < end_b else None
+            if (line_a or "").strip() or (line_b or "").strip():
+                number = begin_a + nth if line_a is not None else begin_b + nth
+                yield Setting(f"{name}:{number + 1}", line_a, line_b)
+
+
+def _resolved(trace: Trace) -> Any:
+    try:
+        return json.loads(trace.job.get("resolved") or "{}")
+    except ValueError:  # of a later version, or damaged: the job file itself was compared
+        return {}
+
+
+def _differences(path: str, a: Any, b: Any) -> Iterator[tuple[str, str | None, str | None]]:
+    """Yield (path, value in a, value in b) for the leaves that differ."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in sorted({*a, *b}):
+            inner = f"{path}.{key}" if path else str(key)
+            if key not in a or key not in b:
+                yield inner, _text(a, key), _text(b, key)
+            else:
+                yield from _differences(inner, a[key], b[key])
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        for position, (x, y) in enumerate(zip(a, b, strict=True)):
+            yield from _differences(f"{path}[{position}]", x, y)
+    elif a != b or type(a) is not type(b):
+        yield path, json.dumps(a, ensure_ascii=False), json.dumps(b, ensure_ascii=False)
+
+
+def _text(mapping: dict[str, Any], key: str) -> str | None:
+    return json.dumps(mapping[key], ensure_ascii=False) if key in mapping else None

@@ -1,0 +1,7 @@
+"""From a Job to a trace and a result: where the layers below are put together."""
+
+from rsltrace.run.process import Observer
+from rsltrace.run.provenance import environment
+from rsltrace.run.recording import RunResult, record, run
+
+__all__ = ["Observer", "RunResult", "environment", "record", "run"]

@@ -1,0 +1,77 @@
+"""What a run asks of the process: module search, garbage collection, news for whoever watches."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.job import Job
+from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.stop import Stop
+
+_GC_EVERY_EVENTS = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class Observer:
+    """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
+    about every thousand time steps; ``interrupt`` gets a function that ends the run properly."""
+
+    progress: Callable[[int, int | None, int], None] | None = None
+    interrupt: Callable[[Callable[[Stop], None]], None] | None = None
+
+
+def housekeeping(
+    loop: Callable[[], EventLoop], observer: Observer, end_ns: int | None
+) -> Callable[[], None]:
+    """Return what is done between time steps: progress, and collecting garbage.
+
+    Python's collector would otherwise run finalizers in the middle of some callback; here they run
+    between steps, after the same events in every run.
+    """
+    collect_at = _GC_EVERY_EVENTS
+    steps = 0
+
+    def between_steps() -> None:
+        nonlocal collect_at, steps
+        steps += 1
+        events = loop().events
+        if events >= collect_at:
+            collect_at = events + _GC_EVERY_EVENTS
+            gc.collect(1)
+        if steps % 1000 == 0 and observer.progress is not None:
+            observer.progress(loop().now_ns, end_ns, events)
+
+    return between_steps
+
+
+@contextmanager
+def quiet_gc() -> Iterator[None]:
+    """Keep Python's own garbage collector off."""
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()
+
+
+@contextmanager
+def search_path(job: Job) -> Iterator[None]:
+    """Let user modules be imported from the job's search path, and forget them afterwards."""
+    folders = [str(job.resolve(folder)) for folder in job.search_path]
+    old_path, old_modules = list(sys.path), set(sys.modules)
+    sys.path[:0] = folders
+    try:
+        yield
+    finally:
+        sys.path[:] = old_path
+        for name in set(sys.modules) - old_modules:
+            file = getattr(sys.modules[name], "__file__", None)
+            if file and any(Path(file).is_relative_to(folder) for folder in folders):
+                del sys.modules[name]

@@ -1,0 +1,59 @@
+"""What a trace says of its own origin: the job, the environment, which payloads it keeps."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import platform
+from collections.abc import Callable
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+from rsltrace._version import __version__
+from rsltrace.job import Job
+from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
+from rsltrace.trace.writer import TraceWriter
+
+_PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
+
+
+def payload_filter(job: Job) -> Callable[[str], bool]:
+    """Return the function that says whether a topic's payloads are kept."""
+    spec = job.record
+
+    def keep(topic: str) -> bool:
+        name = topic
+        for prefix in (PREFIX_REQUEST, PREFIX_RESPONSE):
+            name = name.removeprefix(prefix)
+        return (
+            spec.payloads
+            and any(fnmatchcase(name, glob) for glob in spec.topics)
+            and not any(fnmatchcase(name, glob) for glob in spec.exclude)
+        )
+
+    return keep
+
+
+def write_job(writer: TraceWriter, job: Job) -> None:
+    """Put the job into the trace: its text, and what it means with every default filled in."""
+    resolved = json.dumps(job.resolved(), sort_keys=True, ensure_ascii=False)
+    name = Path(job.source_name).name
+    writer.add_metadata(METADATA_JOB, {"name": name, "resolved": resolved})
+    writer.add_attachment(ATTACHMENT_JOB, "application/yaml", job.source_text.encode())
+
+
+def environment() -> dict[str, str]:
+    """Return what a run's result may depend on: versions, never dates, names or paths."""
+    values = {
+        "rsltrace": __version__,
+        "python": platform.python_version(),
+        "implementation": platform.python_implementation(),
+        "machine": platform.machine(),
+        "system": platform.system(),
+    }
+    for package in _PACKAGES:
+        try:
+            values[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return values

@@ -1,0 +1,57 @@
+"""From a job's ``stop:`` to the conditions that the loop asks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rsltrace.job import Job, locate
+from rsltrace.loop.stop import (
+    StopCondition,
+    stop_after_events,
+    stop_at,
+    stop_when,
+    stop_when_quiet,
+)
+from rsltrace.model.stamp import format_seconds
+
+
+def end_ns_of(job: Job, start_ns: int) -> int | None:
+    """Return the latest simulated time the run can reach, or None if time does not end it."""
+    ends = []
+    if job.stop.duration_ns is not None:
+        ends.append(start_ns + job.stop.duration_ns)
+    if job.stop.time_ns is not None:
+        ends.append(job.stop.time_ns)
+    return min(ends, default=None)
+
+
+def stop_conditions(job: Job, start_ns: int) -> Iterator[StopCondition]:
+    """Yield the conditions of a job. Raises JobError if its stop function cannot be imported."""
+    stop = job.stop
+    if stop.duration_ns is not None:
+        reason = f"duration of {format_seconds(stop.duration_ns)} s"
+        yield stop_at(start_ns + stop.duration_ns, reason)
+    if stop.time_ns is not None:
+        yield stop_at(stop.time_ns, f"time {format_seconds(stop.time_ns)} s")
+    if stop.events is not None:
+        yield stop_after_events(stop.events)
+    if stop.quiescence_ns is not None:
+        yield stop_when_quiet(
+            stop.quiescence_ns, f"quiet for {format_seconds(stop.quiescence_ns)} s"
+        )
+    if stop.function is not None:
+        function: Any = stop.function
+        name = str(function)
+        if isinstance(function, str):
+            from rsltrace.ros.world import load_target
+
+            function = load_target(function, where=locate(job, ("stop", "function")))
+        else:
+            name = f"{function.__module__}:{function.__qualname__}"
+        yield stop_when(function, name)
+
+
+def has_stop(job: Job) -> bool:
+    """Return whether the job says itself when it ends; otherwise its bags do."""
+    return job.stop.topic is not None or any(True for _ in stop_conditions(job, 0))

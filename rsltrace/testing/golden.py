@@ -1,0 +1,118 @@
+"""Golden traces: a run is right if it does what the run did that was checked in."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
+
+from rsltrace.errors import RsltraceError, TraceError
+
+if TYPE_CHECKING:
+    from rsltrace.diff.options import DiffOptions
+    from rsltrace.job import Job
+    from rsltrace.run import RunResult
+
+UPDATE_HINT = "pytest --rsltrace-update accepts what it does now"
+
+
+class GoldenMismatch(AssertionError):
+    """A run does not do what its golden trace did; the message is the report of the diff."""
+
+
+def run_job(
+    job: Job | str | os.PathLike[str], tmp_path: str | os.PathLike[str], *, name: str = "run.mcap"
+) -> RunResult:
+    """Run a job (a ``Job``, or the path of a job file) and record it to ``tmp_path/name``.
+
+    An existing trace of that name is overwritten. Raises what ``rsltrace.record`` raises: a
+    RunError if the run itself went wrong, with the trace complete up to there.
+    """
+    from rsltrace.job import load_job
+    from rsltrace.run import record
+
+    loaded = load_job(Path(job)) if isinstance(job, (str, os.PathLike)) else job
+    return record(loaded, Path(tmp_path, name), force=True)
+
+
+def assert_matches_golden(
+    job_or_result: Job | RunResult | str | os.PathLike[str],
+    golden: str | os.PathLike[str],
+    *,
+    update: bool = False,
+    options: DiffOptions | None = None,
+) -> bool:
+    """Assert that a run does the same as the golden trace.
+
+    ``job_or_result`` is a job (or its file, which is then run), the result of ``run_job``, or the
+    path of a trace (``.mcap``). With ``update``, the golden trace is written instead wherever it
+    is missing or another one. ``options`` shape the report; no tolerance makes a run match.
+    Returns whether the golden trace was written.
+
+    :raises GoldenMismatch: they part; the message is the report.
+    :raises RsltraceError: there is nothing to compare: the run failed or a file is unreadable.
+    """
+    __tracebackhide__ = True
+    target = Path(golden)
+    path = _trace_of(job_or_result)
+    if path is None:
+        with TemporaryDirectory(prefix="rsltrace-golden-") as folder:
+            result = run_job(job_or_result, folder)  # type: ignore[arg-type]
+            return assert_matches_golden(result, golden, update=update, options=options)
+    if update:
+        return _write(path, target)
+    if not target.exists():
+        raise TraceError(f"there is no golden trace {target}: {UPDATE_HINT}")
+    report = _report(target, path, options)
+    if report is not None:
+        raise GoldenMismatch(f"{report}\n{UPDATE_HINT}")
+    return False
+
+
+def _trace_of(given: Job | RunResult | str | os.PathLike[str]) -> Path | None:
+    """Return the trace that is given, or None for a job."""
+    if isinstance(given, (str, os.PathLike)):
+        path = Path(given)
+        return None if path.suffix in (".yaml", ".yml") else path
+    from rsltrace.run import RunResult
+
+    if not isinstance(given, RunResult):
+        return None
+    if given.path is None:
+        raise TraceError("the run was not recorded, so there is nothing to compare: use run_job")
+    return given.path
+
+
+def _report(golden: Path, run: Path, options: DiffOptions | None) -> str | None:
+    """Return what differs, or None if nothing does."""
+    from rsltrace.diff.engine import diff_traces
+    from rsltrace.diff.options import DiffOptions
+    from rsltrace.diff.report import render
+    from rsltrace.trace.reader import Trace
+
+    options = options or DiffOptions()
+    with Trace.open(golden) as expected, Trace.open(run) as actual:
+        diff = diff_traces(expected, actual, options)
+    return None if diff.identical else render(diff, "text", options)
+
+
+def _write(run: Path, golden: Path) -> bool:
+    """Make the run the golden trace, unless it is the same already: then no file changes."""
+    from rsltrace.trace.reader import Trace
+
+    with Trace.open(run) as actual:
+        digest = actual.digest
+    try:
+        with Trace.open(golden) as expected:
+            if expected.complete and expected.digest == digest:
+                return False
+    except RsltraceError:
+        pass  # missing, damaged or of an older format: what the update is for
+    golden.parent.mkdir(parents=True, exist_ok=True)
+    # Beside the target first: an interrupted copy must not leave half a golden trace.
+    part = golden.with_name(golden.name + ".part")
+    shutil.copyfile(run, part)
+    part.replace(golden)
+    return True

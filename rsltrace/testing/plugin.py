@@ -1,0 +1,111 @@
+"""The pytest plugin: the fixture ``rsltrace_golden`` and the option ``--rsltrace-update``.
+
+Loaded in every pytest run of every environment with rsltrace in it, so it imports nothing heavy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    import os
+
+    from rsltrace.diff.options import DiffOptions
+    from rsltrace.job import Job
+    from rsltrace.run import RunResult
+
+_PROPERTY = "rsltrace_golden_written"
+_NOT_IN_NAME = re.compile(r"[^A-Za-z0-9_.-]+")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add ``--rsltrace-update``."""
+    parser.getgroup("rsltrace").addoption(
+        "--rsltrace-update",
+        action="store_true",
+        help="write the golden traces of rsltrace anew instead of comparing with them",
+    )
+
+
+class Golden:
+    """What the fixture ``rsltrace_golden`` gives: call it with a job or a result.
+
+    ``path`` defaults to ``golden/<name of the test>.mcap``; relative paths are relative to the
+    test's file. A job is recorded to the test's ``tmp_path``, where the trace stays for a look.
+    """
+
+    def __init__(self, request: pytest.FixtureRequest, tmp_path: Path) -> None:
+        self._node: Any = request.node
+        self._update = bool(request.config.getoption("--rsltrace-update"))
+        self._tmp_path = tmp_path
+        self._calls = 0
+
+    def __call__(
+        self,
+        job_or_result: Job | RunResult | str | os.PathLike[str],
+        path: str | os.PathLike[str] | None = None,
+        *,
+        options: DiffOptions | None = None,
+    ) -> RunResult | None:
+        """Assert that it does what the golden trace did; return the result if a job was run."""
+        __tracebackhide__ = True
+        from rsltrace.errors import TraceError
+        from rsltrace.testing.golden import assert_matches_golden, run_job
+
+        self._calls += 1
+        folder = Path(self._node.path).parent
+        golden = folder / (self._default() if path is None else Path(path))
+        result: RunResult | None = None
+        given: Any = job_or_result
+        if isinstance(given, str):
+            given = Path(given)
+        if isinstance(given, Path):
+            given = folder / given
+            is_job = given.suffix in (".yaml", ".yml")
+        else:
+            is_job = not hasattr(given, "digest")
+        if is_job:
+            given = result = run_job(given, self._tmp_path, name=f"run{self._number()}.mcap")
+        try:
+            written = assert_matches_golden(given, golden, update=self._update, options=options)
+        except TraceError as error:
+            pytest.fail(str(error), pytrace=False)
+        if written:
+            self._node.user_properties.append((_PROPERTY, str(golden)))
+        return result
+
+    def _default(self) -> Path:
+        name = _NOT_IN_NAME.sub("_", self._node.name).strip("_")
+        return Path("golden", f"{name}{self._number()}.mcap")
+
+    def _number(self) -> str:
+        """Return what tells the second and later calls of one test apart."""
+        return "" if self._calls == 1 else f"_{self._calls}"
+
+
+@pytest.fixture
+def rsltrace_golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
+    """Compare runs with golden traces: ``rsltrace_golden("job.yaml")``; see ``Golden``."""
+    return Golden(request, tmp_path)
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Say which golden traces were written, so that nobody commits one unseen."""
+    written = sorted(set(_written(terminalreporter)))
+    if written:
+        terminalreporter.section("golden traces written by --rsltrace-update")
+        for path in written:
+            terminalreporter.line(path)
+
+
+def _written(terminalreporter: Any) -> Iterator[str]:
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            for name, value in getattr(report, "user_properties", ()):
+                if name == _PROPERTY:
+                    yield str(value)

@@ -1,0 +1,108 @@
+"""What nodes said: log records with their levels, and the tracebacks of exceptions.
+
+Rerun's loader reads ``/rosout``; which node a record is from, the trace knows better than a name
+in the record, since the sender is an entity.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk, McapReader
+
+from rsltrace.errors import TraceError
+from rsltrace.model.event import OutputKind
+from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.segments import output_of
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_chunk
+from rsltrace_viewer.rerun_export.moments import Moments
+from rsltrace_viewer.rerun_export.paths import NO_NODE, Paths
+
+_COLUMNS = ("TextLog:text", "TextLog:level")
+
+
+class LogRows:
+    """Makes chunks of the log records and exceptions of one trace. ``count`` is how many."""
+
+    def __init__(self, trace: Trace, paths: Paths, clock: Clock) -> None:
+        self.count = 0
+        self._trace = trace
+        self._paths = paths
+        self._clock = clock
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield all chunks. Raises TraceError where the trace is damaged."""
+        if any(channel.topic == TOPIC_ROSOUT for channel in self._trace.channels.values()):
+            yield from self._records()
+        yield from self._exceptions()
+
+    def _records(self) -> Iterator[Chunk]:
+        moments = Moments(self._trace)
+        try:
+            reader = McapReader(
+                self._trace.name,
+                timeline_type=self._clock.timeline_type,  # type: ignore[arg-type]
+                decoders=("ros2msg",),
+                include_topic_regex=[f"^{re.escape(TOPIC_ROSOUT)}$"],
+                recover=not self._trace.complete,
+            )
+            for chunk in reader.stream():
+                batch = chunk.to_record_batch()
+                if set(_COLUMNS) <= set(batch.schema.names):
+                    yield from self._split(batch, moments)
+        except (RuntimeError, ValueError, OSError) as error:
+            raise TraceError(
+                f"{self._trace.name}: Rerun cannot read its log records ({error})"
+            ) from error
+
+    def _split(self, batch: pa.RecordBatch, moments: Moments) -> Iterator[Chunk]:
+        """Yield one chunk per node."""
+        stamps = batch.column("message_log_time").cast(pa.int64()).to_numpy()
+        events, senders = moments.of_messages(TOPIC_ROSOUT, TOPIC_ROSOUT, stamps)
+        self.count += len(stamps)
+        texts, levels = (batch.column(name) for name in _COLUMNS)
+        by_path: dict[str, list[int]] = {}
+        for sender in np.unique(senders).tolist():
+            entity = self._trace.entities.get(sender)
+            name = self._paths.node_name(entity) if entity else NO_NODE
+            by_path.setdefault(f"{self._paths.node(name)}/log", []).append(sender)
+        for path, own in by_path.items():
+            places = np.flatnonzero(np.isin(senders, own))
+            rows = pa.array(places)
+            yield from make_chunk(
+                path,
+                (
+                    (SIM_TIME, self._clock.array(stamps[places])),
+                    (EVENT, pa.array(events[places])),
+                ),
+                (
+                    (rr.TextLog.descriptor_text(), texts.take(rows)),
+                    (rr.TextLog.descriptor_level(), levels.take(rows)),
+                ),
+            )
+
+    def _exceptions(self) -> Iterator[Chunk]:
+        for events, outputs in zip(self._trace.events(), self._trace.outputs(), strict=True):
+            for row in outputs[outputs["kind"] == int(OutputKind.EXCEPTION)]:
+                output = output_of(row)
+                event = events[output.event - int(events["index"][0])]
+                entity = self._trace.entities.get(int(event["entity"]))
+                name = self._paths.node_name(entity) if entity else NO_NODE
+                text = self._trace.detail(output) or "an exception; its traceback was not kept"
+                self.count += 1
+                yield from make_chunk(
+                    f"{self._paths.node(name)}/log",
+                    (
+                        (SIM_TIME, self._clock.array(np.array([event["stamp"]]))),
+                        (EVENT, pa.array([output.event])),
+                    ),
+                    (
+                        (rr.TextLog.descriptor_text(), pa.array([text.rstrip()])),
+                        (rr.TextLog.descriptor_level(), pa.array(["CRITICAL"])),
+                    ),
+                )

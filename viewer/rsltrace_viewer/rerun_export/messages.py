@@ -1,0 +1,403 @@
+"""The messages of a trace: Rerun's own loader reads them, this puts them in their place.
+
+What the loader draws (point clouds, images, transforms, grids, …) stays as it is, on our timelines
+and below our root. What it leaves as data stays as data, and is drawn and plotted besides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk, McapReader
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.format import (
+    TOPIC_DETAILS,
+    TOPIC_ENTITIES,
+    TOPIC_EVENTS,
+    TOPIC_OUTPUTS,
+    TOPIC_ROSOUT,
+)
+from rsltrace.trace.reader import Trace
+from rsltrace_viewer.rerun_export.colours import colour
+from rsltrace_viewer.rerun_export.columns import (
+    EVENT,
+    SIM_TIME,
+    Clock,
+    Column,
+    constant,
+    lists,
+    make_chunk,
+    vectors,
+)
+from rsltrace_viewer.rerun_export.fields import Curves, curves_of
+from rsltrace_viewer.rerun_export.frames import FrameTree
+from rsltrace_viewer.rerun_export.markers import MarkerBoard
+from rsltrace_viewer.rerun_export.moments import Moments
+from rsltrace_viewer.rerun_export.paths import Paths, join
+from rsltrace_viewer.rerun_export.shapes import SHAPES, Drawing, Paint, frames_of
+from rsltrace_viewer.rerun_export.tracks import Track
+from rsltrace_viewer.rerun_export.values import messages_of, numbers
+
+_OWN = (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS, TOPIC_ROSOUT)
+_DECODERS = ("ros2msg", "ros2_reflection", "raw")
+_LOG_TIME = "message_log_time"
+_FRAME_TYPE = b"rerun.components.TransformFrameId"
+_MARKERS = ("visualization_msgs.msg.Marker", "visualization_msgs.msg.MarkerArray")
+_RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
+"""The bytes of a cloud, beside its points: the same once more."""
+
+Times = tuple[tuple[str, pa.Array], ...]
+
+
+@dataclass(slots=True)
+class Seen:
+    """What there is to show, gathered while the messages pass; the layout is made from it."""
+
+    frames: FrameTree = field(default_factory=FrameTree)
+    images: dict[str, None] = field(default_factory=dict)
+    fixes: dict[str, None] = field(default_factory=dict)
+    curves: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """By path, the names of the curves there."""
+    topic_of: dict[str, str] = field(default_factory=dict)
+    """By path of curves or drawings, the topic."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """The rows of one chunk: where they belong and what they hold."""
+
+    topic: str
+    path: str
+    times: Times
+    stamps_ns: npt.NDArray[np.int64]
+    events: npt.NDArray[np.int64]
+    columns: tuple[tuple[pa.Field, pa.Array], ...]
+
+
+class MessageRows:
+    """Makes chunks of the messages of one trace; memory is that of a chunk of the file."""
+
+    def __init__(self, trace: Trace, paths: Paths, clock: Clock, recording: rr.RecordingStream):
+        self.seen = Seen()
+        self._trace = trace
+        self._paths = paths
+        self._clock = clock
+        self._recording = recording
+        self._moments = Moments(trace)
+        self._topics = {join(c.topic): c.topic for c in trace.channels.values()}
+        self._numbers = {topic: i for i, topic in enumerate(sorted(self._topics.values()))}
+        self._tracks: dict[str, tuple[Track, str]] = {}
+        self._fix_tracks: dict[str, Track] = {}
+        self._boards: dict[str, MarkerBoard] = {}
+        self._expiring: dict[str, int] = {}
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
+        own = [f"^{re.escape(topic)}$" for topic in _OWN]
+        try:
+            reader = McapReader(
+                self._trace.name,
+                timeline_type=self._clock.timeline_type,  # type: ignore[arg-type]
+                decoders=_DECODERS,
+                exclude_topic_regex=own,
+                recover=not self._trace.complete,
+            )
+            for chunk in reader.stream():
+                yield from self._chunk(chunk)
+        except (RuntimeError, ValueError, OSError) as error:
+            raise TraceError(
+                f"{self._trace.name}: Rerun cannot read its messages ({error})"
+            ) from error
+        yield from self._ends()
+
+    def _chunk(self, chunk: Chunk) -> Iterator[Chunk]:
+        topic, below = self._place(str(chunk.entity_path))
+        if not topic:
+            return
+        path = self._paths.topic(topic) + below
+        batch = chunk.to_record_batch()
+        columns = tuple(
+            (f, batch.column(i)) for i, f in enumerate(batch.schema) if _kind(f) == b"data"
+        )
+        if chunk.is_static:
+            yield from self._static(path, columns)
+            return
+        stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
+        stream = (path, tuple(f.name for f, _ in columns))
+        events, _ = self._moments.of_messages(topic, stream, stamps)
+        times = ((SIM_TIME, self._clock.array(stamps)), (EVENT, pa.array(events)))
+        rows = _Rows(topic, path, times, stamps, events, columns)
+        yield from self._as_it_is(rows)
+        yield from self._derived(rows)
+
+    def _place(self, loaded: str) -> tuple[str, str]:
+        """Return the topic of an entity that the loader made, and the path below the topic's."""
+        path = loaded
+        while path:
+            if path in self._topics:
+                return self._topics[path], loaded[len(path) :]
+            path = path.rpartition("/")[0]
+        return "", ""
+
+    def _static(self, path: str, columns: tuple[tuple[pa.Field, pa.Array], ...]) -> list[Chunk]:
+        """Names of curves and the like."""
+        for f, column in columns:
+            if f.name == "SeriesLines:names":
+                names = tuple(f"{self._paths.root} {n}".strip() for n in column[0].as_py())
+                self.seen.curves[path] = names
+                return self._curve_names(path, names)
+        return _batch(path, (), columns)
+
+    def _as_it_is(self, rows: _Rows) -> list[Chunk]:
+        """What the loader made, on our timelines, with the run's own frames."""
+        columns = []
+        for f, column in rows.columns:
+            if f.name.startswith(_RAW_CLOUD):
+                continue
+            if (f.metadata or {}).get(b"rerun:component_type") == _FRAME_TYPE:
+                if f.name == "CoordinateFrame:frame":
+                    self._note_frame(rows.path, column)
+                column = self._own_frames(column)
+            columns.append((f, column))
+        names = {f.name for f, _ in rows.columns}
+        if names & {"Image:buffer", "EncodedImage:blob", "DepthImage:buffer"}:
+            self.seen.images[rows.path] = None
+        self.seen.topic_of.setdefault(rows.path, rows.topic)
+        return _batch(rows.path, rows.times, columns) if columns else []
+
+    def _derived(self, rows: _Rows) -> Iterator[Chunk]:
+        by_name = {f.name: column for f, column in rows.columns}
+        for name, column in by_name.items():
+            type_name, _, kind = name.partition(":")
+            messages = messages_of(column) if kind == "message" else None
+            if messages is None:
+                continue
+            if type_name in _MARKERS:
+                self._draw_markers(rows, messages)
+                continue
+            yield from self._curves(rows, curves_of(messages))
+            draw = SHAPES.get(type_name)
+            if draw is not None:
+                yield from self._draw(rows, draw(messages, self._paint(rows.topic)), messages)
+        translations = by_name.get("InstancePoses3D:translations")
+        if translations is not None:
+            yield from self._curves(rows, _vector_curves("position", "xyz", translations))
+            yield from self._loaded_pose(rows, by_name)
+        fixes = by_name.get("GeoPoints:positions")
+        if fixes is not None:
+            yield from self._fix(rows, fixes, by_name.get("altitude"))
+        if "Transform3D:child_frame" in by_name and "Transform3D:parent_frame" in by_name:
+            self._note_transforms(by_name)
+        if "Scalars:scalars" in by_name:
+            self.seen.curves.setdefault(rows.path, ())
+
+    # Frames.
+
+    def _own_frames(self, column: pa.Array) -> pa.Array:
+        if not self._paths.root:
+            return column
+        names = [
+            None if row is None else [f"{self._paths.root}/{name}" for name in row]
+            for row in column.to_pylist()
+        ]
+        return pa.array(names, type=column.type)
+
+    def _note_frame(self, path: str, column: pa.Array) -> None:
+        if path not in self.seen.frames.drawn and len(column):
+            first = column[0].as_py()
+            if first:
+                self.seen.frames.drawn[path] = first[0]
+
+    def _note_transforms(self, by_name: dict[str, pa.Array]) -> None:
+        parents = by_name["Transform3D:parent_frame"].flatten()
+        children = by_name["Transform3D:child_frame"].flatten()
+        for pair in set(zip(parents.to_pylist(), children.to_pylist(), strict=False)):
+            self.seen.frames.add_edge(*pair)
+
+    # What is drawn.
+
+    def _paint(self, topic: str) -> Paint:
+        return Paint(colour(self._paths.root, self._numbers[topic]))
+
+    def _draw(self, rows: _Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
+        frames = frames_of(messages) or [""] * len(messages)
+        yield from self._drawing(rows, drawing, frames)
+
+    def _drawing(self, rows: _Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
+        path = f"{rows.path}/{drawing.part}"
+        names = pa.array([str(name) for name in frames])
+        self.seen.frames.drawn.setdefault(path, str(frames[0]))
+        self.seen.topic_of.setdefault(path, rows.topic)
+        frame = self._own_frames(lists(np.ones(len(frames), dtype=np.int64), names))
+        columns = (*drawing.columns, (rr.CoordinateFrame.descriptor_frame(), frame))
+        yield from make_chunk(path, rows.times, columns)
+        if drawing.position is not None:
+            track, _ = self._tracks.setdefault(rows.path, (Track(), str(frames[0])))
+            track.add(drawing.position)
+
+    def _loaded_pose(self, rows: _Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
+        """The loader knows poses, but draws nothing where they are."""
+        from rsltrace_viewer.rerun_export.shapes import pose_drawing
+
+        positions = _flat(by_name["InstancePoses3D:translations"], 3)
+        quaternions = _flat(by_name["InstancePoses3D:quaternions"], 4)
+        frames = by_name["CoordinateFrame:frame"].flatten().to_pylist()
+        if len(positions) == len(quaternions) == len(frames) == len(rows.stamps_ns):
+            drawing = pose_drawing(positions, quaternions, self._paint(rows.topic))
+            yield from self._drawing(rows, drawing, frames)
+
+    def _fix(self, rows: _Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
+        self.seen.fixes[rows.path] = None
+        positions = _flat(fixes, 2)
+        self._fix_tracks.setdefault(rows.path, Track()).add(positions)
+        yield from self._curves(rows, _vector_curves("position", ("latitude", "longitude"), fixes))
+        if altitude is not None:
+            counts = np.ones(len(altitude), dtype=np.int64)
+            scalars = lists(counts, pa.array(numbers(altitude.flatten())))
+            yield from self._curves(rows, iter((Curves("altitude", ("altitude",), scalars),)))
+
+    def _draw_markers(self, rows: _Rows, messages: pa.StructArray) -> None:
+        board = self._boards.setdefault(rows.topic, MarkerBoard())
+        recording = self._recording
+        for message, stamp_ns, event in zip(
+            messages.to_pylist(), rows.stamps_ns.tolist(), rows.events.tolist(), strict=True
+        ):
+            for change in board.changes(message, stamp_ns):
+                path = rows.path + join(*change.parts)
+                self._expire(path, stamp_ns)
+                self._set_time(stamp_ns)
+                recording.set_time(EVENT, sequence=event)
+                recording.log(path, change.what)
+                if change.frame:
+                    self.seen.frames.drawn.setdefault(path, change.frame)
+                    name = f"{self._paths.root}/{change.frame}" if self._paths.root else change.frame
+                    recording.log(path, rr.CoordinateFrame(frame=name))
+                if change.expires_ns is not None:
+                    self._expiring[path] = change.expires_ns
+        recording.reset_time()
+
+    def _set_time(self, stamp_ns: int) -> None:
+        if self._clock.dated:
+            self._recording.set_time(SIM_TIME, timestamp=np.datetime64(stamp_ns, "ns"))
+        else:
+            self._recording.set_time(SIM_TIME, duration=np.timedelta64(stamp_ns, "ns"))
+
+    def _expire(self, path: str, before_ns: int) -> None:
+        """Clear a marker whose lifetime ended before it was replaced. No event does that, so it
+        is on the timeline of simulated time only."""
+        expires_ns = self._expiring.pop(path, None)
+        if expires_ns is not None and expires_ns < before_ns:
+            self._recording.reset_time()
+            self._set_time(expires_ns)
+            self._recording.log(path, rr.Clear(recursive=False))
+
+    # Curves.
+
+    def _curves(self, rows: _Rows, curves: Iterator[Curves]) -> Iterator[Chunk]:
+        for curve in curves:
+            path = rows.path + (join(curve.path) if curve.path else "")
+            scalars = rr.Scalars.descriptor_scalars()
+            yield from make_chunk(path, rows.times, ((scalars, curve.scalars),))
+            known = self.seen.curves.get(path, ())
+            if len(curve.names) > len(known):
+                names = tuple(f"{self._paths.root} {name}".strip() for name in curve.names)
+                self.seen.curves[path] = names
+                self.seen.topic_of[path] = rows.topic
+                yield from self._curve_names(path, names)
+
+    def _curve_names(self, path: str, names: tuple[str, ...]) -> list[Chunk]:
+        one = np.array([len(names)])
+        columns: list[Column] = [
+            (rr.SeriesLines.descriptor_names(), lists(one, pa.array(list(names))))
+        ]
+        if self._paths.root:
+            paints = [colour(self._paths.root, i) for i in range(len(names))]
+            paint = pa.array(paints, type=pa.uint32())
+            columns.append((rr.SeriesLines.descriptor_colors(), lists(one, paint)))
+        return make_chunk(path, (), columns)
+
+    # At the end.
+
+    def _ends(self) -> Iterator[Chunk]:
+        for path, expires_ns in list(self._expiring.items()):
+            if expires_ns <= self._trace.end_ns:
+                self._expire(path, self._trace.end_ns + 1)
+        self._recording.reset_time()
+        for path, (track, frame) in self._tracks.items():
+            if len(track.points):
+                topic = self.seen.topic_of[path]
+                root = self._paths.root
+                at = f"{path}/track"
+                self.seen.frames.drawn[at] = frame
+                name = f"{root}/{frame}" if root else frame
+                yield from make_chunk(
+                    at,
+                    (),
+                    (
+                        (rr.LineStrips3D.descriptor_strips(), _strip(track, 3)),
+                        (rr.LineStrips3D.descriptor_colors(), self._paint(topic).column(1)),
+                        (rr.LineStrips3D.descriptor_radii(), constant(-1.0, 1, pa.float32())),
+                        (rr.CoordinateFrame.descriptor_frame(), pa.array([name])),
+                    ),
+                )
+        for path, track in self._fix_tracks.items():
+            if len(track.points):
+                paint = self._paint(self.seen.topic_of[path])
+                flat = pa.array(track.points.reshape(-1))
+                kind = pa.list_(pa.field("item", pa.float64(), nullable=False), 2)
+                points = pa.FixedSizeListArray.from_arrays(flat, type=kind)
+                strip = lists(np.array([len(points)]), points)
+                yield from make_chunk(
+                    f"{path}/track",
+                    (),
+                    (
+                        (
+                            rr.GeoLineStrings.descriptor_line_strings(),
+                            lists(np.array([1]), strip),
+                        ),
+                        (rr.GeoLineStrings.descriptor_colors(), paint.column(1)),
+                    ),
+                )
+
+
+def _strip(track: Track, size: int) -> pa.Array:
+    points = track.points[:, :size]
+    return lists(np.array([1]), lists(np.array([len(points)]), vectors(points)))
+
+
+def _flat(column: pa.Array, size: int) -> npt.NDArray[np.float64]:
+    """Return a column of one fixed-size list per row as an array of shape (rows, size)."""
+    values = column.flatten().flatten().to_numpy()
+    return np.asarray(values, dtype=np.float64).reshape(-1, size)
+
+
+def _vector_curves(path: str, names: str | tuple[str, ...], column: pa.Array) -> Iterator[Curves]:
+    values = _flat(column, len(names))
+    if len(values) == len(column):
+        counts = np.full(len(values), len(names), dtype=np.int64)
+        yield Curves(path, tuple(names), lists(counts, pa.array(values.reshape(-1))))
+
+
+def _kind(f: pa.Field) -> bytes:
+    return bytes((f.metadata or {}).get(b"rerun:kind", b""))
+
+
+def _batch(
+    path: str, times: Times, columns: list[tuple[pa.Field, pa.Array]] | tuple[Any, ...]
+) -> list[Chunk]:
+    fields = [pa.field(name, values.type) for name, values in times]
+    fields += [f for f, _ in columns]
+    batch = pa.RecordBatch.from_arrays(
+        [values for _, values in (*times, *columns)], schema=pa.schema(fields)
+    )
+    return Chunk.from_record_batch(
+        batch, index=[name for name, _ in times] or None, entity_path=path
+    )

@@ -1,0 +1,274 @@
+"""What is open and where one is in it: the state behind the screen, without a screen.
+
+The app changes this object and draws what it says; tests drive it directly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.model.stamp import format_duration
+from rsltrace_viewer.model import match
+from rsltrace_viewer.model.compare import Comparison
+from rsltrace_viewer.model.history import History, Marks
+from rsltrace_viewer.model.inspector import Effects, inspect
+from rsltrace_viewer.model.lanes import LaneMaker, Lanes, Window
+from rsltrace_viewer.model.lines import Line, Openness
+from rsltrace_viewer.model.match import Condition
+from rsltrace_viewer.model.query import parse
+from rsltrace_viewer.model.run import WITH_TOPIC, Run
+from rsltrace_viewer.model.shown import AllRows, FilteredRows, Rows
+from rsltrace_viewer.model.timeline import Columns, EventText, EventTexts, Sign, layout, node_of
+from rsltrace_viewer.model.view import SingleView, View
+
+SEEK: dict[str, tuple[Condition, str]] = {
+    "raised": (match.RAISED, "exception"),
+    "log": (match.ANY_LOG, "log record"),
+    "warning": (match.log_at_least(30), "warning"),
+    "finding": (match.GUARD_FINDING, "finding of the guard"),
+}
+"""What one can jump to by a key: the condition, and what it is called."""
+
+
+class Session:
+    """One run, or two that are compared. ``place`` is the selected row of the whole timeline."""
+
+    def __init__(self, a: Run, b: Run | None = None) -> None:
+        self.a = a
+        self.b = b
+        self.comparison: Comparison | None = None
+        self.side = "diff" if b is not None else "a"
+        self.view: View = SingleView(a.count)
+        self.rows: Rows = AllRows(a.count)
+        self.filter_text = ""
+        self.search: Condition | None = None
+        self.search_text = ""
+        self.place = 0
+        self.history = History()
+        self.marks = Marks()
+        self.openness = Openness()
+        self.effects: Effects | None = None
+        self._texts = {"a": EventTexts(a)}
+        if b is not None:
+            self._texts["b"] = EventTexts(b)
+        self.lane_maker = LaneMaker(a)
+        self.window: Window = self.lane_maker.whole
+        self._lanes: tuple[tuple[object, ...], Lanes] | None = None
+
+    def close(self) -> None:
+        """Close the files."""
+        self.a.close()
+        if self.b is not None:
+            self.b.close()
+
+    # What is selected.
+
+    @property
+    def empty(self) -> bool:
+        """Whether there is no event at all."""
+        return self.view.count == 0
+
+    def current(self) -> tuple[Run, int] | None:
+        """Return the run and the index of the selected event; None if there is no event."""
+        if self.empty:
+            return None
+        index_a, index_b = self.view.a(self.place), self.view.b(self.place)
+        if self.b is not None and index_b is not None and (index_a is None or self.side == "b"):
+            return self.b, index_b
+        return (self.a, index_a) if index_a is not None else None
+
+    def stamp(self) -> int:
+        """Return the time of the selected event (0: none)."""
+        here = self.current()
+        return here[0].stamp(here[1]) if here else 0
+
+    def row_of_place(self) -> int:
+        """Return the row that is, or is next to, the selected place."""
+        return self.rows.near(self.place)
+
+    # Rows.
+
+    def columns(self, width: int) -> Columns:
+        """Return the columns for a timeline of ``width`` cells."""
+        texts = self._texts["a"]
+        return layout(
+            width,
+            index_width=max(t.index_width for t in self._texts.values()),
+            time_width=max(t.time_width for t in self._texts.values()),
+            node_width=texts.node_width,
+            signs=self.b is not None,
+        )
+
+    def row(self, row: int) -> tuple[EventText, Sign | None, bool, str]:
+        """Return the event of a row in words, its sign, whether it is marked, its relation."""
+        place = self.rows.at(row)
+        index, index_b = self.view.a(place), self.view.b(place)
+        if index is not None:
+            event = self._texts["a"].of(index)
+        else:
+            assert index_b is not None  # a place stands for something
+            event = self._texts["b"].of(index_b)
+        return event, self.view.sign(place), place in self.marks, self._relation(place)
+
+    def _relation(self, place: int) -> str:
+        """Return ``cause`` or ``effect`` if that is what the event is to the selected one."""
+        here = self.current()
+        if here is None or place == self.place:
+            return ""
+        run, index = here
+        other = self.view.b(place) if run is self.b else self.view.a(place)
+        if other is None:
+            return ""
+        if int(run.row(index)["cause_event"]) == other:
+            return "cause"
+        if self.effects is not None and self.effects.event == index:
+            return "effect" if other in self.effects.found else ""
+        return ""
+
+    def lines(self) -> list[Line]:
+        """Return the lines of the inspector."""
+        here = self.current()
+        if here is None:
+            return []
+        if self.comparison is not None and self.side == "diff":
+            return self.comparison.lines(self.place, self.openness)
+        return inspect(here[0], here[1], self.openness, self.effects)
+
+    # Lanes.
+
+    def lanes(self, columns: int) -> tuple[Lanes, int]:
+        """Return the lanes, and where the cursor is in them (a time, or an index)."""
+        here = self.current()
+        index = 0
+        if here is not None:
+            run, index = here
+            if run is not self.a:
+                index = self.a.index_at(run.stamp(index)) if self.a.count else 0
+            self.window = self.lane_maker.centred(self.window, index, columns)
+        numbers = self.lane_maker.summaries
+        key = (self.window, columns, numbers, index if self.window.order else -1)
+        if self._lanes is None or self._lanes[0] != key:
+            self._lanes = key, self.lane_maker.make(self.window, columns, index)
+        position = index if self.window.order else self.stamp()
+        return self._lanes[1], position
+
+    def zoom(self, step: int, columns: int) -> None:
+        """Zoom the lanes in (1), out (-1), or to the whole run (0)."""
+        index = self.view.a(self.place) if not self.empty else None
+        if step == 0 or index is None:
+            self.window = self.lane_maker.whole
+        else:
+            self.window = self.lane_maker.zoomed(self.window, step, index, columns)
+
+    def own_lane(self) -> str:
+        """Return the node of the selected event."""
+        here = self.current()
+        if here is None:
+            return ""
+        try:
+            return node_of(here[0], here[0].event(here[1]))
+        except TraceError:
+            return ""
+
+    # Finding.
+
+    def same(self, what: str) -> tuple[Condition, str] | None:
+        """Return the condition of ``node``, ``entity`` or ``topic`` being that of the selected
+        event, and its name; None if it has none."""
+        here = self.current()
+        if here is None:
+            return None
+        run, index = here
+        event = run.event(index)
+        entity = run.entities.get(event.entity)
+        if event.kind is EventKind.CONSTRUCT:
+            made = next((o for o in run.outputs(index) if o.kind is OutputKind.ENTITY), None)
+            entity = run.entities.get(made.entity) if made is not None else entity
+        if entity is None:
+            return None
+        if what == "node":
+            ids = run.ids_where(node=entity.node)
+            return match.OfEntities(match.ids(ids)), run.node_name(entity.id)
+        if what == "entity":
+            return match.OfEntities(match.ids([entity.id])), run.entity_name(entity.id)
+        topic = entity.name if entity.kind in WITH_TOPIC else ""
+        if not topic:
+            sent = next((o for o in run.outputs(index) if o.kind is OutputKind.MESSAGE), None)
+            topic = run.entities[sent.entity].name if sent is not None else ""
+        if not topic:
+            return None
+        return match.OfEntities(match.ids(run.ids_where(name=topic)), outputs=True), topic
+
+    def seek(self, condition: Condition, step: int, *, wrap: bool = False) -> Iterator[int | None]:
+        """Yield None while looking and the places of matches from the selected one on."""
+        here = self.current()
+        if here is None:
+            return
+        run, index = here
+        other = run is self.b
+        for found in match.find(run, condition, index, step):
+            yield None if found is None else self.view.place_of(found, other=other)
+        if wrap:
+            start = -1 if step > 0 else run.count
+            for found in match.find(run, condition, start, step):
+                yield None if found is None else self.view.place_of(found, other=other)
+
+    def set_filter(self, text: str) -> FilteredRows | None:
+        """Show only events that fulfil a filter (empty: all). Raises QueryError.
+
+        Returns the rows to be found by ``advance``; None if there is no filter.
+        """
+        condition = parse(text, self.a)
+        self.filter_text = text.strip()
+        if condition is None:
+            self.rows = AllRows(self.view.count)
+            return None
+        rows = FilteredRows(self.a, condition, self.view)
+        self.rows = rows
+        return rows
+
+    def set_search(self, text: str) -> None:
+        """Set what ``n`` looks for (empty: nothing). Raises QueryError."""
+        self.search = parse(text, self.a)
+        self.search_text = text.strip()
+
+    # Going somewhere.
+
+    def go(self, place: int, *, remember: bool = True) -> None:
+        """Select a place, and remember where one was."""
+        if remember and place != self.place:
+            self.history.leave(self.place)
+        self.place = max(min(place, self.view.count - 1), 0)
+        self.effects = None
+
+    def place_at_time(self, stamp_ns: int) -> int:
+        """Return the place of the first event at a time or later."""
+        return self.view.place_of(self.a.index_at(stamp_ns))
+
+    # Words.
+
+    def title(self) -> str:
+        """Return the name of what is open."""
+        return self.a.name if self.b is None else f"{self.a.name} ↔ {self.b.name}"
+
+    def facts(self) -> str:
+        """Return a line of facts about it."""
+        trace = self.a.trace
+        parts = [f"{self.a.count:,} events"]
+        if self.b is not None and self.b.count != self.a.count:
+            parts[0] = f"{self.a.count:,} and {self.b.count:,} events"
+        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
+        nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
+        parts.append(f"{nodes} nodes")
+        if self.b is None:
+            parts.append(f"digest {trace.digest}")
+        unfinished = [r.name for r in (self.a, self.b) if r is not None and not r.trace.complete]
+        if unfinished:
+            parts.append("not finished" if self.b is None else f"{unfinished[0]} is not finished")
+        reason = trace.result.get("exit_code", "0")
+        if self.b is None and reason != "0":
+            parts.append(f"exit code {reason}")
+        return "  ".join(parts)
