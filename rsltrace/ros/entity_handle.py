@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.ros.destroyable import Destroyable
+from rsltrace.ros.groups import is_busy
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -34,6 +36,11 @@ class EntityHandle(Destroyable):
         self.created_ns = core.loop.now_ns
         self.wrapper: Any = None
         core.pending.append(self)
+
+    def get_logger_name(self) -> str:
+        """Return the node's logger name."""
+        assert self.node is not None
+        return self.node.logger_name()
 
     def settle(self) -> bool:
         """Find owner and wrapper; return whether the owner is known."""
@@ -95,6 +102,47 @@ class EntityHandle(Destroyable):
         """Name the entity for people: ``/listener: subscription /chatter``."""
         node = self.node.fully_qualified_name if self.node is not None else "(no node)"
         return f"{node}: {self.kind.label} {self.trace_name()}"
+
+
+class Receiver(EntityHandle):
+    """A handle with a queue of what has arrived for its callback.
+
+    One entry in the loop's ready queue stands for one arrival, so arrivals of all entities run in
+    the order in which they came. An arrival that the queue has dropped leaves an entry behind that
+    finds nothing to do.
+    """
+
+    queue: deque[Any]
+
+    def deliver(self, arrival: Any) -> None:
+        """Queue an arrival; it is dispatched once the node is being run."""
+        self.queue.append(arrival)
+        if self.wrapper is not None:
+            self.core.loop.ready.append(self)
+        else:
+            self.find_wrapper()
+
+    def activate(self) -> None:
+        self.core.loop.ready.extend([self] * len(self.queue))
+
+    def may_run(self) -> bool:
+        """Return whether to take an arrival now; if the callback group is busy, try again later."""
+        wrapper = self.wrapper
+        if not self.queue or wrapper is None or self._destroyed:
+            return False
+        group = wrapper.callback_group
+        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
+            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
+            return False
+        return True
+
+    def settle(self) -> bool:
+        self.find_wrapper()
+        return True
+
+    def dispatch(self) -> None:
+        """Take the oldest arrival and run the callback with it."""
+        raise AssertionError("every receiver says how")
 
 
 def callback_name(callback: Any) -> str:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.ros.codec import codec_for
-from rsltrace.ros.entity_handle import EntityHandle, callback_name
-from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.entity_handle import EntityHandle, Receiver, callback_name
+from rsltrace.ros.groups import begin
 from rsltrace.ros.interfaces import schema_text, type_hash
 from rsltrace.ros.qos import Durability, Qos
 from rsltrace.ros.qos_events import EndpointEvents
@@ -117,11 +117,6 @@ class PublisherHandle(EntityHandle):
         )
         return self._channel
 
-    def get_logger_name(self) -> str:
-        """Return the node's logger name."""
-        assert self.node is not None
-        return self.node.logger_name()
-
     def get_topic_name(self) -> str:
         """Return the resolved topic."""
         return self.topic
@@ -150,12 +145,8 @@ class PublisherHandle(EntityHandle):
         self.core.graph.remove_publisher(self)
 
 
-class SubscriptionHandle(EntityHandle):
-    """Stands in for ``_rclpy.Subscription``.
-
-    One entry in the loop's ready queue stands for one delivery. A full queue drops its oldest
-    message; the entry that is left over then finds nothing to do.
-    """
+class SubscriptionHandle(Receiver):
+    """Stands in for ``_rclpy.Subscription``. A full queue drops its oldest message."""
 
     kind = EntityKind.SUBSCRIPTION
     lists = "subscriptions"
@@ -177,30 +168,12 @@ class SubscriptionHandle(EntityHandle):
         self._with_info = False
         core.graph.add_subscription(self)
 
-    def deliver(self, delivery: Delivery) -> None:
-        """Queue a message; it is dispatched once the node is being run."""
-        self.queue.append(delivery)
-        if self.wrapper is not None:
-            self.core.loop.ready.append(self)
-        else:
-            self.find_wrapper()
-
-    def activate(self) -> None:
-        self.core.loop.ready.extend([self] * len(self.queue))
-
     def dispatch(self) -> None:
         """Take the oldest message and run the callback with a copy of its own."""
-        queue = self.queue
-        if not queue:
+        if not self.may_run():
             return
         wrapper = self.wrapper
-        if wrapper is None or self._destroyed:
-            return
-        group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
-            return
-        data, event, position, digest, *_ = delivery = queue.popleft()
+        data, event, position, digest, *_ = delivery = self.queue.popleft()
         callback = wrapper._callback
         if callback is not self._callback:
             self._learn(wrapper)
@@ -208,7 +181,7 @@ class SubscriptionHandle(EntityHandle):
         args = (message, _message_info(delivery)) if self._with_info else (message,)
         core = self.core
         if self._coroutine:
-            begin(group, wrapper)
+            begin(wrapper.callback_group, wrapper)
             start_coroutine(core, self, _SUBSCRIPTION, callback, args, event, position, digest)
             return
         core.execute(
@@ -230,11 +203,6 @@ class SubscriptionHandle(EntityHandle):
         message = data if raw else codec_for(msg_type).deserialize(data)
         return message, _message_info(delivery)
 
-    def get_logger_name(self) -> str:
-        """Return the node's logger name."""
-        assert self.node is not None
-        return self.node.logger_name()
-
     def get_topic_name(self) -> str:
         """Return the resolved topic."""
         return self.topic
@@ -242,10 +210,6 @@ class SubscriptionHandle(EntityHandle):
     def get_publisher_count(self) -> int:
         """Count the connected publishers."""
         return len(self.publishers)
-
-    def settle(self) -> bool:
-        self.find_wrapper()
-        return True
 
     def trace_name(self) -> str:
         return self.topic

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.ros.codec import codec_for
-from rsltrace.ros.entity_handle import EntityHandle, callback_name
-from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.entity_handle import Receiver, callback_name
+from rsltrace.ros.groups import begin
 from rsltrace.ros.interfaces import schema_text
 from rsltrace.ros.qos import Qos
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
@@ -51,7 +51,7 @@ class ServiceInfo:
 Exchange = tuple[bytes, int, int, int, ServiceInfo]
 
 
-class _End(EntityHandle):
+class _End(Receiver):
     """What a client and a server have in common."""
 
     def __init__(self, core: Core, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
@@ -64,20 +64,6 @@ class _End(EntityHandle):
         super().__init__(core, node)
         self.queue: deque[Exchange] = deque()
         self._channel: int | None = None
-
-    def deliver(self, exchange: Exchange) -> None:
-        """Queue a request or response; it is dispatched once the node is being run."""
-        self.queue.append(exchange)
-        if self.wrapper is not None:
-            self.core.loop.ready.append(self)
-        else:
-            self.find_wrapper()
-
-    def activate(self) -> None:
-        self.core.loop.ready.extend([self] * len(self.queue))
-
-    def dispatch(self) -> None:
-        raise NotImplementedError
 
     def _emit(self, kind: int, prefix: str, codec: Any, part: Any, data: bytes) -> tuple[int, int]:
         """Record an outgoing request or response; return its output position and hash."""
@@ -96,17 +82,8 @@ class _End(EntityHandle):
         )
         return position, digest
 
-    def get_logger_name(self) -> str:
-        """Return the node's logger name."""
-        assert self.node is not None
-        return self.node.logger_name()
-
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
         """Accept the switch; requests and responses are in the trace in any case."""
-
-    def settle(self) -> bool:
-        self.find_wrapper()
-        return True
 
     def trace_name(self) -> str:
         return self.service
@@ -132,18 +109,14 @@ class ServiceHandle(_End):
 
     def dispatch(self) -> None:
         """Take the oldest request, run the callback and send what it returns."""
-        wrapper = self.wrapper
-        if not self.queue or wrapper is None or self._destroyed:
-            return
-        group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
+        if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
         request = self._request.deserialize(data)
         core = self.core
+        wrapper = self.wrapper
         if is_coroutine_function(wrapper.callback):
-            begin(group, wrapper)
+            begin(wrapper.callback_group, wrapper)
             start_coroutine(
                 core, self, _SERVICE, self._serve_async, (request, header), event, position, digest
             )
@@ -237,12 +210,7 @@ class ClientHandle(_End):
 
     def dispatch(self) -> None:
         """Take the oldest response and complete its future."""
-        wrapper = self.wrapper
-        if not self.queue or wrapper is None or self._destroyed:
-            return
-        group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
+        if not self.may_run():
             return
         data, event, position, digest, header = self.queue.popleft()
         self.core.execute(

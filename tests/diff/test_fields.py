@@ -1,0 +1,412 @@
+"""What differs between two decoded messages, and by how much."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsltrace.diff.fields import diff_messages, preview
+from rsltrace.diff.model import FieldDifference
+from rsltrace.diff.numbers import ulp_distance
+from rsltrace.diff.options import DiffOptions
+from rsltrace.errors import TraceError
+from rsltrace.trace.decode import Decoder
+from rsltrace.trace.index import ChannelInfo
+
+SCHEMA = f"""\
+std_msgs/Header header
+float32 single
+float64 double
+uint64 big
+int8 small
+bool flag
+string text
+float32[] ranges
+float64[9] covariance
+int64[] counts
+bool[] bits
+uint8[] data
+string[] names
+geometry_msgs/Point[] points
+{"=" * 80}
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+{"=" * 80}
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+{"=" * 80}
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+"""
+ONLY = DiffOptions()
+
+
+def decoder(schema: str = SCHEMA, name: str = "pkg/msg/All") -> Decoder:
+    return Decoder(ChannelInfo(1, "/all", name, "ros2msg", schema, {}))
+
+
+ALL = decoder()
+
+
+def message(**changes: Any) -> Any:
+    """A message as decoding gives it, with some fields set by their paths."""
+    store = ALL._store
+    types = store.types
+    point = types["geometry_msgs/msg/Point"]
+    fields: dict[str, Any] = {
+        "header": types["std_msgs/msg/Header"](
+            types["builtin_interfaces/msg/Time"](sec=10, nanosec=500), "map"
+        ),
+        "single": 0.0,
+        "double": 0.0,
+        "big": 0,
+        "small": 0,
+        "flag": False,
+        "text": "",
+        "ranges": np.zeros(4, dtype=np.float32),
+        "covariance": np.zeros(9),
+        "counts": np.zeros(0, dtype=np.int64),
+        "bits": np.zeros(3, dtype=bool),
+        "data": np.zeros(0, dtype=np.uint8),
+        "names": [],
+        "points": [point(1.0, 2.0, 3.0), point(4.0, 5.0, 6.0)],
+    }
+    fields.update(changes)
+    name = "pkg/msg/All"
+    raw = store.serialize_cdr(types[name](**fields), name)
+    return ALL.decode(bytes(raw))
+
+
+def only(a: Any, b: Any, options: DiffOptions = ONLY) -> FieldDifference:
+    found, more = diff_messages(a, b, options)
+    assert len(found) == 1, found
+    assert more == 0
+    return found[0]
+
+
+def test_equal_messages_have_no_differences() -> None:
+    assert diff_messages(message(), message(), ONLY) == ((), 0)
+
+
+@pytest.mark.parametrize(
+    ("field", "a", "b", "text_a", "text_b", "ulp"),
+    [
+        ("single", 0.1, 0.2, "0.1", "0.2", 8388608),
+        ("double", 0.1, 0.1 + 2**-56, "0.1", "0.10000000000000002", 1),
+        ("double", 1e300, -1e300, "1e+300", "-1e+300", None),
+        ("single", 16777216.0, 16777218.0, "16777216.0", "16777218.0", 1),
+    ],
+)
+def test_floats_are_shown_in_full_and_measured_in_their_own_width(
+    field: str, a: float, b: float, text_a: str, text_b: str, ulp: int | None
+) -> None:
+    found = only(message(**{field: a}), message(**{field: b}))
+    assert (found.path, found.a, found.b) == (field, text_a, text_b)
+    if ulp is not None:
+        assert found.ulp == ulp
+    width = np.float32 if field == "single" else np.float64
+    assert found.absolute == abs(float(width(a)) - float(width(b)))
+    assert width(found.a) == width(a)
+    assert width(found.b) == width(b)
+
+
+@pytest.mark.parametrize("field", ["single", "double"])
+@pytest.mark.parametrize(
+    ("a", "b", "note"),
+    [
+        (math.nan, 1.0, "NaN in a only"),
+        (1.0, math.nan, "NaN in b only"),
+        (0.0, -0.0, "sign of zero"),
+        (math.inf, 1.0, "infinite in a only"),
+        (math.inf, -math.inf, "infinities of opposite sign"),
+    ],
+)
+def test_special_floats_are_called_out(field: str, a: float, b: float, note: str) -> None:
+    found = only(message(**{field: a}), message(**{field: b}))
+    assert found.note == note
+    if note == "sign of zero":
+        assert (found.a, found.b, found.absolute, found.ulp) == ("0.0", "-0.0", 0.0, 0)
+    else:
+        assert found.absolute is None
+        assert found.ulp is None
+
+
+def nan_of(bits: int) -> float:
+    value: float = struct.unpack("<d", struct.pack("<Q", bits))[0]
+    return value
+
+
+def test_nan_equals_a_nan_of_the_same_bits_only() -> None:
+    assert diff_messages(message(double=math.nan), message(double=math.nan), ONLY) == ((), 0)
+    found = only(message(double=math.nan), message(double=nan_of(0x7FF8000000000001)))
+    assert found.note == "NaN with another payload"
+    assert (found.a, found.b) == ("nan", "nan(0x7ff8000000000001)")
+    array = np.full(4, np.nan, dtype=np.float32)
+    assert diff_messages(message(ranges=array), message(ranges=array), ONLY) == ((), 0)
+
+
+def test_integers_and_truth_values() -> None:
+    found = only(message(big=2**64 - 1), message(big=2**64 - 3))
+    assert (found.a, found.b) == ("18446744073709551615", "18446744073709551613")
+    assert (found.absolute, found.ulp) == (2.0, None)
+    assert only(message(small=-128), message(small=127)).absolute == 255.0
+    found = only(message(flag=True), message(flag=False))
+    assert (found.a, found.b, found.absolute) == ("true", "false", None)
+
+
+def test_times_are_one_field_in_seconds() -> None:
+    a, b = message(), message()
+    b.header.stamp.sec, b.header.stamp.nanosec = 9, 999_999_999
+    found = only(a, b)
+    assert (found.path, found.a, found.b) == ("header.stamp", "10.000000500", "9.999999999")
+    assert found.absolute == pytest.approx(501e-9)
+    close = DiffOptions(absolute=(("header.stamp", 1e-6),))
+    assert only(a, b, close).within_tolerance
+    assert not only(a, b, DiffOptions(absolute=(("header.stamp", 1e-7),))).within_tolerance
+    for glob in ("header.stamp", "header", "*.stamp.*", "*stamp", "header.stamp.*"):
+        assert diff_messages(a, b, DiffOptions(ignore=(glob,))) == ((), 0), glob
+    b.header.stamp.nanosec = 2_000_000_000  # no time in its normal form: as numbers then
+    assert [d.path for d in diff_messages(a, b, ONLY)[0]] == [
+        "header.stamp.sec",
+        "header.stamp.nanosec",
+    ]
+
+
+def test_texts_say_where_they_part() -> None:
+    found = only(message(text="left"), message(text="right\x1b[31m\n"))
+    assert (found.a, found.b, found.note) == ('"left"', '"right\\x1b[31m\\n"', "")
+    long = "x" * 200
+    found = only(message(text=long), message(text=long[:120] + "y" + long[121:150]))
+    assert found.note == "first at character 120; length 200 and 150"
+    assert "xy" in found.b
+    assert len(found.a) < 70
+
+
+def test_one_element_is_named_by_its_index() -> None:
+    ranges = np.zeros(4, dtype=np.float32)
+    ranges[2] = 0.5
+    found = only(message(), message(ranges=ranges))
+    assert (found.path, found.a, found.b, found.absolute) == ("ranges[2]", "0.0", "0.5", 0.5)
+    assert found.elements == (1, 4)
+
+
+def test_arrays_are_summarised() -> None:
+    a = np.arange(100, dtype=np.float32)
+    b = a.copy()
+    b[[3, 50]] += 0.5
+    b[7] = np.nan
+    b[0] = -0.0
+    b[99] = np.inf
+    found = only(message(ranges=a), message(ranges=b))
+    assert found.path == "ranges"
+    assert found.elements == (5, 100)
+    assert found.first == (
+        (0, "0.0", "-0.0"),
+        (3, "3.0", "3.5"),
+        (7, "7.0", "nan"),
+        (50, "50.0", "50.5"),
+        (99, "99.0", "inf"),
+    )
+    assert (found.smallest, found.largest) == (0.0, 0.5)
+    assert found.ulp == 2097152
+    assert found.note == "NaN in b only: 1; infinite in b only: 1; sign of zero: 1"
+    assert found.a == "[0.0, 1.0, 2.0, 3.0, … 100]"
+
+
+def test_arrays_of_other_length_show_what_is_beyond() -> None:
+    a = np.arange(5, dtype=np.float32)
+    found = only(message(ranges=a), message(ranges=a[:3]))
+    assert found.note == "length 5 and 3"
+    assert found.elements == (2, 5)
+    assert found.first == ((3, "3.0", "absent"), (4, "4.0", "absent"))
+    assert not found.within_tolerance
+    assert not only(
+        message(ranges=a), message(ranges=a[:3]), DiffOptions(absolute=(("*", 1e9),))
+    ).within_tolerance
+
+
+def test_differences_of_64_bit_integers_do_not_wrap() -> None:
+    low, high = -(2**63), 2**63 - 1
+    a = np.array([low, 0, low], dtype=np.int64)
+    b = np.array([high, 0, low + 1], dtype=np.int64)
+    found = only(message(counts=a), message(counts=b))
+    assert (found.smallest, found.largest) == (1.0, float(2**64 - 1))
+    found = only(
+        message(bits=np.array([True, False, True])), message(bits=np.array([False, True, True]))
+    )
+    assert found.elements == (2, 3)
+    assert (found.ulp, found.smallest) == (None, None)
+
+
+def test_long_binary_fields_are_shown_as_a_hex_dump() -> None:
+    a = np.arange(200, dtype=np.uint8)
+    b = a.copy()
+    b[[18, 20, 150]] = 255
+    found = only(message(data=a), message(data=b))
+    assert (found.a, found.b, found.elements) == ("200 bytes", "200 bytes", (3, 200))
+    assert found.note == "first at byte 18"
+    assert [offset for offset, _, _ in found.first] == [16, 144]
+    assert found.first[0][1].startswith("10 11 12 13 14")
+    assert found.first[0][2].startswith("10 11 ff 13 ff")
+    found = only(message(data=a), message(data=a[:100]))
+    assert found.note == "length 200 and 100"
+    assert found.first[0][0] == 96
+    # short ones are numbers
+    assert only(message(data=a[:8]), message(data=b[:0])).a == "[0, 1, 2, 3, … 8]"
+
+
+def test_messages_in_arrays_are_compared_one_by_one() -> None:
+    a, b = message(), message()
+    b.points[1].y = 7.0
+    assert only(a, b).path == "points[1].y"
+    b.points.append(b.points[0])
+    found, _ = diff_messages(a, b, ONLY)
+    assert [one.path for one in found] == ["points", "points[1].y"]
+    assert (found[0].a, found[0].b, found[0].note) == ("2 items", "3 items", "length 2 and 3")
+    assert found[0].first == ((2, "absent", "x: 1.0, y: 2.0, z: 3.0"),)
+    names = only(message(names=["a", "b"]), message(names=["a", "c"]))
+    assert (names.path, names.a, names.b) == ("names[1]", '"b"', '"c"')
+
+
+def test_globs_reach_into_arrays_with_and_without_indexes() -> None:
+    a, b = message(), message()
+    b.points[1].y = 7.0
+    for glob in ("points", "points[1]", "points[*].y", "points.y", "*.y", "point?[1].y"):
+        assert diff_messages(a, b, DiffOptions(ignore=(glob,))) == ((), 0), glob
+    for glob in ("point", "points[0]", "points.x", "y", "points[1].yy"):
+        assert diff_messages(a, b, DiffOptions(ignore=(glob,)))[0], glob
+    ranges = np.zeros(4, dtype=np.float32)
+    ranges[[1, 2]] = 1.0
+    found = only(message(), message(ranges=ranges), DiffOptions(ignore=("ranges[1]",)))
+    assert found.path == "ranges[2]"
+    assert only(
+        message(), message(ranges=ranges), DiffOptions(absolute=(("ranges[*]", 1.0),))
+    ).within_tolerance
+    assert not only(
+        message(), message(ranges=ranges), DiffOptions(absolute=(("ranges[2]", 1.0),))
+    ).within_tolerance
+
+
+def test_tolerances() -> None:
+    a, b = message(double=100.0), message(double=101.0)
+    assert only(a, b, DiffOptions(absolute=(("double", 1.0),))).within_tolerance
+    assert not only(a, b, DiffOptions(absolute=(("double", 0.99),))).within_tolerance
+    assert only(a, b, DiffOptions(relative=(("*", 0.01),))).within_tolerance
+    assert not only(a, b, DiffOptions(relative=(("*", 0.009),))).within_tolerance
+    # the most generous of several counts
+    both = DiffOptions(absolute=(("double", 0.0), ("*", 2.0)))
+    assert only(a, b, both).within_tolerance
+    nan = message(double=math.nan)
+    assert not only(a, nan, DiffOptions(absolute=(("*", 1e300),))).within_tolerance
+
+
+def test_what_is_not_covered_comes_first() -> None:
+    a = message(single=1.0, double=1.0, big=1)
+    b = message(single=2.0, double=2.0, big=9)
+    found, more = diff_messages(a, b, DiffOptions(absolute=(("*", 1.0),)), limit=2)
+    assert [one.path for one in found] == ["big", "single"]
+    assert [one.within_tolerance for one in found] == [False, True]
+    assert more == 1
+
+
+def test_globs_of_one_topic() -> None:
+    options = DiffOptions(ignore=("/odom:header", "text"), absolute=(("/sca*:ranges", 1.0),))
+    assert options.for_topic("/odom").ignore == ("header", "text")
+    assert options.for_topic("/scan").ignore == ("text",)
+    assert options.for_topic("/scan").absolute == (("ranges", 1.0),)
+    assert options.for_topic("/odom").absolute == ()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"context": -1},
+        {"window": 0},
+        {"by": "name"},
+        {"absolute": (("*", -1.0),)},
+        {"relative": (("*", math.nan),)},
+    ],
+)
+def test_options_that_make_no_sense(wrong: dict[str, Any]) -> None:
+    with pytest.raises(TraceError):
+        DiffOptions(**wrong)
+
+
+def test_types_that_differ() -> None:
+    other = decoder("float64 x\n", "pkg/msg/Other").decode(b"\0\1\0\0" + struct.pack("<d", 1.0))
+    same = decoder("float64 x\nfloat64 y\n", "pkg/msg/Other").decode(
+        b"\0\1\0\0" + struct.pack("<dd", 1.0, 2.0)
+    )
+    found = only(other, same)
+    assert (found.path, found.a, found.b) == ("y", "absent", "2.0")
+    found = only(same, other)
+    assert (found.path, found.a, found.b) == ("y", "2.0", "absent")
+    float32 = decoder("float32 x\n", "pkg/msg/Third").decode(b"\0\1\0\0" + struct.pack("<f", 1.0))
+    found = only(other, float32)
+    assert (found.path, found.a, found.b) == ("(whole)", "pkg/msg/Other", "pkg/msg/Third")
+
+
+def test_words_of_python_are_fields_by_their_ros_names() -> None:
+    with_class = decoder("int32 class\n", "pkg/msg/Word")
+    a, b = (with_class.decode(b"\0\1\0\0" + struct.pack("<i", value)) for value in (1, 2))
+    assert only(a, b).path == "class"
+    assert preview(a) == "class: 1"
+
+
+def test_plain_texts_are_compared_too() -> None:
+    found = only("ValueError: 1", "ValueError: 2")
+    assert (found.path, found.a, found.b) == ("(whole)", '"ValueError: 1"', '"ValueError: 2"')
+
+
+def test_preview_is_one_short_line() -> None:
+    shown = preview(message(text="a\nb", single=0.1), 300)
+    assert shown.startswith('header: {stamp: 10.000000500, frame_id: "map"}, single: 0.1, ')
+    assert 'text: "a\\nb"' in shown
+    assert "points: [{x: 1.0, y: 2.0, z: 3.0}, {x: 4.0" in shown
+    assert len(preview(message(), 20)) == 20
+    assert preview(message(), 20).endswith("…")
+
+
+floats = st.floats(allow_nan=False, allow_infinity=False)
+
+
+@given(floats, floats)
+def test_ulp_distance_counts_the_floats_between(a: float, b: float) -> None:
+    distance = ulp_distance(a, b, 64)
+    assert distance == ulp_distance(b, a, 64)
+    assert (distance == 0) == (a == b)
+    step = math.nextafter(a, b) if hasattr(math, "nextafter") else float(np.nextafter(a, b))
+    if a != b:
+        assert ulp_distance(step, b, 64) == distance - 1  # type: ignore[operator]
+
+
+arrays = st.lists(
+    st.floats(width=32) | st.sampled_from([0.0, -0.0, math.nan, math.inf]), max_size=12
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(arrays, arrays, floats, floats, st.text(max_size=5), st.text(max_size=5))
+def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
+    ranges_a: list[float], ranges_b: list[float], x: float, y: float, s: str, t: str
+) -> None:
+    s, t = s.replace("\0", ""), t.replace("\0", "")
+    a = message(ranges=np.array(ranges_a, dtype=np.float32), double=x, text=s)
+    b = message(ranges=np.array(ranges_b, dtype=np.float32), double=y, text=t)
+    raw = [bytes(ALL._store.serialize_cdr(m, "pkg/msg/All")) for m in (a, b)]
+    found, _ = diff_messages(a, b, ONLY)
+    assert (raw[0] == raw[1]) == (not found)
+    swapped, _ = diff_messages(b, a, ONLY)
+    assert [(d.path, d.b, d.a, d.absolute) for d in swapped] == [
+        (d.path, d.a, d.b, d.absolute) for d in found
+    ]
