@@ -24,6 +24,8 @@ _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",
     "cat": "Print the events of a trace, one per line.",
+    "view": "Look at a trace in the terminal, or at two side by side.",
+    "rerun": "Show a trace, or two side by side, in Rerun.",
     "diff": "Find where two runs (or recordings) first part, and why.",
 }
 """Each is the function of its name in the module of its name, beside this one."""
@@ -82,6 +84,7 @@ def cli() -> None:
       rsltrace record job.yaml -o run.mcap    run it and write the trace
       rsltrace info run.mcap                  see what is in it
       rsltrace cat run.mcap | less            read every callback
+      rsltrace view run.mcap                  step through it
       rsltrace diff run1.mcap run2.mcap       see where two runs part, and why
 
     "rsltrace COMMAND --help" explains a command.

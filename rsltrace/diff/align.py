@@ -8,6 +8,7 @@ that came later than another is the same message still. What is left over is in 
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -218,7 +219,7 @@ class _Group:
         gaps = []
         for rows, places in ((self.a, self.places_a), (self.b, self.places_b)):
             stamps = [rows.stamp[place] for place in places]
-            gaps += [late - early for early, late in zip(stamps, stamps[1:], strict=False)]
+            gaps += [late - early for early, late in itertools.pairwise(stamps)]
         return median_low(gaps) if gaps else -1
 
 

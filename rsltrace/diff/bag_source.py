@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.bag import open_bag
+from rsltrace.diff.cut_off import CutOffFile, is_cut_off
 from rsltrace.diff.kinds import is_trace
-from rsltrace.errors import BagError, RsltraceError, TraceError
-from rsltrace.trace.format import MCAP_MAGIC, PREFIX_OWN, SCHEMA_ENCODING
+from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.trace.format import PREFIX_OWN, SCHEMA_ENCODING
 
 if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
@@ -68,7 +69,7 @@ def open_source(path: str | os.PathLike[str]) -> Source:
     """
     if is_trace(path):
         return _trace_source(path)
-    if _is_cut_off(Path(path)):
+    if is_cut_off(Path(path)):
         return _cut_off_source(Path(path))
     bag = open_bag(path)
     return Source(
@@ -130,89 +131,35 @@ def _payload_notes(trace: Trace) -> tuple[str, ...]:
     return ()
 
 
-# -- recordings that were cut off ------------------------------------------------------------------
-
-
-def _is_cut_off(path: Path) -> bool:
-    """Whether ``path`` is an MCAP file without the end of one."""
-    try:
-        if not path.is_file():
-            return False
-        with path.open("rb") as file:
-            if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-                return False
-            file.seek(max(path.stat().st_size - len(MCAP_MAGIC), 0))
-            return file.read() != MCAP_MAGIC
-    except OSError:
-        return False
-
-
 def _cut_off_source(path: Path) -> Source:
-    """Open an MCAP file that ends in the middle, as a recorder leaves it that was killed."""
-    topics: dict[tuple[str, str], SourceTopic] = {}
-    count = 0
-    for channel, schema, _ in _walk(path):
-        key = (channel.topic, schema.name if schema else "")
-        if key not in topics:
-            usable = schema is not None and schema.encoding == SCHEMA_ENCODING
-            text = schema.data.decode("utf-8", "replace") if usable else ""
-            topics[key] = SourceTopic(*key, text)
-        count += 1
-    if not count:
-        raise BagError(
-            f"{path}: the recording was cut off before its first whole chunk: nothing can be read"
+    cut = CutOffFile(path)
+    topics: dict[SourceTopic, int] = {}
+    numbers: dict[int, int] = {}
+    for channel in cut.channels.values():
+        schema = cut.schemas.get(channel.schema_id)
+        usable = schema is not None and schema.encoding == SCHEMA_ENCODING
+        topic = SourceTopic(
+            channel.topic,
+            schema.name if schema is not None else "",
+            schema.text if schema is not None and usable else "",
         )
-    numbers = {key: number for number, key in enumerate(topics)}
+        numbers[channel.id] = topics.setdefault(topic, len(topics))
 
     def read(wanted: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        for channel, schema, message in _walk(path):
-            number = numbers[channel.topic, schema.name if schema else ""]
-            if number in wanted:
-                yield message.log_time, number, message.data
+        return cut.messages({i: number for i, number in numbers.items() if number in wanted})
 
     return Source(
         path=str(path),
         kind="mcap",
-        topics=tuple(topics.values()),
+        topics=tuple(topics),
         read=read,
         close=lambda: None,
         complete=False,
         notes=(
-            f"{path} was cut off: {count} messages before the cut are compared ('mcap recover' "
-            "repairs it)",
+            f"{path} was cut off: {cut.message_count} messages in the first {cut.whole_bytes} of "
+            f"{cut.size} bytes are compared",
         ),
     )
-
-
-def _walk(path: Path) -> Iterator[tuple[Any, Any, Any]]:
-    """Yield (channel, schema or None, message) of every whole record, in file order."""
-    from mcap.exceptions import EndOfFile, McapError
-    from mcap.records import Channel, Header, Message, Schema
-    from mcap.stream_reader import StreamReader
-
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
-    with path.open("rb") as file:
-        records = StreamReader(file, validate_crcs=True).records
-        try:
-            for record in records:
-                if isinstance(record, Header) and record.profile not in ("ros2", ""):
-                    raise BagError(
-                        f"{path}: not a ROS 2 recording: its MCAP profile is {record.profile!r}"
-                    )
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels[record.channel_id]
-                    yield channel, schemas.get(channel.schema_id), record
-        except EndOfFile:
-            return
-        except (McapError, KeyError, ValueError) as error:
-            # A record cut in the middle of its own fields shows as one of these, at the very end.
-            if file.read(1):
-                raise BagError(f"{path}: damaged near byte {file.tell()}: {error}") from error
 
 
 # -- decoding --------------------------------------------------------------------------------------

@@ -288,4 +288,3 @@ def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]
     both = zip(longer, shorter, strict=False)
     result = [mine for mine, other in both if mine[:3] != other[:3]]
     return result + longer[len(shorter) :]
-

@@ -49,6 +49,10 @@ class Identity:
             raise TraceError(f"{trace.name} has no entity {int(places[int(np.argmax(unknown))])}")
         return numbers
 
+    def node_number(self, key: EntityKey) -> int:
+        """Return the number of the node that an entity belongs to (0: the run)."""
+        return self.nodes[self.by_key[key]]
+
     @property
     def nothing_in_common(self) -> bool:
         """Whether the two graphs share no entity at all: they are of different jobs."""

@@ -35,8 +35,17 @@ def number_text(value: Any, type_name: str = "float64") -> str:
             pattern = float_bits(float(value), bits)
             usual = pattern == _QUIET_NAN[bits]
             return "nan" if usual else f"nan(0x{pattern:0{bits // 4}x})"
-        return str(np.float32(value)) if bits == 32 else repr(float(value))
+        return _float32_text(np.float32(value)) if bits == 32 else repr(float(value))
     return str(int(value))
+
+
+def _float32_text(value: np.float32) -> str:
+    """Return what ``repr`` says of a float64 for a float32; numpy's own text changed with time."""
+    if value == 0.0 or 1e-4 <= abs(value) < 1e16:
+        return np.format_float_positional(value, unique=True, trim="0")
+    if np.isinf(value):
+        return "inf" if value > 0 else "-inf"
+    return np.format_float_scientific(value, unique=True, trim="-", exp_digits=2)
 
 
 def float_bits(value: float, bits: int) -> int:

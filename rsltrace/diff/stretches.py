@@ -6,6 +6,7 @@ the cut some more are loaded, so that an event near the cut finds its counterpar
 
 from __future__ import annotations
 
+import itertools
 from bisect import bisect_left
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -202,7 +203,7 @@ def mark_inverted(items: list[Item]) -> None:
     """Set ``inverted`` of pairs of one time that stand in another order in b than in a."""
     items.sort(key=lambda item: item.a)
     order = [item.b for item in items]
-    if all(early < late for early, late in zip(order, order[1:], strict=False)):
+    if all(early < late for early, late in itertools.pairwise(order)):
         return
     latest = -1
     for item in items:

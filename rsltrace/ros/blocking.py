@@ -11,6 +11,7 @@ In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RES
 
 from __future__ import annotations
 
+import os
 import threading
 import time
 import traceback
@@ -18,10 +19,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.errors import UnsupportedError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
 
@@ -30,6 +32,13 @@ if TYPE_CHECKING:
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
+_SHUTDOWN_NS = 10_000_000_000
+_SHORTEST_SLEEP_NS = 1_000_000
+_PATIENCE = 1000
+
+# Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
+# be collected: that would raise in them once more.
+_abandoned: list[greenlet] = []
 
 
 class RunEnded(BaseException):
@@ -113,6 +122,15 @@ def wait(
 
     :raises RunEnded: when the run ends before the wait does.
     """
+    if threading.get_ident() != core.thread or os.getpid() != core.process:
+        place = "thread" if os.getpid() == core.process else "process"
+        raise UnsupportedError(
+            f"a {place} that a node has started waits for {what}, which takes simulated time: only "
+            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
+            f"there, or let a callback wait and hand the result to the {place}"
+        )
+    if core.ending:
+        _refuse(core)
     group = _hold_group(core)
     blocked = Wait(core, what, group)
     core.flags |= _SUSPENDED
@@ -123,13 +141,24 @@ def wait(
     core.end_event()
     core.blocked[blocked] = None
     core.on_end = None
-    runner = core.runners.pop() if core.runners else greenlet(core.take_over, core.main)
-    runner.switch()
+    core.next_runner().switch()
     core.blocked.pop(blocked, None)
     blocked.resumed()
     if core.ending:
         raise RunEnded
     return not blocked.timed_out
+
+
+def _refuse(core: Core) -> NoReturn:
+    """Do not wait any more, the run is over. Who will not hear of it is left where it is."""
+    core.refused += 1
+    if core.refused > _PATIENCE and getcurrent() is not core.main:
+        core.refused = 0
+        core.end_event()
+        _abandoned.append(getcurrent())
+        assert core.main is not None
+        core.main.switch()
+    raise RunEnded
 
 
 def _hold_group(core: Core) -> object:
@@ -202,40 +231,60 @@ class FutureWake:
         self._event.set()
 
 
+_real_sleep = time.sleep
+_world: list[Core] = []
+
+
+def _sleep(seconds: float) -> None:
+    """Stand in for ``time.sleep``, in every run: modules may keep it (``from time import sleep``)."""
+    core = _world[-1] if _world else None
+    if (
+        core is None
+        or core.current_handle is None
+        or threading.get_ident() != core.thread
+        or os.getpid() != core.process
+    ):
+        _real_sleep(seconds)
+        return
+    if seconds < 0:
+        raise ValueError("sleep length must be non-negative")
+    for_ns = int(seconds * 1_000_000_000)
+    if core.ending and core.shutdown_ns < _SHUTDOWN_NS:
+        # Time stands still, but destroy_node and ``finally`` shall have their say: as much as
+        # ros2 launch leaves a node between SIGINT and SIGKILL.
+        core.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
+        return
+    wait(core, f"{seconds} s to pass", for_ns=for_ns)
+
+
 @contextmanager
 def simulated_waiting(core: Core) -> Iterator[None]:
     """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
+    import rclpy.action.client
     import rclpy.client
     import rclpy.node
     import rclpy.timer
-
-    real_sleep = time.sleep
-    thread = threading.get_ident()
-
-    def sleep(seconds: float) -> None:
-        if core.current_handle is None or threading.get_ident() != thread:
-            real_sleep(seconds)
-            return
-        if seconds < 0:
-            raise ValueError("sleep length must be non-negative")
-        wait(core, f"{seconds} s to pass", for_ns=int(seconds * 1_000_000_000))
 
     def now() -> float:
         return core.loop.now_ns / 1_000_000_000
 
     replaced = [
-        (time, "sleep", sleep),
-        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=sleep)),
-        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=sleep)),
+        (time, "sleep", _sleep),
+        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
+        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "threading", _threading(core, "the response to a service call")),
         (rclpy.timer, "threading", _threading(core, "the next period of a Rate")),
+        (rclpy.action.client, "threading", _threading(core, "an answer of an action server")),
+        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=core.random_uuid)),
     ]
     saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
     for module, name, value in replaced:
         setattr(module, name, value)
+    _world.append(core)
     try:
         yield
     finally:
+        _world.remove(core)
         for module, name, value in saved:
             setattr(module, name, value)
 

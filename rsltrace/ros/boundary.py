@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.ros import graph as graph_queries
+from rsltrace.ros.actions import ActionClientHandle, ActionServerHandle, GoalHandle
 from rsltrace.ros.arguments import InvalidArgumentsError
 from rsltrace.ros.clock import ClockEventHandle, ClockHandle
 from rsltrace.ros.codec import codec_for
@@ -66,9 +67,6 @@ _PASSED_THROUGH = (
 ).split()
 
 _LATER = {
-    "ActionClient": "actions",
-    "ActionServer": "actions",
-    "ActionGoalHandle": "actions",
     "LifecycleStateMachine": "lifecycle nodes",
     "EventsExecutor": "rclpy's EventsExecutor",
 }
@@ -172,6 +170,15 @@ class Boundary:
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
         return EventHandle(parent.core, parent, event_type)
+
+    def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
+        return ActionServerHandle(self, node.core, node, *arguments)
+
+    def ActionGoalHandle(self, server: ActionServerHandle, info: Any) -> GoalHandle:  # noqa: N802
+        return GoalHandle(server, info)
+
+    def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
+        return ActionClientHandle(node.core, node, *arguments)
 
     def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
         from rsltrace.ros.executor import WaitSetHandle

@@ -7,11 +7,15 @@ small; what only some events need belongs elsewhere.
 from __future__ import annotations
 
 import contextlib
+import os
+import random
 import struct
+import threading
 import traceback
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from greenlet import getcurrent, greenlet
 
@@ -46,8 +50,11 @@ class Core:
     ``recorder`` is None in a run that records nothing. ``current_*`` describe the event under way.
     """
 
-    def __init__(self, loop: EventLoop, *, base_dir: Path) -> None:
+    def __init__(self, loop: EventLoop, *, base_dir: Path, seed: int = 0) -> None:
         self.loop = loop
+        self.seed = seed
+        self.thread = threading.get_ident()
+        self.process = os.getpid()
         self.recorder: Recorder | None = None
         self.base_dir = base_dir
         self.graph: Graph
@@ -63,9 +70,12 @@ class Core:
         self.on_end: Callable[[], None] | None = None
         self.blocked: dict[Wait, None] = {}
         self.runners: list[greenlet] = []
+        self.runner_maker: greenlet | None = None
         self.main: greenlet | None = None
         self.runner_error: BaseException | None = None
         self.ending = False
+        self.shutdown_ns = 0
+        self.refused = 0
         self.stuck: list[str] = []
         self.error: RunError | None = None
         self.logs: Logs
@@ -81,6 +91,7 @@ class Core:
         self._entity_count = 0
         self._parked: dict[object, list[Callable[[], None]]] = {}
         self._channels: dict[str, int] = {}
+        self._uuids: dict[str, random.Random] = {}
 
     # -- the hot path ------------------------------------------------------------------------
 
@@ -132,7 +143,32 @@ class Core:
         loop.events += 1
         self.flags = 0
 
+    @contextlib.contextmanager
+    def outside_events(self) -> Iterator[None]:
+        """Run what belongs to no event (a stop function, finalizers): it cannot wait."""
+        handle, self.current_handle = self.current_handle, None
+        try:
+            yield
+        finally:
+            self.current_handle = handle
+
     # -- blocked calls -------------------------------------------------------------------------
+
+    def next_runner(self) -> greenlet:
+        """Return the stack to switch to when a callback blocks: who runs the loop from then on.
+
+        New runners all begin on the stack of one maker, so that however many calls are blocked, the
+        next callback does not run deeper (in Python's recursion limit, and in C).
+        """
+        if self.runners:
+            return self.runners.pop()
+        if self.runner_maker is None:
+            self.runner_maker = greenlet(self._make_runners, self.main)
+        return self.runner_maker
+
+    def _make_runners(self) -> None:
+        while True:
+            greenlet(self.take_over, self.main).switch()
 
     def take_over(self) -> None:
         """Run the loop on a stack of its own, because its runner's callback has blocked.
@@ -177,30 +213,27 @@ class Core:
             else:
                 self.unowned.append(handle)
 
+    def random_uuid(self) -> uuid.UUID:
+        """Return a random UUID from the stream of the present node: goals need ids."""
+        name = self.current_node.fully_qualified_name if self.current_node is not None else ""
+        stream = self._uuids.setdefault(name, random.Random(f"goal ids {self.seed} {name}"))
+        return uuid.UUID(int=stream.getrandbits(128), version=4)
+
     def watch(self, topic: str, watcher: Callable[[Any, bytes], None]) -> None:
         """Call ``watcher(message class, canonical bytes)`` for every message on a topic."""
         self.watchers[topic] = watcher
 
     def activate_node(self, node: NodeHandle) -> None:
         """Run the callbacks of a node from now on: an executor of this run has it."""
-        for lists in ("subscriptions", "timers", "clients", "services", "guards", "waitables"):
-            for wrapper in getattr(node.wrapper, lists):
-                handle = getattr(wrapper, "handle", None) or getattr(
-                    wrapper, "_EventHandler__event", None
-                )
-                if handle is not None and handle.wrapper is None:
-                    handle.node = handle.node or node
-                    handle.find_wrapper()
+        for handle in _handles(node):
+            if handle.wrapper is None:
+                handle.node = handle.node or node
+                handle.find_wrapper()
 
     def deactivate_node(self, node: NodeHandle) -> None:
         """Stop running the callbacks of a node; what it has received stays in its queues."""
-        for lists in ("subscriptions", "timers", "clients", "services", "guards", "waitables"):
-            for wrapper in getattr(node.wrapper, lists):
-                handle = getattr(wrapper, "handle", None) or getattr(
-                    wrapper, "_EventHandler__event", None
-                )
-                if handle is not None:
-                    handle.deactivate()
+        for handle in _handles(node):
+            handle.deactivate()
         node.wrapper = None
 
     def channel(
@@ -270,18 +303,24 @@ class Core:
             return
         if isinstance(error, OutputError):
             raise error  # the trace cannot be written: no event may be lost quietly
+        if os.getpid() != self.process:
+            _end_child(error)
         self.flags |= _RAISED
         name = self.current_node.fully_qualified_name if self.current_node else ""
         label = handle.describe()
         stamp_ns = self.loop.now_ns
         text = user_traceback(error)
+        said = text_of(error)
         if self.recorder is not None:
-            content = f"{type(error).__qualname__}\0{error}"
+            content = f"{type(error).__qualname__}\0{said}"
             self.recorder.detail(
                 OutputKind.EXCEPTION, self.current_entity, stamp_ns, text, hash64(content.encode())
             )
         if isinstance(error, SystemExit):
-            self.loop.stop(Stop(f"{label} raised SystemExit", _exit_status(error)))
+            reason = f"{label} raised SystemExit"
+            if error.code is not None and not isinstance(error.code, int):
+                reason += f": {said}"  # what Python would print
+            self.loop.stop(Stop(reason, _exit_status(error)))
             return
         if isinstance(error, KeyboardInterrupt):
             self.loop.stop(Stop("interrupted", 130))
@@ -290,11 +329,11 @@ class Core:
         if isinstance(error, RsltraceError):
             # Raised by the middleware itself: the message says what to do, this says where.
             failure = type(error).__new__(type(error))
-            Exception.__init__(failure, f"{error}\n  in {where}")
+            Exception.__init__(failure, f"{said}\n  in {where}")
             self.error = failure if isinstance(failure, RunError) else RunError(str(failure))
         else:
             self.error = NodeError(
-                f"{where} raised {type(error).__qualname__}: {error}",
+                f"{where} raised {type(error).__qualname__}: {said}",
                 node=name,
                 entity=label,
                 stamp_ns=stamp_ns,
@@ -315,6 +354,18 @@ class Core:
         self.execute(_Outside(describe), entity, node, kind, callback, (), NO_EVENT, 0, 0)
 
 
+def _handles(node: NodeHandle) -> Iterator[Any]:
+    """Yield what runs callbacks of a node, in creation order of each kind."""
+    for lists in ("subscriptions", "timers", "clients", "services", "guards"):
+        for wrapper in getattr(node.wrapper, lists):
+            yield wrapper.handle
+    for waitable in node.wrapper.waitables:
+        for name in ("_EventHandler__event", "_handle", "_client_handle"):
+            handle = getattr(waitable, name, None)
+            if handle is not None:
+                yield from getattr(handle, "parts", [handle])
+
+
 class _Outside:
     """A nameable stand-in for an entity in ``run_outside``."""
 
@@ -331,6 +382,30 @@ def _exit_status(error: SystemExit) -> int:
     return error.code if isinstance(error.code, int) else 1
 
 
+def _end_child(error: BaseException) -> NoReturn:
+    """End a process that a callback forked and left by an exception: the run is its parent's."""
+    if not isinstance(error, SystemExit):
+        traceback.print_exception(error)
+    elif error.code is not None and not isinstance(error.code, int):
+        print(text_of(error), file=sys.stderr)
+    with contextlib.suppress(Exception):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit((_exit_status(error) if isinstance(error, SystemExit) else 1) & 0xFF)
+
+
+def text_of(error: BaseException) -> str:
+    """Return what an exception says, as text that can be written to any file."""
+    try:
+        return _writable(str(error))
+    except Exception:
+        return "(its text could not be made)"
+
+
+def _writable(text: str) -> str:
+    return text.encode("utf-8", "backslashreplace").decode()
+
+
 def user_traceback(error: BaseException) -> str:
     """Return the traceback without the frames of rsltrace that lead to the user's code."""
     tb = error.__traceback__
@@ -339,5 +414,5 @@ def user_traceback(error: BaseException) -> str:
     if tb is None:
         tb = error.__traceback__
     with contextlib.suppress(Exception):
-        return "".join(traceback.format_exception(type(error), error, tb))
+        return _writable("".join(traceback.format_exception(type(error), error, tb)))
     return f"{type(error).__qualname__} (its text could not be made)"

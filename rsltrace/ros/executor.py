@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import Executor
@@ -33,8 +34,8 @@ class SimExecutor(Executor):  # type: ignore[misc]
         if type(callback) in (Resume, FutureWake):
             callback(*args)
             return None
-        if getattr(callback, "__func__", None) is _remove_pending_request():
-            callback(*args)  # rclpy's own bookkeeping, not an event
+        if getattr(callback, "__func__", None) in _bookkeeping():
+            callback(*args)  # rclpy's own, not an event
             return None
         return create_task(self._core, callback, args, kwargs)
 
@@ -96,10 +97,20 @@ class SimExecutor(Executor):  # type: ignore[misc]
             wait(self._core, "the run to end")
 
 
-def _remove_pending_request() -> Any:
+@lru_cache(maxsize=1)
+def _bookkeeping() -> frozenset[Any]:
+    """Return the methods by which rclpy forgets requests that have been answered."""
+    from rclpy.action import ActionClient
     from rclpy.client import Client
 
-    return Client.remove_pending_request
+    return frozenset(
+        {
+            Client.remove_pending_request,
+            ActionClient._remove_pending_goal_request,
+            ActionClient._remove_pending_cancel_request,
+            ActionClient._remove_pending_result_request,
+        }
+    )
 
 
 class WaitSetHandle:

@@ -47,8 +47,10 @@ class World:
     :param echo: print log records on stderr.
     """
 
-    def __init__(self, loop: EventLoop, *, base_dir: Path, echo: bool = True) -> None:
-        self.core = Core(loop, base_dir=base_dir)
+    def __init__(
+        self, loop: EventLoop, *, base_dir: Path, seed: int = 0, echo: bool = True
+    ) -> None:
+        self.core = Core(loop, base_dir=base_dir, seed=seed)
         self.core.graph = Graph()
         self.core.logs = Logs(self.core, echo=echo)
         loop.idle.append(lambda: poll(self.core))
@@ -83,6 +85,7 @@ class World:
         import rclpy
 
         self.core.main_context = None  # from here on a shutdown is ours
+        self.core.current_handle = None
         self.core.executor.shutdown()
         rclpy.try_shutdown()
         # What user code has left behind must meet its finalizers while rclpy is still simulated.
@@ -161,7 +164,9 @@ class World:
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
         core = self.core
+        core.ending = True
         for node in self.nodes:
+            core.shutdown_ns = 0
             handle = node.handle
             if handle._destroyed or core.error is not None:
                 continue

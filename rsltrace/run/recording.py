@@ -89,7 +89,7 @@ def run(
             livelock_limit=job.livelock_limit,
             between_steps=housekeeping(lambda: loop, observer, end_ns_of(job, start_ns)),
         )
-        world = stack.enter_context(World(loop, base_dir=job.base_dir, echo=echo))
+        world = stack.enter_context(World(loop, base_dir=job.base_dir, seed=job.seed, echo=echo))
         # Whatever can be known to be wrong is found before a file is made.
         loop.stop_conditions = tuple(stop_conditions(job, start_ns))
         entries = _prepare(job)

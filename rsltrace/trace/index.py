@@ -236,7 +236,9 @@ def _chunk_entry(summary: bytes, begin: int) -> ChunkEntry:
     if len(starts) == 1:  # events or outputs: most chunks
         index_at, channel_id = starts[0]
         count = (behind - index_at - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
-        return ChunkEntry(span, {channel_id: count}, {channel_id: Span(index_at, behind - index_at)})
+        return ChunkEntry(
+            span, {channel_id: count}, {channel_id: Span(index_at, behind - index_at)}
+        )
     starts.sort()
     indexes: dict[int, Span] = {}
     counts: dict[int, int] = {}

@@ -96,6 +96,8 @@ def installed_message_classes() -> list[type]:
 
 
 CLASSES = installed_message_classes()
+
+
 def _case_id(value: object) -> str:
     """Name a parameter; never with an address, which pytest-xdist's workers would not share."""
     return repr(value).split(" object at ")[0]

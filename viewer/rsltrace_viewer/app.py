@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
+from time import perf_counter
 from typing import Any, ClassVar
 
 from textual import events
@@ -16,9 +17,11 @@ from textual.app import App, ComposeResult, SystemCommand
 from textual.binding import Binding
 from textual.containers import Container
 from textual.screen import Screen
+from textual.worker import get_current_worker
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import RsltraceError, TraceError
 from rsltrace_viewer.background import walk
+from rsltrace_viewer.follow import Follow
 from rsltrace_viewer.keys import KEYS
 from rsltrace_viewer.model.effects import effects_of
 from rsltrace_viewer.model.inspector import Effects, summary_line
@@ -36,7 +39,7 @@ from rsltrace_viewer.widgets.prompt import Prompt, Question
 from rsltrace_viewer.widgets.timeline import Row, Timeline
 
 _WIDE = 110
-_FOLLOW_S = 1.0
+_REPORT_S = 0.25
 _INSPECT_S = 0.02
 """Events are inspected when one has stopped at them for this long: holding a key stays smooth."""
 
@@ -68,12 +71,25 @@ class ViewerApp(App[None]):
     .only-lanes #lanes { height: 1fr; }
     """
 
-    def __init__(self, session: Session, *, start: int | None = None, light: bool = False) -> None:
+    def __init__(
+        self,
+        session: Session,
+        *,
+        start: int | None = None,
+        light: bool = False,
+        follow: bool = False,
+        filter_text: str = "",
+    ) -> None:
+        """Show ``session``, at place ``start`` (None: where it is)."""
         super().__init__()
         self.session = session
+        self.busy = True
+        """Whether something is about to be drawn that is not yet: for pictures and tests."""
         self._start = start
+        self._first_filter = filter_text
         self._status = ""
-        self._following = False
+        self._follow: Follow | None = None
+        self._follow_at_once = follow
         self.theme = "textual-light" if light else "textual-dark"
 
     # Setting up.
@@ -106,7 +122,43 @@ class ViewerApp(App[None]):
 
     def _after_second(self) -> None:
         self._show_inspector()
+        self.busy = False
+        if self._first_filter:
+            self._filter(self._first_filter)
+        if self._follow_at_once:
+            self.action_follow()
         walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
+        comparison = self.session.comparison
+        if comparison is not None and not comparison.identical:
+            self.run_worker(self._explain, group="diff", thread=True, exit_on_error=False)
+
+    def _explain(self) -> None:
+        """Let the diff find the reason, then match the rest of the runs. Runs in a thread."""
+        comparison = self.session.comparison
+        worker = get_current_worker()
+        assert comparison is not None  # started for two runs only
+        try:
+            comparison.finish_diff()
+        except RsltraceError as error:
+            self.call_from_thread(self.notify, str(error), severity="error")
+        if not worker.is_cancelled:
+            self.call_from_thread(self._explained)
+        shown = perf_counter()
+        while not comparison.done and not worker.is_cancelled:
+            try:
+                stretch = comparison.fetch()
+            except RsltraceError as error:
+                self.call_from_thread(self.notify, str(error), severity="error")
+                return
+            # On the app's thread: the view must not change while a screen is drawn from it.
+            self.call_from_thread(self.session.take_stretch, stretch)
+            if comparison.done or perf_counter() - shown > _REPORT_S:
+                self.call_from_thread(self._show_rows)
+                shown = perf_counter()
+
+    def _explained(self) -> None:
+        self._show_header()
+        self._show_inspector(top=False)
 
     def _summaries(self) -> Iterator[int]:
         for number in self.session.lane_maker.order():
@@ -220,12 +272,14 @@ class ViewerApp(App[None]):
             self.timeline.redraw()
         self._show_lanes()
         self._show_footer()
+        self.busy = True
         self.set_timer(_INSPECT_S, self._inspect_if_still(session.place))
 
     def _inspect_if_still(self, place: int) -> Any:
         def inspect() -> None:
             if self.session.place == place:
                 self._show_inspector()
+                self.busy = False
 
         return inspect
 
@@ -514,7 +568,7 @@ class ViewerApp(App[None]):
             self._say("")
         elif session.filter_text:
             self._filter("")
-        elif self._following:
+        elif self._follow is not None:
             self.action_follow()
 
     # Looking.
@@ -595,9 +649,42 @@ class ViewerApp(App[None]):
 
     def action_other(self) -> None:
         """Inspect the differences, run a, run b in turn."""
+        side = self.session.next_side()
+        self._show_rows()
+        self._show_inspector()
+        self._say({"diff": "the differences", "a": "run a only", "b": "run b only"}[side])
 
     def action_follow(self) -> None:
         """Follow a file that is still being recorded, or stop that."""
+        if self._follow is not None:
+            self._follow.stop()
+            self._follow = None
+            self._say("no longer following")
+        elif self.session.b is not None:
+            self._say("only one trace can be followed")
+        elif self.session.a.trace.complete:
+            self._say("this trace is finished: there is nothing to follow")
+        else:
+            self._follow = Follow(self, Path(self.session.a.trace.name), self._grown)
+            self._say("following; Esc stops")
+
+    def _grown(self, run: Run) -> None:
+        """Show a trace that got longer."""
+        session = self.session
+        at_end = session.empty or session.place >= session.view.count - 1
+        session.replace_run(run)
+        self._fit(self.size.width, self.size.height)
+        self._show_header()
+        if session.filter_text:
+            self._filter(session.filter_text)
+        if at_end and not session.empty:
+            self.go(session.view.count - 1, remember=False)
+        self._show_rows()
+        self._show_lanes()
+        if run.trace.complete:
+            self._follow = None
+            self._say("the recording has ended")
+        walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
         """Offer all keys by their help in the command palette."""

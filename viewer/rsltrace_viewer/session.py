@@ -6,13 +6,13 @@ The app changes this object and draws what it says; tests drive it directly.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 from rsltrace_viewer.model import match
-from rsltrace_viewer.model.compare import Comparison
 from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector import Effects, inspect
 from rsltrace_viewer.model.lanes import LaneMaker, Lanes, Window
@@ -23,6 +23,10 @@ from rsltrace_viewer.model.run import WITH_TOPIC, Run
 from rsltrace_viewer.model.shown import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.timeline import Columns, EventText, EventTexts, Sign, layout, node_of
 from rsltrace_viewer.model.view import SingleView, View
+
+if TYPE_CHECKING:
+    from rsltrace.diff.stretches import Stretch
+    from rsltrace_viewer.model.compare import Comparison  # the diff is loaded for two traces only
 
 SEEK: dict[str, tuple[Condition, str]] = {
     "raised": (match.RAISED, "exception"),
@@ -42,11 +46,17 @@ class Session:
         self.comparison: Comparison | None = None
         self.side = "diff" if b is not None else "a"
         self.view: View = SingleView(a.count)
-        self.rows: Rows = AllRows(a.count)
+        if b is not None:
+            from rsltrace_viewer.model.compare import Comparison
+
+            self.view = self.comparison = Comparison(a, b)
+        self.rows: Rows = AllRows(self.view.count)
         self.filter_text = ""
         self.search: Condition | None = None
         self.search_text = ""
         self.place = 0
+        if self.comparison is not None:
+            self.place = self.comparison.first_place or 0
         self.history = History()
         self.marks = Marks()
         self.openness = Openness()
@@ -63,6 +73,40 @@ class Session:
         self.a.close()
         if self.b is not None:
             self.b.close()
+
+    def take_stretch(self, stretch: Stretch | None) -> None:
+        """Show another stretch of two runs; the selected event stays selected."""
+        comparison = self.comparison
+        if comparison is None:
+            return
+        a, b = comparison.a(self.place), comparison.b(self.place)
+        comparison.take(stretch)
+        if a is not None:
+            self.place = comparison.place_of(a)
+        elif b is not None:
+            self.place = comparison.place_of(b, other=True)
+        if not self.filter_text:
+            self.rows = AllRows(comparison.count)
+
+    def replace_run(self, run: Run) -> None:
+        """Show a newer state of the same recording. The old file is closed."""
+        old, self.a = self.a, run
+        self._texts["a"] = EventTexts(run)
+        self.view = SingleView(run.count)
+        self.rows = AllRows(run.count)
+        whole = self.window == self.lane_maker.whole
+        self.lane_maker = LaneMaker(run)
+        self._lanes = None
+        if whole:
+            self.window = self.lane_maker.whole
+        old.close()
+
+    def next_side(self) -> str:
+        """Inspect the differences, run a or run b; return which it is now."""
+        if self.b is not None:
+            sides = ("diff", "a", "b")
+            self.side = sides[(sides.index(self.side) + 1) % 3]
+        return self.side
 
     # What is selected.
 
@@ -134,7 +178,9 @@ class Session:
         if here is None:
             return []
         if self.comparison is not None and self.side == "diff":
-            return self.comparison.lines(self.place, self.openness)
+            from rsltrace_viewer.model.differences import pair_lines
+
+            return pair_lines(self.comparison, self.place, self.openness)
         return inspect(here[0], here[1], self.openness, self.effects)
 
     # Lanes.

@@ -101,6 +101,10 @@ class Section:
         rows = [*more, *self.rows] if self.newest_last else [*self.rows, *more]
         return [BLANK, *([self.title] if self.title else []), *rows]
 
+    def spare(self, *, hard: bool) -> int:
+        """Return how many rows could go; ``hard`` if it must be."""
+        return len(self.rows) - (min(self.keep, self.least) if hard else self.keep)
+
     def shorten(self) -> None:
         """Leave out the row that matters least."""
         self.rows.pop(0 if self.newest_last else -1)
@@ -117,13 +121,10 @@ def fitted(head: list[Line], sections: Sequence[Section], height: int | None) ->
     The section that has most to spare is shortened first; each says how much it leaves out.
     """
 
-    def too_high() -> bool:
-        return height is not None and len(head) + sum(part.height for part in sections) > height
-
-    for floor in (lambda part: part.keep, lambda part: min(part.keep, part.least)):
-        while too_high():
-            part = max(sections, key=lambda part: len(part.rows) - floor(part))
-            if len(part.rows) <= floor(part):
+    for hard in (False, True):
+        while height is not None and len(head) + sum(part.height for part in sections) > height:
+            part = max(sections, key=lambda part: part.spare(hard=hard))
+            if part.spare(hard=hard) <= 0:
                 break
             part.shorten()
     return [*head, *(row for part in sections for row in part.lines())]

@@ -35,7 +35,8 @@ from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 
 HEIGHT = 40
-"""Lines of a report unless everything is asked for: what fits a screen."""
+"""Lines of a report unless more is asked for: what fits a screen."""
+_CONTEXT = 5
 
 
 def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Line]:
@@ -45,19 +46,20 @@ def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Lin
         sections = [_settings(diff, width), _notes(diff, width)]
         return fitted(head, sections, None)
     first, *others = diff.divergences
-    sections = _divergence(first, width)
+    sections = _divergence(first, width, options)
     sections.append(_afterwards(diff, width))
     sections.append(_settings(diff, width))
     sections.append(_notes(diff, width))
     if not options.everything:
         sections.append(_next(first, len(others), width))
-        return fitted(head, sections, HEIGHT)
+        # Whoever asks for a longer context wants to see it.
+        return fitted(head, sections, HEIGHT + 2 * max(options.context - _CONTEXT, 0))
     sections.append(_next(first, 0, width))
     lines = fitted(head, sections, None)
     for number, other in enumerate(others, start=2):
         lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
         lines += wrapped(printable(other.sentence), width, style=BAD)
-        lines += fitted([], [*_divergence(other, width), _next(other, 0, width)], None)
+        lines += fitted([], [*_divergence(other, width, options), _next(other, 0, width)], None)
     return lines
 
 
@@ -104,11 +106,11 @@ def _side_cells(name: str, style: str, side: Side) -> list[Piece]:
     ]
 
 
-def _divergence(found: Divergence, width: int) -> list[Section]:
+def _divergence(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
     return [
         _event(found, width),
         _cause(found, width),
-        *_before(found, width),
+        *_before(found, width, options),
         _reaches(found, width),
     ]
 
@@ -119,9 +121,10 @@ def _event(found: Divergence, width: int) -> Section:
     some = a or b
     assert some is not None or not found.messages
     if a is not None and b is not None and a.entity == b.entity and a.kind is b.kind:
-        title = f"{event_text(a)}, its event {a.position + 1}"
-        if a.position != b.position:
-            title += f" (b: {b.position + 1})"
+        title = event_text(a)
+        if min(a.position, b.position) >= 0:
+            title += f", its event {a.position + 1}"
+            title += f" (b: {b.position + 1})" if a.position != b.position else ""
         if (a.index, a.stamp_ns) == (b.index, b.stamp_ns):
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         else:
@@ -203,20 +206,26 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
     )
 
 
-def _before(found: Divergence, width: int) -> list[Section]:
+def _before(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
     """Return the last events before: of both runs, and of the node where that says more."""
-    sections = [_listed("before it", found.before_a, found.before_b, width, least=1)]
+    keep = options.context if options.context > _CONTEXT else 2
+    sections = [_listed("before it", found.before_a, found.before_b, width, keep, least=1)]
     seen = {event.index for event in (*found.before_a, *found.before_b)}
     own = (*found.same_node_a, *found.same_node_b)
     some = found.a or found.b
     if some is not None and any(event.index not in seen for event in own):
         title = f"before it in {printable(some.entity.node) or 'the run'}"
-        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, least=0))
+        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, keep, least=0))
     return sections
 
 
 def _listed(
-    title: str, a: tuple[EventView, ...], b: tuple[EventView, ...], width: int, least: int
+    title: str,
+    a: tuple[EventView, ...],
+    b: tuple[EventView, ...],
+    width: int,
+    keep: int,
+    least: int,
 ) -> Section:
     if not a and not b:
         return NOTHING
@@ -224,7 +233,7 @@ def _listed(
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
         heading = line((f"{title} (the same in both)", TITLE))
-        return Section(heading, rows, 2, "events", least, newest_last=True)
+        return Section(heading, rows, keep, "events", least, newest_last=True)
     half = (width - 5) // 2
     longest = max(len(a), len(b))
     left = [None] * (longest - len(a)) + list(a)
@@ -235,7 +244,7 @@ def _listed(
         first = f"{_brief(one, half):<{half}}"
         rows.append(line("  ", first, (mark, BAD), f" {_brief(other, half)}".rstrip()))
     heading = line((f"{title} ", TITLE), ("(a left, b right)", FAINT))
-    return Section(heading, rows, 2, "events", least, newest_last=True)
+    return Section(heading, rows, keep, "events", least, newest_last=True)
 
 
 def _brief(event: EventView | None, width: int) -> str:

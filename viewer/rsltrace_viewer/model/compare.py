@@ -1,27 +1,211 @@
-"""Two runs next to each other: placeholder until the engine is there."""
+"""Two runs next to each other: which events belong together, what differs in them, and why.
+
+Up to the first difference a place is an event of both runs and nothing is read. From there on
+events are matched by the diff, a stretch at a time, as far as one has come; what has not been
+matched yet stands at the end, unmatched, and says so.
+"""
 
 from __future__ import annotations
 
-from rsltrace_viewer.model.lines import Line, Openness
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+
+from rsltrace.diff.identity import identify
+from rsltrace.diff.model import Diff
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.rows import Run as DiffRun
+from rsltrace.diff.search import first_difference
+from rsltrace.diff.stretches import Item, Stretch, Stretches
+from rsltrace_viewer.model.lanes import Window
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.timeline import Sign
+
+_EVENTS_PER_STRETCH = 2000
+_ALIGNED_MAX = 2_000_000
+"""Events after the first difference that are matched; beyond, rows are not compared."""
+
+_SIGNS = tuple(Sign)
+_CODES = {sign: code for code, sign in enumerate(_SIGNS)}
+_UNMATCHED = -1
 
 
 class Comparison:
-    """Two runs."""
+    """The view of two runs (see ``View``). ``advance`` matches another stretch."""
 
-    def lines(self, place: int, openness: Openness) -> list[Line]:
-        """Return lines."""
-        return []
+    def __init__(self, a: Run, b: Run) -> None:
+        """Find the first difference and match the events around it. Raises TraceError."""
+        self.run_a = a
+        self.run_b = b
+        self.diff: Diff | None = None
+        first = first_difference(a.trace, b.trace)
+        self.agreeing = a.count if first is None else first
+        self.done = first is None
+        self._a = array("q")
+        self._b = array("q")
+        self._signs = array("B")
+        self._place_a = array("q")
+        self._place_b = array("q")
+        self._blocks: list[int] = []
+        """Places where rows begin to differ, after one that does not."""
+        self._first_place: int | None = None if first is None else first
+        self._end_a = self._end_b = self.agreeing
+        self._stretches: Iterator[Stretch] = iter(())
+        identity = identify(a.trace, b.trace)
+        self.diff_run_a = DiffRun(a.trace, identity, False)
+        self.diff_run_b = DiffRun(b.trace, identity, True)
+        if first is not None:
+            self._stretches = iter(
+                Stretches(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_STRETCH)
+            )
+            self.advance()
+            self._first_place = self._blocks[0] if self._blocks else first
 
-    identical = True
+    # The view.
+
+    @property
+    def count(self) -> int:
+        """How many places there are."""
+        rest = max(self.run_a.count - self._end_a, self.run_b.count - self._end_b)
+        return self.agreeing + len(self._a) + rest
+
+    def a(self, place: int) -> int | None:
+        """Return the index of the event of run a at a place."""
+        return self._index(place, self._a, self._end_a, self.run_a.count)
+
+    def b(self, place: int) -> int | None:
+        """Return the index of the event of run b at a place."""
+        return self._index(place, self._b, self._end_b, self.run_b.count)
+
+    def sign(self, place: int) -> Sign:
+        """Return how the two compare."""
+        if place < self.agreeing:
+            return Sign.MATCH
+        matched = place - self.agreeing
+        return _SIGNS[self._signs[matched]] if matched < len(self._signs) else Sign.UNKNOWN
+
+    def place_of(self, index: int, *, other: bool = False) -> int:
+        """Return the place of an event of run a (``other``: of run b)."""
+        if index < self.agreeing:
+            return index
+        places, end = (self._place_b, self._end_b) if other else (self._place_a, self._end_a)
+        matched = index - self.agreeing
+        if matched < len(places) and places[matched] >= 0:
+            return places[matched]
+        return self.agreeing + len(self._a) + max(index - end, 0)
+
+    def _index(self, place: int, matched: array[int], end: int, count: int) -> int | None:
+        if place < self.agreeing:
+            return place
+        offset = place - self.agreeing
+        if offset < len(matched):
+            index = matched[offset]
+            return index if index >= 0 else None
+        index = end + offset - len(matched)
+        return index if index < count else None
+
+    # Matching.
+
+    @property
+    def progress(self) -> float:
+        """The part of both runs that is matched, 0 to 1."""
+        total = self.run_a.count + self.run_b.count
+        return 1.0 if self.done else (self._end_a + self._end_b) / max(total, 1)
+
+    def advance(self) -> None:
+        """Match the next stretch."""
+        self.take(self.fetch())
+
+    def fetch(self) -> Stretch | None:
+        """Match the next stretch without showing it yet, in any thread. Raises TraceError."""
+        return next(self._stretches, None)
+
+    def take(self, stretch: Stretch | None) -> None:
+        """Show a stretch (None: there is no more)."""
+        if stretch is None:
+            self.done = True
+            return
+        for item in stretch.items:
+            self._add(item, _sign(item, stretch))
+        self._end_a, self._end_b = stretch.end_a, stretch.end_b
+        self.done = stretch.at_end or len(self._a) > _ALIGNED_MAX
+
+    def _add(self, item: Item, sign: Sign) -> None:
+        place = self.agreeing + len(self._a)
+        plain = sign is Sign.MATCH
+        if not plain and (not self._signs or self._signs[-1] == _CODES[Sign.MATCH]):
+            self._blocks.append(place)
+        self._a.append(item.a)
+        self._b.append(item.b)
+        self._signs.append(_CODES[sign])
+        _enter(self._place_a, item.a - self.agreeing, place)
+        _enter(self._place_b, item.b - self.agreeing, place)
+
+    def finish_diff(self) -> None:
+        """Let the diff say why the runs part. Takes a while; meant for a thread."""
+        from rsltrace.diff.engine import diff_traces
+
+        self.diff = diff_traces(self.run_a.trace, self.run_b.trace, DiffOptions())
+
+    # What it says.
+
+    @property
+    def identical(self) -> bool:
+        """Whether the runs did the same."""
+        return self._first_place is None
+
+    @property
+    def first_place(self) -> int | None:
+        """The place of the first difference; None if there is none."""
+        return self._first_place
 
     def verdict(self) -> str:
-        """Return a sentence."""
-        return ""
+        """Return in one sentence how the runs compare."""
+        if self._first_place is None:
+            return f"= identical: all {self.run_a.count:,} events are the same"
+        if self.diff is not None:
+            return f"≠ {self.diff.verdict.value}: {self.diff.sentence}"
+        return f"≠ the runs agree for {self.agreeing:,} events; looking for the cause …"
 
-    def divergence_in(self, window: object) -> int | None:
-        """Return where."""
-        return None
+    def divergence_in(self, window: Window) -> int | None:
+        """Return the time (or index in a) of the first difference, for the lanes."""
+        if self._first_place is None:
+            return None
+        index = self.a(self._first_place)
+        if index is None:
+            other = self.b(self._first_place)
+            assert other is not None  # a place stands for something
+            return self.agreeing if window.order else self.run_b.stamp(other)
+        return index if window.order else self.run_a.stamp(index)
 
     def next_divergence(self, place: int, step: int) -> int | None:
-        """Return where."""
-        return None
+        """Return where the runs next begin to differ after (or before) a place."""
+        if step > 0:
+            found = bisect_right(self._blocks, place)
+        else:
+            found = bisect_left(self._blocks, place) - 1
+        return self._blocks[found] if 0 <= found < len(self._blocks) else None
+
+
+def _sign(item: Item, stretch: Stretch) -> Sign:
+    if item.b < 0:
+        return Sign.ONLY_A
+    if item.a < 0:
+        return Sign.ONLY_B
+    if item.plain:
+        return Sign.MATCH
+    if item.same:
+        return Sign.MOVED
+    a, b = stretch.rows_a, stretch.rows_b
+    i, j = item.a - a.first, item.b - b.first
+    did_the_same = (a.input[i], a.content[i], a.flags[i]) == (b.input[j], b.content[j], b.flags[j])
+    return Sign.MOVED if did_the_same else Sign.DIFFERS
+
+
+def _enter(places: array[int], offset: int, place: int) -> None:
+    """Note a place by index; what is between was matched with an earlier stretch, or comes later."""
+    if offset < 0:
+        return
+    while len(places) <= offset:
+        places.append(_UNMATCHED)
+    places[offset] = place

@@ -26,8 +26,6 @@ class FrameTree:
     parents: dict[str, str] = field(default_factory=dict)
     drawn: dict[str, str] = field(default_factory=dict)
     """By entity path, the frame of what is drawn there."""
-    supposed: dict[str, tuple[str, str]] = field(default_factory=dict)
-    """By child frame: parent and topic of an odometry that would place it, if no /tf does."""
 
     def add_edge(self, parent: str, child: str) -> None:
         """Note that a transform places ``child`` in ``parent``."""
@@ -50,14 +48,10 @@ class FrameTree:
         return dict(sorted(result.items(), key=lambda item: -len(item[1])))
 
 
-def frame_chunks(prefixes: list[str], trees: list[FrameTree]) -> Iterator[Chunk]:
-    """Yield where views look from, and what joins the roots of several runs."""
-    roots = dict.fromkeys(root for tree in trees for root in tree.by_root())
-    for root in roots:
-        frame = rr.CoordinateFrame.descriptor_frame()
-        yield from make_chunk(origin_of(root), (), ((frame, pa.array([root])),))
+def joining_chunks(prefixes: list[str], trees: list[FrameTree]) -> Iterator[Chunk]:
+    """Yield what joins the root frames of several runs: ``a/odom`` and ``b/odom`` in ``odom``."""
     for prefix, tree in zip(prefixes, trees, strict=True):
-        for root in tree.by_root() if prefix else ():
+        for root in tree.by_root():
             yield from make_chunk(
                 join("frames", root or "(none)", prefix),
                 (),
@@ -66,8 +60,3 @@ def frame_chunks(prefixes: list[str], trees: list[FrameTree]) -> Iterator[Chunk]
                     (rr.Transform3D.descriptor_child_frame(), pa.array([f"{prefix}/{root}"])),
                 ),
             )
-
-
-def origin_of(root: str) -> str:
-    """Return the path of the entity that stands for a root frame."""
-    return join("frames", root or "(none)")

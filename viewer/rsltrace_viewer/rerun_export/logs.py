@@ -47,7 +47,7 @@ class LogRows:
             reader = McapReader(
                 self._trace.name,
                 timeline_type=self._clock.timeline_type,  # type: ignore[arg-type]
-                decoders=("ros2msg",),
+                decoders=("ros2msg", "ros2_reflection"),
                 include_topic_regex=[f"^{re.escape(TOPIC_ROSOUT)}$"],
                 recover=not self._trace.complete,
             )

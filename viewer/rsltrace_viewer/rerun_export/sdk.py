@@ -7,7 +7,10 @@ is refused here with a sentence instead of failing somewhere inside with a trace
 from __future__ import annotations
 
 import importlib.metadata
+import importlib.util
 import os
+import sys
+from pathlib import Path
 
 from rsltrace.errors import SetupError
 
@@ -39,3 +42,23 @@ def require() -> None:
             f"rerun-sdk {found} is installed, but it cannot be loaded ({error}); "
             f"install it again with: {INSTALL}"
         ) from error
+
+
+def viewer() -> Path:
+    """Return the viewer's program. Raises SetupError if it is not there.
+
+    The ``rerun`` on the PATH is a script that starts this one; ending the script would leave the
+    viewer behind.
+    """
+    override = os.environ.get("RERUN_CLI_PATH")  # Rerun's own variable
+    spec = importlib.util.find_spec("rerun_cli")
+    folder = Path(spec.origin).parent if spec is not None and spec.origin else Path()
+    names = ["rerun.exe" if sys.platform == "win32" else "rerun"]
+    if sys.platform == "darwin":
+        names.insert(0, "Rerun.app/Contents/MacOS/Rerun")
+    for program in [Path(override)] if override else [folder / name for name in names]:
+        if program.is_file():
+            return program
+    raise SetupError(
+        f"Rerun's viewer is not at {override or folder}; install it again with: {INSTALL}"
+    )

@@ -139,7 +139,10 @@ def _laser_scan(messages: pa.StructArray, paint: Paint) -> Drawing:
     angles = each("angle_min") + (np.arange(len(ranges)) - starts) * each("angle_increment")
     with np.errstate(invalid="ignore"):
         hit = (ranges >= each("range_min")) & (ranges <= each("range_max")) & np.isfinite(ranges)
-    points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), 0 * ranges], axis=1)[hit]
+    ranges, angles = ranges[hit], angles[hit]
+    points = np.stack(
+        [ranges * np.cos(angles), ranges * np.sin(angles), np.zeros_like(ranges)], axis=1
+    )
     message_of = np.repeat(np.arange(len(counts)), counts)
     kept = np.bincount(message_of[hit], minlength=len(counts)).astype(np.int64)
     return _points("points", kept, points, paint)

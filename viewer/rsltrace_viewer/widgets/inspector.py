@@ -12,6 +12,7 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.lines import Line, Role
+from rsltrace_viewer.widgets.styles import background_of
 
 _LABEL_MAX = 24
 
@@ -128,8 +129,9 @@ class Inspector(ScrollView, can_focus=True):
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
         if style is None:
-            partial = name == "cursor"
-            style = self.get_component_rich_style(f"inspector--{name}", partial=partial)
+            style = self.get_component_rich_style(f"inspector--{name}")
+            if name == "cursor":
+                style = background_of(style)
             self._styles[name] = style
         return style
 
@@ -141,7 +143,7 @@ class Inspector(ScrollView, can_focus=True):
             return Strip([Piece(" " * width, self._style("field"))], width)
         line, text = self._drawn[row]
         again = row > 0 and self._drawn[row - 1][0] is line
-        sign = "  " if line.open is None or again else "▾ " if line.open else "▸ "
+        sign = "  " if line.open is None or again else "▼ " if line.open else "▶ "
         label = "" if again else line.label
         if line.role is Role.SECTION:
             pieces = [
@@ -153,7 +155,7 @@ class Inspector(ScrollView, can_focus=True):
             label = fit(label, _LABEL_MAX) if cells(label) > _LABEL_MAX else label
             gap = " " * (cells(line.label) if again else 0)
             pieces = [
-                Piece("  " * line.depth + sign[2 if line.open is None else 0 :]),
+                Piece("  " * line.depth + sign[2 if line.open is None else 0 :], self._style("label")),
                 Piece(f"{label or gap} " if label or gap else "", self._style("label")),
                 Piece(text, self._style(line.role.value)),
             ]
@@ -162,7 +164,8 @@ class Inspector(ScrollView, can_focus=True):
             strip = Strip([*strip.crop(0, width - 1), Piece("…", self._style("label"))])
         strip = strip.adjust_cell_length(width, self._style("field"))
         if self.has_focus and row == self.cursor:
-            return strip.apply_style(self._style("cursor"))
+            style = self._style("cursor")
+            return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
         return strip
 
     def refresh_line_of(self, row: int) -> None:

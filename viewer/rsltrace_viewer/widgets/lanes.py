@@ -31,7 +31,7 @@ class LanesView(Widget, can_focus=True):
     LanesView > .lanes--label { color: $text-muted; }
     LanesView > .lanes--own { color: $text; text-style: bold; }
     LanesView > .lanes--bar { color: $text-primary; }
-    LanesView > .lanes--cursor { background: $primary 45%; text-style: bold; }
+    LanesView > .lanes--cursor { color: $text-accent; background: $accent 30%; text-style: bold; }
     LanesView > .lanes--raised { color: $text-error; text-style: bold; }
     LanesView > .lanes--divergence { color: $text-error; background: $error 30%; }
     LanesView > .lanes--empty { color: $text-muted; }
@@ -109,9 +109,7 @@ class LanesView(Widget, can_focus=True):
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
         if style is None:
-            partial = name in ("cursor", "divergence")
-            style = self.get_component_rich_style(f"lanes--{name}", partial=partial)
-            self._styles[name] = style
+            style = self._styles[name] = self.get_component_rich_style(f"lanes--{name}")
         return style
 
     def _first_lane(self) -> int:

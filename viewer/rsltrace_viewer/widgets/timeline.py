@@ -15,6 +15,7 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.timeline import Columns, EventText, Sign
+from rsltrace_viewer.widgets.styles import background_of
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
@@ -174,9 +175,10 @@ class Timeline(ScrollView, can_focus=True):
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
         if style is None:
-            style = self._styles[name] = self.get_component_rich_style(
-                f"timeline--{name}", partial=name in ("cursor", "related")
-            )
+            style = self.get_component_rich_style(f"timeline--{name}")
+            if name in ("cursor", "related"):
+                style = background_of(style)
+            self._styles[name] = style
         return style
 
     def render_line(self, y: int) -> Strip:
@@ -200,11 +202,11 @@ class Timeline(ScrollView, can_focus=True):
         for name, text in self._columns.cells(event, sign=sign, mark=mark):
             pieces.append(Piece(text + " ", self._style(self._style_of(name, shown, mark))))
         strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))
-        if selected:
-            return strip.apply_style(self._style("cursor"))
-        if shown.related:
-            return strip.apply_style(self._style("related"))
-        return strip
+        over = "cursor" if selected else "related" if shown.related else ""
+        if not over:
+            return strip
+        style = self._style(over)
+        return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
 
     def _style_of(self, name: str, shown: Row, mark: str) -> str:
         sign = shown.sign

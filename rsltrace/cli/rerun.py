@@ -1,0 +1,73 @@
+"""``rsltrace rerun``: a trace, or two side by side, in Rerun's viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.argument("other", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Write a Rerun recording (.rrd), to open with `rerun FILE`.",
+)
+@click.option("--spawn", is_flag=True, help="Open it in Rerun's viewer (default with a display).")
+@click.option("--web", is_flag=True, help="Open it in a browser; served to this machine only.")
+@click.option("--force", is_flag=True, help="Replace the output file if it exists.")
+@click.option("-q", "--quiet", is_flag=True, help="Do not say what was written.")
+def rerun(
+    trace: Path,
+    other: Path | None,
+    output: Path | None,
+    spawn: bool,
+    web: bool,
+    force: bool,
+    quiet: bool,
+) -> None:
+    """Show TRACE on Rerun's timelines, or TRACE and OTHER and where they part.
+
+    The timelines are simulated time and the number of the event: stepping along the events steps
+    through the callbacks. Messages are drawn and plotted, logs and events are listed, and of two
+    runs the first divergence is explained and marked.
+
+    \b
+    Needs Rerun: pip install 'rsltrace[rerun]'
+    """
+    if spawn and web:
+        raise click.UsageError("give --spawn or --web, not both")
+    from rsltrace_viewer.rerun_export import sdk
+
+    sdk.require()
+    from rsltrace_viewer.rerun_export import show
+    from rsltrace_viewer.rerun_export.export import Exported, export
+
+    how = show.choose(spawn=spawn, web=web, output=output)
+    traces = [trace] if other is None else [trace, other]
+    diff = None
+    if other is not None:
+        from rsltrace.diff.engine import diff_traces
+
+        diff = diff_traces(trace, other)
+
+    def written(target: Path, *, replace: bool) -> Exported:
+        return export(traces, target, diff=diff, force=replace)
+
+    if output is not None:
+        done = written(output, replace=force)
+        if not quiet:
+            click.echo(
+                f"wrote {output}: {done.events} events, {done.bytes / 1e6:.1f} MB "
+                f"({done.bytes / max(done.trace_bytes, 1):.1f} x the trace)"
+            )
+        if how is not None:
+            show.open_viewer(output, how)
+    elif how is not None:
+        with show.temporary_recording() as target:
+            written(target, replace=True)
+            show.open_viewer(target, how)

@@ -1,0 +1,172 @@
+"""``rsltrace view``: look at a trace, or at two, in the terminal."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.errors import OutputError, SetupError, TraceError
+
+if TYPE_CHECKING:
+    from rsltrace_viewer.app import ViewerApp
+
+_SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
+_PORT = 8321
+
+
+@click.command()
+@click.argument("traces", nargs=-1, type=click.Path(path_type=Path))
+@click.option("--at", metavar="EVENT|TIME", help="Start at an event (1200) or a time (1.5s).")
+@click.option("--filter", "filter_text", default="", metavar="TEXT", help="Show only some events.")
+@click.option("--light", is_flag=True, help="Dark on light.")
+@click.option("--follow", is_flag=True, help="Follow a trace that is still being recorded.")
+@click.option(
+    "--export",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write one screen to a file (.svg or .txt) instead; needs no terminal.",
+)
+@click.option(
+    "--size", default="120x36", show_default=True, help="With --export: columns x rows."
+)
+@click.option("--keys", default="", help="With --export: keys to press first, as in 'n down z'.")
+@click.option("--serve", is_flag=True, help="Open it in a browser on this machine instead.")
+@click.option("--port", default=_PORT, show_default=True, help="With --serve: the port.")
+def view(
+    traces: tuple[Path, ...],
+    at: str | None,
+    filter_text: str,
+    light: bool,
+    follow: bool,
+    export: Path | None,
+    size: str,
+    keys: str,
+    serve: bool,
+    port: int,
+) -> None:
+    """Look at TRACE, or compare two: step through events, follow causes, read messages.
+
+    Without a TRACE, offers those of this folder. Inside, ? shows all keys and q quits.
+    """
+    _check_installed("textual")
+    if len(traces) > 2:
+        raise click.UsageError("view shows one trace or compares two; `rsltrace diff` takes more")
+    if follow and len(traces) > 1:
+        raise click.UsageError("--follow works with one trace")
+    if serve:
+        _serve(port)
+        return
+    from rsltrace_viewer.app import ViewerApp, open_session
+
+    chosen = traces or _choose(exporting=export is not None)
+    if not chosen:
+        return
+    session = open_session(*chosen)
+    try:
+        app = ViewerApp(
+            session,
+            start=None if at is None else _place(session, at),
+            light=light,
+            follow=follow,
+            filter_text=_checked_filter(session, filter_text),
+        )
+        if export is not None:
+            _export(app, export, _parse_size(size), keys.split())
+        else:
+            _run(app)
+    finally:
+        session.close()
+
+
+def _check_installed(package: str) -> None:
+    if importlib.util.find_spec(package) is None:
+        raise SetupError(
+            f"the viewer needs {package}, which is not installed; install it with "
+            "pip install 'rsltrace[view]'"
+        )
+
+
+def _choose(*, exporting: bool) -> tuple[Path, ...]:
+    """Offer the traces of the current folder."""
+    from rsltrace_viewer.choose import ChooseApp, traces_in
+
+    found = traces_in(Path())
+    if not found:
+        raise TraceError(
+            "there is no trace in this folder; name one, or make one with `rsltrace record`"
+        )
+    if exporting or not sys.stdout.isatty():
+        names = ", ".join(str(entry.path) for entry in found[:8])
+        raise TraceError(f"name a trace; this folder has {names}")
+    chosen = ChooseApp(found).run()
+    return tuple(chosen or ())
+
+
+def _place(session: Any, at: str) -> int:
+    from rsltrace_viewer.model.times import parse_time
+
+    if at.isdecimal():
+        return int(session.view.place_of(min(int(at), max(session.a.count - 1, 0))))
+    try:
+        stamp_ns = parse_time(at)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; or the number of an event", param_hint="--at") from None
+    return int(session.place_at_time(stamp_ns)) if not session.empty else 0
+
+
+def _checked_filter(session: Any, text: str) -> str:
+    from rsltrace_viewer.model.query import QueryError, parse
+
+    try:
+        parse(text, session.a)
+    except QueryError as error:
+        message = f"{error}\n  {text}\n  {' ' * error.start}{'^' * max(error.end - error.start, 1)}"
+        raise click.BadParameter(message, param_hint="--filter") from None
+    return text
+
+
+def _parse_size(text: str) -> tuple[int, int]:
+    found = _SIZE.fullmatch(text)
+    if found is None or not (20 <= int(found[1]) <= 500 and 5 <= int(found[2]) <= 300):
+        raise click.BadParameter(
+            f"{text!r} is no size from 20x5 to 500x300, like 120x36", param_hint="--size"
+        )
+    return int(found[1]), int(found[2])
+
+
+def _export(app: ViewerApp, path: Path, size: tuple[int, int], keys: list[str]) -> None:
+    if path.suffix not in (".svg", ".txt"):
+        raise click.BadParameter(f"{path} should end in .svg or .txt", param_hint="--export")
+    from rsltrace_viewer.export import screen_of
+
+    picture = screen_of(app, size, keys, svg=path.suffix == ".svg")
+    try:
+        path.write_text(picture, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _run(app: ViewerApp) -> None:
+    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+        raise SetupError(
+            "the viewer needs a terminal; --export writes a screen to a file, `rsltrace cat` prints"
+        )
+    app.run()
+    if app.return_code:
+        sys.exit(app.return_code)
+
+
+def _serve(port: int) -> None:
+    """Serve this very command, without --serve, in a browser. Only this machine can reach it."""
+    _check_installed("textual_serve")
+    from textual_serve.server import Server
+
+    arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
+    command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])
+    click.echo(f"rsltrace view: http://127.0.0.1:{port}/ (Ctrl-C ends it)", err=True)
+    Server(command, host="127.0.0.1", port=port, title="rsltrace view").serve()

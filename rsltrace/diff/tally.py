@@ -1,0 +1,54 @@
+"""Counts over aligned events, and where the runs agree again."""
+
+from __future__ import annotations
+
+from rsltrace.diff.identity import Identity
+from rsltrace.diff.model import EntityCount
+from rsltrace.diff.stretches import Item, Stretch
+
+AGREEING_MIN = 32
+"""So many events in a row have to agree before it is called agreement, unless the runs end."""
+
+
+class Tally:
+    """Takes stretches in order."""
+
+    def __init__(self) -> None:
+        self._counts: dict[int, list[int]] = {}
+        self._resync: tuple[int, int] | None = None
+        self._agreeing = 0
+        self._ended = False
+
+    def take(self, stretch: Stretch) -> None:
+        """Count the items of a stretch."""
+        for item in stretch.items:
+            rows, index = (stretch.rows_a, item.a) if item.a >= 0 else (stretch.rows_b, item.b)
+            counts = self._counts.setdefault(rows.number[index - rows.first], [0, 0, 0, 0])
+            counts[_column(item)] += 1
+            if not item.plain:
+                self._agreeing, self._resync = 0, None
+            elif not self._agreeing:
+                self._agreeing, self._resync = 1, (item.a, item.b)
+            else:
+                self._agreeing += 1
+        self._ended = stretch.at_end
+
+    def counts(self, identity: Identity) -> tuple[EntityCount, ...]:
+        """Return the counts of each entity that had events, those that differ most first."""
+        counts = [EntityCount(identity.keys[n], *row) for n, row in self._counts.items()]
+        return tuple(
+            sorted(counts, key=lambda c: (-(c.differing + c.only_a + c.only_b), str(c.entity)))
+        )
+
+    @property
+    def resync(self) -> tuple[int, int] | None:
+        """The indexes from which on the runs agree to the end of what was aligned, if they do."""
+        return self._resync if self._ended or self._agreeing >= AGREEING_MIN else None
+
+
+def _column(item: Item) -> int:
+    if item.b < 0:
+        return 2
+    if item.a < 0:
+        return 3
+    return 0 if item.same else 1

@@ -1,0 +1,204 @@
+"""Actions through rclpy's own Python layer, on simulated time."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import pytest
+from rclpy.action import ActionClient, ActionServer, CancelResponse, GoalResponse
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.node import Node
+
+pytestmark = pytest.mark.ros
+test_msgs = pytest.importorskip("test_msgs.action", reason="needs ros-jazzy-test-msgs")
+Fibonacci = test_msgs.Fibonacci
+
+
+def seconds(node: Node) -> float:
+    return float(node.get_clock().now().nanoseconds) / 1e9
+
+
+class Server(Node):
+    """Works a second per number; refuses negative orders; can be cancelled."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__("server")
+        self.server = ActionServer(
+            self,
+            Fibonacci,
+            "fibonacci",
+            self.work,
+            goal_callback=lambda goal: (
+                GoalResponse.ACCEPT if goal.order >= 0 else GoalResponse.REJECT
+            ),
+            cancel_callback=lambda goal: CancelResponse.ACCEPT,
+            callback_group=ReentrantCallbackGroup(),
+            **options,
+        )
+
+    def work(self, goal: Any) -> Any:
+        feedback = Fibonacci.Feedback(sequence=[0, 1])
+        for _ in range(goal.request.order):
+            time.sleep(1.0)
+            if goal.is_cancel_requested:
+                goal.canceled()
+                return Fibonacci.Result(sequence=feedback.sequence)
+            feedback.sequence.append(feedback.sequence[-1] + feedback.sequence[-2])
+            goal.publish_feedback(feedback)
+        goal.succeed()
+        return Fibonacci.Result(sequence=feedback.sequence)
+
+
+class Client(Node):
+    def __init__(self, order: int, log: list[Any], *, cancel_after: float | None = None) -> None:
+        super().__init__("client")
+        self.log, self.order, self.cancel_after = log, order, cancel_after
+        self.client = ActionClient(self, Fibonacci, "fibonacci")
+        self.once = self.create_timer(1.0, self.ask)
+
+    def ask(self) -> None:
+        self.once.cancel()
+        assert self.client.server_is_ready()
+        goal = Fibonacci.Goal(order=self.order)
+        future = self.client.send_goal_async(goal, feedback_callback=self.feedback)
+        future.add_done_callback(self.accepted)
+
+    def feedback(self, message: Any) -> None:
+        self.log.append((seconds(self), list(message.feedback.sequence)))
+
+    def accepted(self, future: Any) -> None:
+        self.goal = future.result()
+        self.log.append((seconds(self), "accepted" if self.goal.accepted else "rejected"))
+        if self.goal.accepted:
+            self.goal.get_result_async().add_done_callback(self.done)
+            if self.cancel_after is not None:
+                self.create_timer(self.cancel_after, self.goal.cancel_goal_async)
+
+    def done(self, future: Any) -> None:
+        result = future.result()
+        self.log.append((seconds(self), result.status, list(result.result.sequence)))
+
+
+def test_a_goal_with_feedback_and_result(simulate: Any) -> None:
+    log: list[Any] = []
+    first = simulate(Server, lambda: Client(3, log), duration=10)
+    assert log == [
+        (1.0, "accepted"),
+        (2.0, [0, 1, 1]),
+        (3.0, [0, 1, 1, 2]),
+        (4.0, [0, 1, 1, 2, 3]),
+        (4.0, 4, [0, 1, 1, 2, 3]),
+    ]
+    second = simulate(Server, lambda: Client(3, log), duration=10)
+    assert first.result.digest == second.result.digest  # goal ids included
+    with second.trace() as trace:
+        topics = {channel.topic for channel in trace.channels.values()}
+        statuses = [
+            [status.status for status in trace.decode("/fibonacci/_action/status", d).status_list]
+            for _, _, d in trace.messages("/fibonacci/_action/status")
+        ]
+    assert "/rsltrace/request/fibonacci/_action/send_goal" in topics
+    assert "/rsltrace/response/fibonacci/_action/get_result" in topics
+    assert statuses == [[1], [2], [4]]
+
+
+def test_a_goal_that_is_rejected(simulate: Any) -> None:
+    log: list[Any] = []
+    simulate(Server, lambda: Client(-1, log), duration=3)
+    assert log == [(1.0, "rejected")]
+
+
+def test_a_goal_that_is_cancelled(simulate: Any) -> None:
+    log: list[Any] = []
+    simulate(Server, lambda: Client(10, log, cancel_after=2.5), duration=20)
+    assert log[-1] == (4.0, 5, [0, 1, 1, 2])
+
+
+def test_several_goals_at_once_and_async_execute_callbacks(simulate: Any) -> None:
+    log: list[Any] = []
+
+    class Awaiting(Node):
+        def __init__(self) -> None:
+            super().__init__("server")
+            self.gates: list[Any] = []
+            self.create_timer(2.0, self.open)
+            self.server = ActionServer(self, Fibonacci, "fibonacci", self.work)
+
+        def open(self) -> None:
+            gates, self.gates = self.gates, []
+            for gate in gates:
+                gate.set_result(None)
+
+        async def work(self, goal: Any) -> Any:
+            from rclpy.task import Future
+
+            gate = Future(executor=self.executor)
+            self.gates.append(gate)
+            await gate
+            goal.succeed()
+            return Fibonacci.Result(sequence=[goal.request.order])
+
+    class Two(Client):
+        def ask(self) -> None:
+            super().ask()
+            self.order += 1
+            super().ask()
+
+    simulate(Awaiting, lambda: Two(7, log), duration=5)
+    assert log == [(1.0, "accepted")] * 2 + [(2.0, 4, [7]), (2.0, 4, [8])]
+
+
+def test_an_exception_in_execute_aborts_the_goal(simulate: Any, capfd: Any) -> None:
+    log: list[Any] = []
+
+    class Faulty(Server):
+        def work(self, goal: Any) -> Any:
+            raise RuntimeError("wheel lost")
+
+    recorded = simulate(Faulty, lambda: Client(1, log), duration=3)
+    assert log[-1] == (1.0, 6, [])
+    assert any("wheel lost" in text for text in recorded.logs())
+    assert "wheel lost" in capfd.readouterr().err
+
+
+def test_results_expire_after_their_timeout(simulate: Any) -> None:
+    log: list[Any] = []
+
+    class Late(Client):
+        def accepted(self, future: Any) -> None:
+            self.goal = future.result()
+            self.create_timer(4.0, self.fetch)
+            self.create_timer(8.0, self.fetch)
+
+        def fetch(self) -> None:
+            self.goal.get_result_async().add_done_callback(self.done)
+
+    simulate(lambda: Server(result_timeout=5), lambda: Late(1, log), duration=9.5)
+    # Done at 2 s, kept until 7 s: there at 5 s, unknown at 9 s.
+    assert [(entry[0], entry[1]) for entry in log if len(entry) == 3] == [
+        (5.0, 4),
+        (9.0, 0),
+        (9.0, 0),
+    ]
+
+
+def test_a_blocking_client_in_a_callback(simulate: Any) -> None:
+    log: list[Any] = []
+
+    class Blocking(Node):
+        def __init__(self) -> None:
+            super().__init__("client")
+            self.client = ActionClient(
+                self, Fibonacci, "fibonacci", callback_group=ReentrantCallbackGroup()
+            )
+            assert self.client.wait_for_server(timeout_sec=5.0)
+            self.once = self.create_timer(1.0, self.ask)
+
+        def ask(self) -> None:
+            self.once.cancel()
+            result = self.client.send_goal(Fibonacci.Goal(order=2))
+            log.append((seconds(self), list(result.result.sequence)))
+
+    simulate(Blocking, Server, duration=10)
+    assert log == [(3.25, [0, 1, 1, 2])]

@@ -1,0 +1,224 @@
+"""Of two runs, what differs and why: as a text beside the pictures, and as marks on the timelines.
+
+    divergence            the verdict, the chain of causes, the values that differ, as a text
+    divergence/agreement  a lane: the runs agree, then they differ
+    divergence/chain      a lane with the events from the root to the divergence
+
+Where an event is in one run only, it is marked where it happened there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk
+
+from rsltrace.diff.model import CauseStep, Diff, Divergence, EventView, MessageDifference
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_chunk
+from rsltrace_viewer.rerun_export.paths import join
+
+DOCUMENT = "/divergence"
+AGREEMENT = "/divergence/agreement"
+CHAIN = "/divergence/chain"
+_AGREE, _DIFFER = "the runs agree", "the runs differ"
+_GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
+_VALUE_WIDTH = 40
+_FIELDS_MAX = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Marks:
+    """What of a diff the layout shows. ``fields`` are (topic, curves) that differ, worst first."""
+
+    document: str
+    lanes: tuple[str, ...]
+    fields: tuple[tuple[str, str], ...]
+
+
+def marks_of(diff: Diff) -> Marks:
+    """Return what the layout needs to know."""
+    fields: dict[tuple[str, str], None] = {}
+    for divergence in diff.divergences:
+        for message in divergence.messages:
+            for field in message.fields:
+                path = field.path.split("[")[0]
+                inside = path.rpartition(".")[0] if path == field.path else path
+                fields[message.topic, join(inside).strip("/") if inside else ""] = None
+    lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
+    return Marks(DOCUMENT, lanes, tuple(fields))
+
+
+def divergence_chunks(diff: Diff, clock: Clock) -> Iterator[Chunk]:
+    """Yield the text and the marks."""
+    yield from make_chunk(
+        DOCUMENT,
+        (),
+        (
+            (rr.TextDocument.descriptor_text(), pa.array([document(diff)])),
+            (rr.TextDocument.descriptor_media_type(), pa.array(["text/markdown"])),
+        ),
+    )
+    first = diff.divergences[0] if diff.divergences else None
+    yield from _agreement(diff, first, clock)
+    if first is not None:
+        yield from _chain(first, clock)
+
+
+def _agreement(diff: Diff, first: Divergence | None, clock: Clock) -> Iterator[Chunk]:
+    state = rr.StateChange.descriptor_state()
+    here = _either(first.a, first.b) if first is not None else None
+    stamps, events, states = [0], [0], [_AGREE]
+    if here is not None:
+        stamps, events, states = [0, here.stamp_ns], [0, here.index], [_AGREE, _DIFFER]
+    elif not diff.identical:
+        end_ns = min(diff.a.end_ns, diff.b.end_ns)
+        stamps, events, states = [0, end_ns], [0, diff.agreeing], [_AGREE, _DIFFER]
+    stamps[0] = min(stamps[0], *stamps)
+    yield from make_chunk(
+        AGREEMENT,
+        ((SIM_TIME, clock.array(np.array(stamps))), (EVENT, pa.array(events))),
+        ((state, pa.array(states)),),
+    )
+    one = np.array([2])
+    configuration = rr.StateConfiguration
+    from rsltrace_viewer.rerun_export.columns import lists
+
+    yield from make_chunk(
+        AGREEMENT,
+        (),
+        (
+            (configuration.descriptor_values(), lists(one, pa.array([_AGREE, _DIFFER]))),
+            (
+                configuration.descriptor_colors(),
+                lists(one, pa.array([_GREEN, _RED], type=pa.uint32())),
+            ),
+        ),
+    )
+
+
+def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
+    """Yield the lane of causes: each from its event to the next, the divergence to the end."""
+    steps = [(view, step) for step in first.chain if (view := _either(step.a, step.b))]
+    rows = [(view.index, view.stamp_ns, f"{i + 1}. {_step(s)}") for i, (view, s) in enumerate(steps)]
+    here = _either(first.a, first.b)
+    if here is not None and (not rows or rows[-1][0] != here.index):
+        rows.append((here.index, here.stamp_ns, f"divergence: {_event(here)}"))
+    if not rows:
+        return
+    rows.sort()
+    rows.append((rows[-1][0] + 1, rows[-1][1] + 1, ""))
+    indexes, stamps, texts = zip(*rows, strict=True)
+    state = rr.StateChange.descriptor_state()
+    yield from make_chunk(CHAIN, ((EVENT, pa.array(indexes)),), ((state, pa.array(texts)),))
+    times = clock.array(np.array(stamps[:-1]))
+    yield from make_chunk(CHAIN, ((SIM_TIME, times),), ((state, pa.array(texts[:-1])),))
+
+
+def document(diff: Diff) -> str:
+    """Return the diff as Markdown, for people."""
+    lines = [f"# {'Identical' if diff.identical else _text(diff.verdict.value)}", "", _text(diff.sentence)]
+    lines += ["", "| | a | b |", "|---|---|---|"]
+    lines += [
+        f"| trace | {_text(diff.a.path)} | {_text(diff.b.path)} |",
+        f"| digest | `{diff.a.digest}` | `{diff.b.digest}` |",
+        f"| events | {diff.a.events} | {diff.b.events} |",
+        f"| end | {format_seconds(diff.a.end_ns)} s | {format_seconds(diff.b.end_ns)} s |",
+        "",
+        f"The first **{diff.agreeing}** events are the same.",
+    ]
+    for number, divergence in enumerate(diff.divergences, 1):
+        lines += ["", *_divergence(divergence, number, len(diff.divergences))]
+    if diff.settings:
+        lines += ["", "## Job and environment", "", "| | a | b |", "|---|---|---|"]
+        lines += [
+            f"| {_text(s.place)} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings
+        ]
+    lines += [f"\n{_text(note)}" for note in diff.notes]
+    return "\n".join(lines) + "\n"
+
+
+def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str]:
+    yield f"## Divergence {number} of {count}" if count > 1 else "## Where they part"
+    yield ""
+    for name, view in (("a", divergence.a), ("b", divergence.b)):
+        yield f"- **{name}**: {_event(view) if view else 'nothing there'}"
+    for message in divergence.messages:
+        yield ""
+        yield from _message(message)
+    if divergence.chain:
+        yield ""
+        yield "### From the root"
+        yield ""
+        for place, step in enumerate(divergence.chain, 1):
+            yield f"{place}. {_step(step)}"
+    if divergence.root_sentence:
+        yield ""
+        yield _text(divergence.root_sentence)
+    if divergence.reaches:
+        yield ""
+        reached = ", ".join(
+            f"{_text(reach.topic)} after {format_duration(reach.after_ns)}"
+            for reach in divergence.reaches
+        )
+        yield f"It reaches {reached}."
+    if divergence.next_step:
+        yield ""
+        yield f"`{printable(divergence.next_step)}`"
+
+
+def _message(message: MessageDifference) -> Iterator[str]:
+    what = "its input" if message.position < 0 else f"output {message.position + 1}"
+    yield f"**{_text(message.topic)}** ({_text(message.type)}, {what}): {message.presence}"
+    if message.reason:
+        yield f" {_text(message.reason)}"
+    if message.preview:
+        yield f" `{printable(shortened(message.preview, 3 * _VALUE_WIDTH))}`"
+    if message.fields:
+        yield ""
+        yield "| field | a | b | difference |"
+        yield "|---|---|---|---|"
+        for field in message.fields[:_FIELDS_MAX]:
+            difference = f"{field.absolute:.6g}" if field.absolute is not None else ""
+            if field.note:
+                difference = f"{difference} {field.note}".strip()
+            yield (
+                f"| {_text(field.path)} | {_value(field.a)} | {_value(field.b)} "
+                f"| {_text(difference)} |"
+            )
+        more = len(message.fields[_FIELDS_MAX:]) + message.more_fields
+        if more:
+            yield f"| {more} more | | | |"
+
+
+def _step(step: CauseStep) -> str:
+    view = _either(step.a, step.b)
+    side = "" if step.a and step.b else (" (only in a)" if step.a else " (only in b)")
+    relation = f" {_text(step.relation)}" if step.relation else ""
+    return f"{_event(view) if view else 'an event'}{relation}{side}"
+
+
+def _event(view: EventView) -> str:
+    what = f"{view.entity.node or '(run)'} {view.kind.label} {view.entity.name}"
+    return f"#{view.index} at {format_seconds(view.stamp_ns)} s: {_text(what)}"
+
+
+def _either(a: EventView | None, b: EventView | None) -> EventView | None:
+    return a if a is not None else b
+
+
+def _text(text: str) -> str:
+    """Return a text that Markdown shows as it is, in a table as well."""
+    safe = printable(text)
+    for character in "\\`*_{}[]<>|#":
+        safe = safe.replace(character, f"\\{character}")
+    return safe
+
+
+def _value(text: str | None) -> str:
+    return "—" if text is None else _text(shortened(text, _VALUE_WIDTH))

@@ -1,0 +1,101 @@
+"""The whole export: one run or two, and where they part, into one Rerun recording (.rrd)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+
+import rerun as rr
+
+from rsltrace.diff.model import Diff
+from rsltrace.errors import OutputError
+from rsltrace.trace.reader import Trace
+from rsltrace_viewer.rerun_export.columns import clock_for
+from rsltrace_viewer.rerun_export.divergence import Marks, divergence_chunks, marks_of
+from rsltrace_viewer.rerun_export.frames import joining_chunks
+from rsltrace_viewer.rerun_export.layout import blueprint
+from rsltrace_viewer.rerun_export.run import export_run
+from rsltrace_viewer.rerun_export.sdk import APPLICATION_ID
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What was written: events and bytes, of the traces and of the recording."""
+
+    path: Path
+    events: int
+    trace_bytes: int
+    bytes: int
+
+
+def export(
+    traces: Sequence[Path], output: Path, *, diff: Diff | None = None, force: bool = False
+) -> Exported:
+    """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
+
+    ``diff`` is that of the two traces, in the same order; without it nothing is marked. What was
+    written so far is removed when something goes wrong. Raises TraceError for damaged traces and
+    OutputError if ``output`` exists (without ``force``) or cannot be written.
+    """
+    assert len(traces) in (1, 2)
+    _check_output(output, traces, force=force)
+    with ExitStack() as stack:
+        opened = [stack.enter_context(Trace.open(path)) for path in traces]
+        recording = rr.RecordingStream(
+            APPLICATION_ID,
+            recording_id="-".join(trace.digest for trace in opened),
+            send_properties=False,
+        )
+        recording.set_log_time_enabled(False)
+        recording.set_log_tick_enabled(False)
+        try:
+            recording.save(output)
+        except RuntimeError as error:
+            raise OutputError(f"{output} cannot be written: {error}") from error
+        try:
+            _send(opened, recording, diff)
+            recording.flush()
+        except BaseException:
+            recording.disconnect()
+            output.unlink(missing_ok=True)
+            raise
+        recording.disconnect()  # this writes the index at the end of the file
+        return Exported(
+            output,
+            sum(trace.event_count for trace in opened),
+            sum(trace.size for trace in opened),
+            output.stat().st_size,
+        )
+
+
+def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None) -> None:
+    clock = clock_for([trace.start_ns for trace in opened])
+    roots = ("",) if len(opened) == 1 else ("a", "b")
+    names = " and ".join(f"{Path(trace.name).name} {trace.digest}" for trace in opened)
+    recording.send_recording_name(names)
+    shown = [
+        export_run(trace, root, clock, recording)
+        for trace, root in zip(opened, roots, strict=True)
+    ]
+    marks: Marks | None = None
+    if len(opened) == 2:
+        trees = [run.seen.frames for run in shown]
+        recording.send_chunks(joining_chunks(list(roots), trees))
+    if diff is not None:
+        marks = marks_of(diff)
+        recording.send_chunks(divergence_chunks(diff, clock))
+    recording.send_blueprint(blueprint(shown, marks), make_active=True, make_default=True)
+
+
+def _check_output(output: Path, traces: Sequence[Path], *, force: bool) -> None:
+    if output.is_dir():
+        raise OutputError(f"{output} is a folder; name a file, such as {output / 'run.rrd'}")
+    for trace in traces:
+        if output.exists() and trace.exists() and output.samefile(trace):
+            raise OutputError(f"{output} is the trace itself; give the recording another name")
+    if output.exists() and not force:
+        raise OutputError(f"{output} exists; use --force to replace it, or another name")
+    if not output.absolute().parent.is_dir():
+        raise OutputError(f"the folder {output.parent} does not exist")

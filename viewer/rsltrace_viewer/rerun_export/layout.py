@@ -1,0 +1,189 @@
+"""What the viewer shows first: the blueprint made for a trace, saved with it.
+
+Above, the world: one three-dimensional view per tree of frames, images, and the plots that say
+most. Below, the run: a lane per node, the log, the table of events, the rates. Of two runs, the
+verdict stands first, and what differs is what is plotted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING
+
+import rerun.blueprint as rrb
+
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
+from rsltrace_viewer.rerun_export.paths import NO_NODE
+from rsltrace_viewer.rerun_export.run import Shown
+
+if TYPE_CHECKING:
+    from rsltrace_viewer.rerun_export.divergence import Marks
+
+_PLOTS_SHOWN = 3
+_PLOTS_MAX = 16
+_IMAGES_MAX = 4
+_LANES_MAX = 64
+_FIRST_FIELDS = ("position", "linear", "angular", "data")
+"""Fields that say most at a glance, in this order; a name in a path counts."""
+_LAST_TOPICS = ("/parameter_events", "/rosout", "/clock")
+_TABLE = ("node", "callback", "kind", "outputs", "cause", "flags", "input_hash", "output_hash")
+
+Part = rrb.Container | rrb.View
+
+
+def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Blueprint:
+    """Return the layout for one run, or for two with what was found to differ."""
+    world = _world(shown)
+    plots = _plots(shown, marks)
+    above: list[Part] = []
+    if marks is not None:
+        above.append(rrb.TextDocumentView(origin=marks.document, name="What differs"))
+    above += [part for part in (world, plots) if part is not None]
+    below = rrb.Tabs(*_below(shown, marks), name="Run")
+    if not above:
+        root: Part = below
+    else:
+        root = rrb.Vertical(rrb.Horizontal(*above), below, row_shares=[3, 2])
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=SIM_TIME),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _world(shown: Sequence[Shown]) -> Part | None:
+    by_root: dict[str, list[str]] = {}
+    for run in shown:
+        for root, paths in run.seen.frames.by_root().items():
+            flat = [p for p in paths if p not in run.seen.images and p not in run.seen.fixes]
+            if flat:
+                by_root.setdefault(root, []).extend(flat)
+    views: list[Part] = [
+        rrb.Spatial3DView(
+            origin="/",
+            contents=_only(paths),
+            name=f"3D: {root}" if root else "3D",
+            spatial_information=rrb.SpatialInformation(target_frame=root) if root else None,
+        )
+        for root, paths in by_root.items()
+    ]
+    fixes = [path for run in shown for path in run.seen.fixes]
+    if fixes:
+        # Never in front: a map in sight asks a server for its tiles, which tells where one was.
+        contents = [f"+ {path}" for fix in fixes for path in (fix, f"{fix}/track")]
+        views.append(rrb.MapView(origin="/", contents=contents, name="Map (online)"))
+    images: list[Part] = [
+        rrb.Spatial2DView(origin=path, contents="$origin", name=path)
+        for run in shown
+        for path in list(run.seen.images)[:_IMAGES_MAX]
+    ]
+    parts: list[Part] = []
+    if views:
+        front = [v for v in views if not isinstance(v, rrb.MapView)]
+        if front:
+            parts.append(rrb.Tabs(*views, active_tab=0) if len(views) > 1 else front[0])
+        else:
+            parts.append(rrb.Tabs(*views, rrb.TextDocumentView(name="(no frames)"), active_tab=1))
+    if images:
+        parts.append(rrb.Grid(*images, name="Images"))
+    if not parts:
+        return None
+    return parts[0] if len(parts) == 1 else rrb.Vertical(*parts, row_shares=[2, 1])
+
+
+def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
+    """The same curves of all runs in one plot; the most telling ones at once, the rest in tabs."""
+    fields: dict[tuple[str, str], list[str]] = {}
+    for run in shown:
+        for path in run.seen.curves:
+            topic = run.seen.topic_of.get(path, "")
+            field = path[len(run.paths.topic(topic)) :].strip("/") if topic else path
+            fields.setdefault((topic, field), []).append(path)
+    first = marks.fields if marks is not None else ()
+    ranked = sorted(fields, key=lambda key: (_place(key, first), _rank(key), key))
+    chosen: list[tuple[str, str]] = []
+    rest: list[tuple[str, str]] = []
+    topics: set[str] = set()
+    for key in ranked:
+        new = key[0] not in topics or _place(key, first) < len(first)
+        (chosen if new and len(chosen) < _PLOTS_SHOWN else rest).append(key)
+        topics.add(key[0])
+    views: list[Part] = [_plot(key, fields[key]) for key in chosen]
+    more = [_plot(key, fields[key]) for key in rest[: _PLOTS_MAX - len(views)]]
+    if not views:
+        return None
+    if more:
+        views[-1] = rrb.Tabs(views[-1], *more, active_tab=0)
+    return views[0] if len(views) == 1 else rrb.Vertical(*views, name="Plots")
+
+
+def _plot(key: tuple[str, str], paths: list[str]) -> rrb.TimeSeriesView:
+    name = f"{key[0]} {key[1]}".strip()
+    return rrb.TimeSeriesView(
+        origin="/",
+        contents=_only(paths),
+        name=name,
+        plot_legend=rrb.PlotLegend(corner="RightTop", visible=True),
+    )
+
+
+def _place(key: tuple[str, str], first: Sequence[tuple[str, str]]) -> int:
+    """Return where a field is in the list of those that differ, or behind its end."""
+    return first.index(key) if key in first else len(first)
+
+
+def _rank(key: tuple[str, str]) -> tuple[bool, int]:
+    topic, field = key
+    places = [i for i, name in enumerate(_FIRST_FIELDS) if name in field]
+    return topic in _LAST_TOPICS, min(places, default=len(_FIRST_FIELDS))
+
+
+def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
+    lanes = list(marks.lanes) if marks is not None else []
+    logs: list[str] = []
+    rates: list[str] = []
+    for run in shown:
+        nodes = sorted(run.nodes, key=lambda name: name == NO_NODE)
+        lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX]]
+        rates += [f"{run.paths.node(name)}/rate" for name in nodes]
+        logs += [f"{run.paths.node(name)}/log" for name in nodes]
+    parts: list[Part] = [
+        rrb.StateTimelineView(origin="/", contents=_only(lanes), name="Callbacks"),
+    ]
+    if any(run.log_records for run in shown):
+        parts.append(
+            rrb.TextLogView(
+                origin="/",
+                contents=_only(logs),
+                name="Log",
+                columns=rrb.TextLogColumns(
+                    timeline_columns=[SIM_TIME, EVENT],
+                    text_log_columns=["entitypath", "loglevel", "body"],
+                ),
+            )
+        )
+    tables: list[Part] = [_table(run) for run in shown]
+    parts.append(tables[0] if len(tables) == 1 else rrb.Horizontal(*tables, name="Events"))
+    parts.append(rrb.TimeSeriesView(origin="/", contents=_only(rates), name="Callbacks per second"))
+    return parts
+
+
+def _table(run: Shown) -> rrb.DataframeView:
+    path = run.paths.events
+    return rrb.DataframeView(
+        origin=path,
+        contents="$origin",
+        name=f"Events {run.paths.root}".strip(),
+        query=rrb.archetypes.DataframeQuery(
+            timeline=EVENT,
+            select=[EVENT, SIM_TIME, *(f"{path}:{name}" for name in _TABLE)],
+            auto_scroll=True,
+        ),
+    )
+
+
+def _only(paths: Iterable[str]) -> list[str]:
+    return [f"+ {path}" for path in paths]
