@@ -4,6 +4,7 @@
 >>> job = rsltrace.load_job("job.yaml")                   # doctest: +SKIP
 >>> result = rsltrace.record(job, "run.mcap")             # doctest: +SKIP
 >>> result.digest                                         # doctest: +SKIP
+>>> rsltrace.diff("run.mcap", "other.mcap").sentence      # doctest: +SKIP
 
 The names below are the public API. They are loaded when first used: importing rsltrace loads
 neither rclpy nor numpy.
@@ -16,6 +17,9 @@ from typing import TYPE_CHECKING, Any
 from rsltrace._version import __version__
 
 if TYPE_CHECKING:
+    from rsltrace.diff import diff_files as diff
+    from rsltrace.diff.model import Diff, Verdict
+    from rsltrace.diff.options import DiffOptions
     from rsltrace.errors import RsltraceError
     from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
     from rsltrace.run import RunResult, record
@@ -23,6 +27,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "BagSpec": "rsltrace.job",
+    "Diff": "rsltrace.diff.model",
+    "DiffOptions": "rsltrace.diff.options",
     "Job": "rsltrace.job",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
@@ -31,12 +37,15 @@ _HOMES = {
     "StopSpec": "rsltrace.job",
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
+    "Verdict": "rsltrace.diff.model",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",
 }
 
 __all__ = [
     "BagSpec",
+    "Diff",
+    "DiffOptions",
     "Job",
     "NodeSpec",
     "RecordSpec",
@@ -45,13 +54,19 @@ __all__ = [
     "StopSpec",
     "TopicStop",
     "Trace",
+    "Verdict",
     "__version__",
+    "diff",
     "load_job",
     "record",
 ]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "diff":
+        import importlib
+
+        return importlib.import_module("rsltrace.diff")  # a package that can be called
     try:
         home = _HOMES[name]
     except KeyError:

@@ -248,8 +248,7 @@ def _nearest(a: list[int], b: list[int], limit: int) -> list[tuple[int, int]]:
     if len(a) * len(b) > _TABLE_MAX:
         return _nearest_in_passing(a, b, limit)
     # best[j]: (pairs, -distance, the pairs) of the first i stamps of a and the first j of b.
-    Best = tuple[int, int, tuple[object, ...]]
-    best: list[Best] = [(0, 0, ())] * (len(b) + 1)
+    best: list[tuple[int, int, tuple[object, ...]]] = [(0, 0, ())] * (len(b) + 1)
     for i, stamp_a in enumerate(a):
         previous, best = best, [best[0]]
         for j, stamp_b in enumerate(b):

@@ -44,7 +44,7 @@ class Viewer:
             output_hash=event.output_hash,
             state_hash=event.state_hash,
             outputs=event.outputs,
-            position=self._position(index, event.entity),
+            position=self._position(index, event.entity) if event.entity else 0,
             summary=self.summary(outputs),
         )
 

@@ -10,12 +10,12 @@ import contextlib
 import os
 import random
 import struct
+import sys
 import threading
-import traceback
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
 from greenlet import getcurrent, greenlet
 
@@ -25,6 +25,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
+from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
@@ -40,7 +41,6 @@ if TYPE_CHECKING:
     from rsltrace.ros.tasks import TaskRun
 
 _RAISED = int(EventFlag.RAISED)
-_PACKAGE = str(Path(__file__).resolve().parent.parent)
 _pack_value = struct.Struct("<Bq").pack
 
 
@@ -53,6 +53,8 @@ class Core:
     def __init__(self, loop: EventLoop, *, base_dir: Path, seed: int = 0) -> None:
         self.loop = loop
         self.seed = seed
+        self.process = os.getpid()
+        self.thread = threading.get_ident()
         self.thread = threading.get_ident()
         self.process = os.getpid()
         self.recorder: Recorder | None = None
@@ -304,7 +306,7 @@ class Core:
         if isinstance(error, OutputError):
             raise error  # the trace cannot be written: no event may be lost quietly
         if os.getpid() != self.process:
-            _end_child(error)
+            end_child(error)
         self.flags |= _RAISED
         name = self.current_node.fully_qualified_name if self.current_node else ""
         label = handle.describe()
@@ -320,7 +322,7 @@ class Core:
             reason = f"{label} raised SystemExit"
             if error.code is not None and not isinstance(error.code, int):
                 reason += f": {said}"  # what Python would print
-            self.loop.stop(Stop(reason, _exit_status(error)))
+            self.loop.stop(Stop(reason, exit_status(error)))
             return
         if isinstance(error, KeyboardInterrupt):
             self.loop.stop(Stop("interrupted", 130))
@@ -374,45 +376,3 @@ class _Outside:
 
     def dispatch(self) -> None:
         raise AssertionError("never in a queue")
-
-
-def _exit_status(error: SystemExit) -> int:
-    if error.code is None:
-        return 0
-    return error.code if isinstance(error.code, int) else 1
-
-
-def _end_child(error: BaseException) -> NoReturn:
-    """End a process that a callback forked and left by an exception: the run is its parent's."""
-    if not isinstance(error, SystemExit):
-        traceback.print_exception(error)
-    elif error.code is not None and not isinstance(error.code, int):
-        print(text_of(error), file=sys.stderr)
-    with contextlib.suppress(Exception):
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit((_exit_status(error) if isinstance(error, SystemExit) else 1) & 0xFF)
-
-
-def text_of(error: BaseException) -> str:
-    """Return what an exception says, as text that can be written to any file."""
-    try:
-        return _writable(str(error))
-    except Exception:
-        return "(its text could not be made)"
-
-
-def _writable(text: str) -> str:
-    return text.encode("utf-8", "backslashreplace").decode()
-
-
-def user_traceback(error: BaseException) -> str:
-    """Return the traceback without the frames of rsltrace that lead to the user's code."""
-    tb = error.__traceback__
-    while tb is not None and tb.tb_frame.f_code.co_filename.startswith(_PACKAGE):
-        tb = tb.tb_next
-    if tb is None:
-        tb = error.__traceback__
-    with contextlib.suppress(Exception):
-        return _writable("".join(traceback.format_exception(type(error), error, tb)))
-    return f"{type(error).__qualname__} (its text could not be made)"

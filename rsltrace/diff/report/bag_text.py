@@ -102,7 +102,7 @@ def _before(found: MessageDivergence, width: int) -> Section:
     side = "a" if found.a is not None else "b"
     rows = [cut(_brief(message), width) for message in found.before]
     title = line((f"before it on {printable(found.topic)}", TITLE), (f" (of {side})", FAINT))
-    return Section(title, rows, 1, "messages", least=0, newest_last=True)
+    return Section(title, rows, 1, "messages", least=0, drop="first")
 
 
 def _brief(message: BagMessage) -> Line:

@@ -74,8 +74,8 @@ class Section:
     """Some lines under a title that may be shortened when space is short.
 
     ``keep`` rows are kept if that is possible at all, ``least`` in any case; a section shortened
-    to no row disappears. ``noun`` names what the rows show: ``… 7 more fields``. With
-    ``newest_last`` the first rows go first.
+    to no row disappears. ``noun`` names what the rows show: ``… 7 more fields``. ``drop`` says
+    where rows go from: ``last``, ``first`` or ``middle``.
     """
 
     title: Line
@@ -83,7 +83,7 @@ class Section:
     keep: int
     noun: str
     least: int = 1
-    newest_last: bool = False
+    drop: str = "last"
     hidden: int = field(default=0)
 
     @property
@@ -98,7 +98,8 @@ class Section:
         if not self.height:
             return []
         more = [line((f"  … {self.hidden} more {self.noun}", FAINT))] if self.hidden else []
-        rows = [*more, *self.rows] if self.newest_last else [*self.rows, *more]
+        gap = {"first": 0, "middle": (len(self.rows) + 1) // 2}.get(self.drop, len(self.rows))
+        rows = [*self.rows[:gap], *more, *self.rows[gap:]]
         return [BLANK, *([self.title] if self.title else []), *rows]
 
     def spare(self, *, hard: bool) -> int:
@@ -107,7 +108,7 @@ class Section:
 
     def shorten(self) -> None:
         """Leave out the row that matters least."""
-        self.rows.pop(0 if self.newest_last else -1)
+        self.rows.pop({"first": 0, "middle": len(self.rows) // 2}.get(self.drop, -1))
         self.hidden += 1
 
 

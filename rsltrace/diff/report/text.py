@@ -37,6 +37,7 @@ from rsltrace.model.stamp import format_duration, format_seconds
 HEIGHT = 40
 """Lines of a report unless more is asked for: what fits a screen."""
 _CONTEXT = 5
+_DEPTH_MAX = 10
 
 
 def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Line]:
@@ -184,14 +185,14 @@ def _cause(found: Divergence, width: int) -> Section:
         for depth, step in enumerate(found.chain)
     ]
     title: Line = line(("cause: ", TITLE), shortened(printable(found.root_sentence), width - 7))
-    return Section(title, rows, 4, "steps", least=2)
+    return Section(title, rows, 5, "steps", least=2, drop="middle")
 
 
 def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
     event = step.a or step.b
     assert event is not None
     side = "" if step.a and step.b else " (only a)" if step.a else " (only b)"
-    branch = "  " * depth + ("└ " if depth else "")
+    branch = "  " * min(depth, _DEPTH_MAX) + ("└ " if depth else "")
     index = str(event.index)
     if step.a and step.b and step.a.index != step.b.index:
         index = f"{step.a.index}/{step.b.index}"
@@ -233,7 +234,7 @@ def _listed(
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
         heading = line((f"{title} (the same in both)", TITLE))
-        return Section(heading, rows, keep, "events", least, newest_last=True)
+        return Section(heading, rows, keep, "events", least, drop="first")
     half = (width - 5) // 2
     longest = max(len(a), len(b))
     left = [None] * (longest - len(a)) + list(a)
@@ -244,7 +245,7 @@ def _listed(
         first = f"{_brief(one, half):<{half}}"
         rows.append(line("  ", first, (mark, BAD), f" {_brief(other, half)}".rstrip()))
     heading = line((f"{title} ", TITLE), ("(a left, b right)", FAINT))
-    return Section(heading, rows, keep, "events", least, newest_last=True)
+    return Section(heading, rows, keep, "events", least, drop="first")
 
 
 def _brief(event: EventView | None, width: int) -> str:
