@@ -25,6 +25,7 @@ from rsltrace.ros.context import ContextHandle
 from rsltrace.ros.destroyable import Destroyable, set_invalid_handle
 from rsltrace.ros.guard_condition import GuardConditionHandle
 from rsltrace.ros.interfaces import type_hash
+from rsltrace.ros.lifecycle import StateMachineHandle
 from rsltrace.ros.node import NodeHandle
 from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.ros.qos_events import EventHandle, IncompatibleQosStatus, MatchedStatus
@@ -67,7 +68,6 @@ _PASSED_THROUGH = (
 ).split()
 
 _LATER = {
-    "LifecycleStateMachine": "lifecycle nodes",
     "EventsExecutor": "rclpy's EventsExecutor",
 }
 
@@ -179,6 +179,11 @@ class Boundary:
 
     def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
         return ActionClientHandle(node.core, node, *arguments)
+
+    def LifecycleStateMachine(  # noqa: N802
+        self, node: NodeHandle, communicate: bool
+    ) -> StateMachineHandle:
+        return StateMachineHandle(self, node.core, node, communicate)
 
     def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
         from rsltrace.ros.executor import WaitSetHandle

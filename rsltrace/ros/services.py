@@ -60,7 +60,7 @@ class _End(Receiver):
         self._response = codec_for(srv_type.Response)
         self._srv_type = srv_type
         self.type_name = self._request.type_name.removesuffix("_Request")
-        self.qos = Qos.from_rmw(qos).resolved(publisher=True, peers=[])
+        self.profile = Qos.from_rmw(qos).resolved(publisher=True, peers=[])
         super().__init__(core, node)
         self.queue: deque[Exchange] = deque()
         self._channel: int | None = None
@@ -106,6 +106,11 @@ class ServiceHandle(_End):
     def name(self) -> str:
         """The resolved service name."""
         return self.service
+
+    @property
+    def qos(self) -> dict[str, Any]:
+        """The QoS profile as rclpy's lifecycle nodes ask for it."""
+        return self.profile.to_dict()
 
     def dispatch(self) -> None:
         """Take the oldest request, run the callback and send what it returns."""
