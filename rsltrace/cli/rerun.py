@@ -45,21 +45,12 @@ def rerun(
 
     sdk.require()
     from rsltrace_viewer.rerun_export import show
-    from rsltrace_viewer.rerun_export.export import Exported, export
+    from rsltrace_viewer.rerun_export.export import export
 
     how = show.choose(spawn=spawn, web=web, output=output)
     traces = [trace] if other is None else [trace, other]
-    diff = None
-    if other is not None:
-        from rsltrace.diff.engine import diff_traces
-
-        diff = diff_traces(trace, other)
-
-    def written(target: Path, *, replace: bool) -> Exported:
-        return export(traces, target, diff=diff, force=replace)
-
     if output is not None:
-        done = written(output, replace=force)
+        done = export(traces, output, force=force)
         if not quiet:
             click.echo(
                 f"wrote {output}: {done.events} events, {done.bytes / 1e6:.1f} MB "
@@ -69,5 +60,5 @@ def rerun(
             show.open_viewer(output, how)
     elif how is not None:
         with show.temporary_recording() as target:
-            written(target, replace=True)
+            export(traces, target)
             show.open_viewer(target, how)

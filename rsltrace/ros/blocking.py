@@ -236,7 +236,7 @@ _world: list[Core] = []
 
 
 def _sleep(seconds: float) -> None:
-    """Stand in for ``time.sleep``, in every run: modules may keep it (``from time import sleep``)."""
+    """Stand in for ``time.sleep`` in every run: ``from time import sleep`` keeps it for ever."""
     core = _world[-1] if _world else None
     if (
         core is None

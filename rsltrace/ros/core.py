@@ -55,8 +55,6 @@ class Core:
         self.seed = seed
         self.process = os.getpid()
         self.thread = threading.get_ident()
-        self.thread = threading.get_ident()
-        self.process = os.getpid()
         self.recorder: Recorder | None = None
         self.base_dir = base_dir
         self.graph: Graph

@@ -147,15 +147,17 @@ class World:
             )
 
     def run(self) -> Stop:
-        """Run the loop to its end; a quiet end with somebody still waiting is a deadlock."""
+        """Run the loop to its end; a quiet end with somebody still waiting is a deadlock.
+
+        The loop never runs on this stack, so that no callback can keep it from going on.
+        """
         core = self.core
-        try:
-            stop = core.loop.run()
-            core.note_stuck()
-        finally:
-            end_blocked(core)
+        core.next_runner().switch()
+        end_blocked(core)
         if core.runner_error is not None:
             raise core.runner_error
+        stop = core.loop.stopped
+        assert stop is not None
         if core.stuck and core.error is None:
             lines = "\n".join(f"  {text}" for text in core.stuck[:20])
             core.error = DeadlockError(f"nothing can happen any more, but somebody waits:\n{lines}")

@@ -646,6 +646,15 @@ class ViewerApp(App[None]):
 
     def action_verdict(self) -> None:
         """Show the whole report on two traces."""
+        comparison = self.session.comparison
+        if comparison is None:
+            self._say("this is one trace; rsltrace view A B compares two")
+        elif comparison.diff is None:
+            self._say("the runs are identical" if comparison.identical else "still looking …")
+        else:
+            from rsltrace_viewer.screens.report import ReportScreen
+
+            self.push_screen(ReportScreen(comparison.diff))
 
     def action_other(self) -> None:
         """Inspect the differences, run a, run b in turn."""

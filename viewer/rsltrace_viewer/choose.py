@@ -71,7 +71,7 @@ class ChooseApp(App[list[Path]]):
     ]
     CSS = """
     Static { padding: 0 1; background: $panel; }
-    OptionList { height: 1fr; border: none; }
+    OptionList, OptionList:focus { height: 1fr; border: none; }
     """
 
     def __init__(self, found: Sequence[Found]) -> None:

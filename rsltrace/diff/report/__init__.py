@@ -70,4 +70,4 @@ def report_lines(
         return report_lines(diff[0], options, width=width)
     from rsltrace.diff.report.several import several_report
 
-    return several_report(diff, width)
+    return several_report(diff)

@@ -30,7 +30,7 @@ from rsltrace.diff.report.line import (
     line,
     wrapped,
 )
-from rsltrace.diff.report.words import cut, field_lines
+from rsltrace.diff.report.words import cut, field_lines, sentence_text
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 
@@ -40,7 +40,7 @@ HEIGHT = 40
 def bag_report(diff: BagDiff, options: DiffOptions, width: int = 100) -> list[Line]:
     """Return the report of two recordings, at most ``HEIGHT`` lines unless all is asked for."""
     style = BAD if diff.verdict is BagVerdict.DIFFERENT else GOOD
-    head = wrapped(printable(diff.sentence), width, style=style)
+    head = wrapped(sentence_text(diff.sentence), width, style=style)
     sides = (("a", SIDE_A, diff.a), ("b", SIDE_B, diff.b))
     head += [
         cut(row, width) for row in in_columns([_side_cells(*side) for side in sides], widest=60)
@@ -66,7 +66,7 @@ def _side_cells(name: str, style: str, side: Recording) -> list[Piece]:
     return [
         (name, style),
         (printable(side.path), ""),
-        (side.kind, ""),
+        (printable(side.kind), ""),
         (f"{side.messages} messages", ""),
         (format_duration(side.end_ns - side.start_ns), ""),
         ("" if side.complete else "cut off", FAINT),

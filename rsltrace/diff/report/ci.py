@@ -12,6 +12,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import trace_report, within_tolerance
+from rsltrace.diff.report.words import sentence_text
 from rsltrace.model.printable import printable
 
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -64,7 +65,9 @@ def _report(diff: Diff | BagDiff, options: DiffOptions) -> list[tuple[tuple[str,
 
 def _message(diff: Diff | BagDiff) -> str:
     tolerated = isinstance(diff, Diff) and within_tolerance(diff)
-    return diff.sentence + (" Equal within tolerance, not identical." if tolerated else "")
+    return sentence_text(diff.sentence) + (
+        " Equal within tolerance, not identical." if tolerated else ""
+    )
 
 
 def _side(text: str | None) -> str:

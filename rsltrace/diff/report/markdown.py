@@ -12,7 +12,7 @@ from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, several_cells
 from rsltrace.diff.report.text import trace_report, within_tolerance
-from rsltrace.diff.report.words import distance_text, message_title
+from rsltrace.diff.report.words import distance_text, message_title, sentence_text
 from rsltrace.model.printable import printable, shortened
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~@])")
@@ -24,7 +24,7 @@ _CELL = 60
 def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
     """Return a heading with the verdict, a table of the fields that differ, and the full report
     folded away."""
-    lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(diff.sentence), ""]
+    lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(sentence_text(diff.sentence)), ""]
     lines += _sides(diff)
     lines += _fields(diff)
     if diff.exit_code or not diff.identical:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 
 from rsltrace.diff.bag_model import BagDiff
 from rsltrace.diff.model import Diff
 from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
 from rsltrace.diff.report.text import within_tolerance
-from rsltrace.diff.report.words import cut, event_text
+from rsltrace.diff.report.words import event_text
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -37,8 +38,11 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
     return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
 
 
-def several_report(diffs: Sequence[Diff | BagDiff], width: int = 100) -> list[Line]:
-    """Return the table of several runs, with a sentence that counts them first."""
+def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
+    """Return the table of several runs, with a sentence that counts them first.
+
+    Nothing in it is cut: it is made to be read by ``grep`` and ``awk``, too.
+    """
     parted = sum(diff.exit_code != 0 for diff in diffs)
     golden = printable(diffs[0].a.path)
     if parted:
@@ -51,11 +55,9 @@ def several_report(diffs: Sequence[Diff | BagDiff], width: int = 100) -> list[Li
         style = BAD if diff.exit_code else GOOD
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
     lines = [line((sentence, BAD if parted else GOOD)), line()]
-    lines += [cut(row, max(width, 100)) for row in in_columns(rows, indent="")]
+    lines += in_columns(rows, indent="", widest=60)
     first = next((diff for diff in diffs if diff.exit_code), None)
     if first is not None:
-        import shlex
-
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
         lines += [line(), line(("next: ", TITLE), printable(command))]
     return lines

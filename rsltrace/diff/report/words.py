@@ -14,7 +14,7 @@ _VERBS = {
     OutputKind.MESSAGE: "message on",
     OutputKind.REQUEST: "request to",
     OutputKind.RESPONSE: "response of",
-    OutputKind.LOG: "log record of",
+    OutputKind.LOG: "log record on",
 }
 
 
@@ -42,14 +42,23 @@ def event_cells(event: EventView) -> list[Piece]:
     ]
 
 
-def same_event(a: EventView, b: EventView) -> bool:
-    """Whether two events are the same but for their place in the run."""
+def event_key(event: EventView) -> tuple[object, ...]:
+    """Return what is equal for events that are the same but for their place in the run."""
     return (
-        a.entity == b.entity
-        and a.stamp_ns == b.stamp_ns
-        and a.kind is b.kind
-        and (a.input_hash, a.output_hash, a.flags) == (b.input_hash, b.output_hash, b.flags)
+        event.entity,
+        event.stamp_ns,
+        event.kind,
+        event.input_hash,
+        event.output_hash,
+        event.flags,
     )
+
+
+def sentence_text(sentence: str) -> str:
+    """Return a sentence with a capital and a full stop, whoever made it."""
+    text = printable(sentence).strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."
 
 
 def message_title(message: MessageDifference) -> str:

@@ -11,6 +11,7 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
+from rsltrace.diff.engine import diff_traces
 from rsltrace.diff.identity import identify
 from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
@@ -143,8 +144,6 @@ class Comparison:
 
     def finish_diff(self) -> None:
         """Let the diff say why the runs part. Takes a while; meant for a thread."""
-        from rsltrace.diff.engine import diff_traces
-
         self.diff = diff_traces(self.run_a.trace, self.run_b.trace, DiffOptions())
 
     # What it says.

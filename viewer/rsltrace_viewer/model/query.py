@@ -393,7 +393,7 @@ FIELDS: dict[str, Field] = {
         "events of nodes", _read_node, lambda run: [node.name for node in run.nodes]
     ),
     "topic": Field(
-        "events that receive from or send to a topic or service",
+        "events that receive from or send to one",
         _read_topic,
         lambda run: list(run.topics),
     ),
@@ -410,7 +410,7 @@ FIELDS: dict[str, Field] = {
     ),
     "time": Field("simulated seconds: 1.5..2, >3, 20ms", _read_time),
     "index": Field("event numbers: 100..200, >5000", _read_index),
-    "text": Field("text in decoded messages and logs (reads them: slow)", _read_text),
+    "text": Field("text in messages and logs (slow)", _read_text),
     "level": Field("logs of a level or worse", _read_level, lambda run: list(_LEVELS)),
     "out": Field(
         "events with an output of a kind", _read_out, lambda run: [k.label for k in OutputKind]

@@ -87,6 +87,13 @@ def lists(counts: npt.NDArray[np.integer[Any]], values: pa.Array) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(offsets), values)
 
 
+def strip_lists(counts: npt.NDArray[np.integer[Any]], points: pa.Array) -> pa.Array:
+    """Return ``points`` cut into strips of ``counts`` points; a strip has no missing points."""
+    strips = lists(counts, points)
+    kind = pa.list_(pa.field("item", points.type, nullable=False))
+    return pa.ListArray.from_arrays(strips.offsets, points, type=kind)
+
+
 def vectors(values: npt.NDArray[np.floating[Any]]) -> pa.Array:
     """Return an array of shape (n, k) as n fixed-size lists of k float32, as Rerun has positions."""
     size = values.shape[1]

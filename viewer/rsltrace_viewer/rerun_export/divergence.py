@@ -20,7 +20,7 @@ from rerun.chunk import Chunk
 from rsltrace.diff.model import CauseStep, Diff, Divergence, EventView, MessageDifference
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_chunk
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists, make_chunk
 from rsltrace_viewer.rerun_export.paths import join
 
 DOCUMENT = "/divergence"
@@ -28,7 +28,7 @@ AGREEMENT = "/divergence/agreement"
 CHAIN = "/divergence/chain"
 _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
-_VALUE_WIDTH = 40
+_VALUE_WIDTH = 18
 _FIELDS_MAX = 20
 
 
@@ -85,18 +85,16 @@ def _agreement(diff: Diff, first: Divergence | None, clock: Clock) -> Iterator[C
         ((SIM_TIME, clock.array(np.array(stamps))), (EVENT, pa.array(events))),
         ((state, pa.array(states)),),
     )
-    one = np.array([2])
+    two = np.array([2])
     configuration = rr.StateConfiguration
-    from rsltrace_viewer.rerun_export.columns import lists
-
     yield from make_chunk(
         AGREEMENT,
         (),
         (
-            (configuration.descriptor_values(), lists(one, pa.array([_AGREE, _DIFFER]))),
+            (configuration.descriptor_values(), lists(two, pa.array([_AGREE, _DIFFER]))),
             (
                 configuration.descriptor_colors(),
-                lists(one, pa.array([_GREEN, _RED], type=pa.uint32())),
+                lists(two, pa.array([_GREEN, _RED], type=pa.uint32())),
             ),
         ),
     )
@@ -105,7 +103,7 @@ def _agreement(diff: Diff, first: Divergence | None, clock: Clock) -> Iterator[C
 def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
     """Yield the lane of causes: each from its event to the next, the divergence to the end."""
     steps = [(view, step) for step in first.chain if (view := _either(step.a, step.b))]
-    rows = [(view.index, view.stamp_ns, f"{i + 1}. {_step(s)}") for i, (view, s) in enumerate(steps)]
+    rows = [(view.index, view.stamp_ns, f"{i + 1}. {printable(_step(s))}") for i, (view, s) in enumerate(steps)]
     here = _either(first.a, first.b)
     if here is not None and (not rows or rows[-1][0] != here.index):
         rows.append((here.index, here.stamp_ns, f"divergence: {_event(here)}"))
@@ -147,7 +145,7 @@ def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str
     yield f"## Divergence {number} of {count}" if count > 1 else "## Where they part"
     yield ""
     for name, view in (("a", divergence.a), ("b", divergence.b)):
-        yield f"- **{name}**: {_event(view) if view else 'nothing there'}"
+        yield f"- **{name}**: {_text(_event(view)) if view else 'nothing there'}"
     for message in divergence.messages:
         yield ""
         yield from _message(message)
@@ -156,7 +154,7 @@ def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str
         yield "### From the root"
         yield ""
         for place, step in enumerate(divergence.chain, 1):
-            yield f"{place}. {_step(step)}"
+            yield f"{place}. {_text(_step(step))}"
     if divergence.root_sentence:
         yield ""
         yield _text(divergence.root_sentence)
@@ -199,13 +197,13 @@ def _message(message: MessageDifference) -> Iterator[str]:
 def _step(step: CauseStep) -> str:
     view = _either(step.a, step.b)
     side = "" if step.a and step.b else (" (only in a)" if step.a else " (only in b)")
-    relation = f" {_text(step.relation)}" if step.relation else ""
+    relation = f", {step.relation}" if step.relation else ""
     return f"{_event(view) if view else 'an event'}{relation}{side}"
 
 
 def _event(view: EventView) -> str:
     what = f"{view.entity.node or '(run)'} {view.kind.label} {view.entity.name}"
-    return f"#{view.index} at {format_seconds(view.stamp_ns)} s: {_text(what)}"
+    return printable(f"#{view.index} at {format_seconds(view.stamp_ns)} s: {what}")
 
 
 def _either(a: EventView | None, b: EventView | None) -> EventView | None:

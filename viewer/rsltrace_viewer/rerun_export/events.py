@@ -167,7 +167,7 @@ class EventRows:
                 name = self._paths.node_name(entity)
                 by_node.setdefault(name, []).append(entity_id)
                 path = f"{self._paths.callback(entity)}/rate"
-                yield from self._rate(path, times, [entity_id], self._paths.label(entity))
+                yield from self._rate(path, times, [entity_id], self._paths.name(entity))
         for name, ids in by_node.items():
             yield from self._rate(f"{self._paths.node(name)}/rate", times, ids, name)
 
@@ -176,7 +176,7 @@ class EventRows:
     ) -> Iterator[Chunk]:
         scalars = pa.array(self.rates.of(ids))
         yield from make_chunk(path, times, ((rr.Scalars.descriptor_scalars(), scalars),))
-        label = f"{self._paths.root} {name}".strip()
+        label = f"{self._paths.label} {name}".strip()
         yield from make_chunk(
             path, (), ((rr.SeriesLines.descriptor_names(), pa.array([f"{label} [1/s]"])),)
         )

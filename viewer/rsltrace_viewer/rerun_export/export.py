@@ -9,6 +9,7 @@ from pathlib import Path
 
 import rerun as rr
 
+from rsltrace.diff.engine import diff_traces
 from rsltrace.diff.model import Diff
 from rsltrace.errors import OutputError
 from rsltrace.trace.reader import Trace
@@ -30,19 +31,18 @@ class Exported:
     bytes: int
 
 
-def export(
-    traces: Sequence[Path], output: Path, *, diff: Diff | None = None, force: bool = False
-) -> Exported:
+def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Exported:
     """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
 
-    ``diff`` is that of the two traces, in the same order; without it nothing is marked. What was
-    written so far is removed when something goes wrong. Raises TraceError for damaged traces and
-    OutputError if ``output`` exists (without ``force``) or cannot be written.
+    Two traces are compared, and where they part is explained and marked. What was written so far
+    is removed when something goes wrong. Raises TraceError for damaged traces and OutputError if
+    ``output`` exists (without ``force``) or cannot be written.
     """
     assert len(traces) in (1, 2)
     _check_output(output, traces, force=force)
     with ExitStack() as stack:
         opened = [stack.enter_context(Trace.open(path)) for path in traces]
+        diff = diff_traces(opened[0], opened[1]) if len(opened) == 2 else None
         recording = rr.RecordingStream(
             APPLICATION_ID,
             recording_id="-".join(trace.digest for trace in opened),
@@ -72,17 +72,17 @@ def export(
 
 def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None) -> None:
     clock = clock_for([trace.start_ns for trace in opened])
-    roots = ("",) if len(opened) == 1 else ("a", "b")
+    labels = ("",) if len(opened) == 1 else ("a", "b")
     names = " and ".join(f"{Path(trace.name).name} {trace.digest}" for trace in opened)
     recording.send_recording_name(names)
     shown = [
-        export_run(trace, root, clock, recording)
-        for trace, root in zip(opened, roots, strict=True)
+        export_run(trace, label, clock, recording)
+        for trace, label in zip(opened, labels, strict=True)
     ]
     marks: Marks | None = None
     if len(opened) == 2:
         trees = [run.seen.frames for run in shown]
-        recording.send_chunks(joining_chunks(list(roots), trees))
+        recording.send_chunks(joining_chunks(list(labels), trees))
     if diff is not None:
         marks = marks_of(diff)
         recording.send_chunks(divergence_chunks(diff, clock))

@@ -24,8 +24,10 @@ class FrameTree:
     """What was seen of the frames of one run, by names without the run's prefix."""
 
     parents: dict[str, str] = field(default_factory=dict)
-    drawn: dict[str, str] = field(default_factory=dict)
-    """By entity path, the frame of what is drawn there."""
+    frames: dict[str, str] = field(default_factory=dict)
+    """By entity path, the frame its data is in."""
+    drawn: set[str] = field(default_factory=set)
+    """Paths at which there is something to see in three dimensions."""
 
     def add_edge(self, parent: str, child: str) -> None:
         """Note that a transform places ``child`` in ``parent``."""
@@ -43,8 +45,9 @@ class FrameTree:
     def by_root(self) -> dict[str, list[str]]:
         """Return, by root frame, the paths of what is drawn in its tree; most first."""
         result: dict[str, list[str]] = {}
-        for path, frame in self.drawn.items():
-            result.setdefault(self.root_of(frame), []).append(path)
+        for path, frame in self.frames.items():
+            if path in self.drawn:
+                result.setdefault(self.root_of(frame), []).append(path)
         return dict(sorted(result.items(), key=lambda item: -len(item[1])))
 
 

@@ -30,7 +30,7 @@ class Labels:
 
     def __init__(self, trace: Trace, paths: Paths) -> None:
         self._entities = trace.entities
-        self._names = {e.id: paths.label(e) for e in trace.entities.values()}
+        self._names = {e.id: paths.name(e) for e in trace.entities.values()}
         count = max(self._names) + 1
         self._known = count
         entities: list[Entity | None] = [trace.entities.get(i) for i in range(count)]

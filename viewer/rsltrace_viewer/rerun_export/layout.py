@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
+import rerun as rr
 import rerun.blueprint as rrb
 
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
@@ -23,9 +24,12 @@ _PLOTS_SHOWN = 3
 _PLOTS_MAX = 16
 _IMAGES_MAX = 4
 _LANES_MAX = 64
-_FIRST_FIELDS = ("position", "linear", "angular", "data")
+_FIRST_FIELDS = ("pose.position", "position", "linear", "angular", "data")
 """Fields that say most at a glance, in this order; a name in a path counts."""
-_LAST_TOPICS = ("/parameter_events", "/rosout", "/clock")
+_LAST_TOPICS = ("/parameter_events", "/rosout", "/clock", "/rsltrace/")
+_LAST_FIELDS = ("latitude", "altitude", "orientation")
+_EVENTS_IN_SIGHT = 120
+"""Lanes show so many events around the cursor: callbacks, not a grey bar."""
 _TABLE = ("node", "callback", "kind", "outputs", "cause", "flags", "input_hash", "output_hash")
 
 Part = rrb.Container | rrb.View
@@ -103,7 +107,11 @@ def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
             field = path[len(run.paths.topic(topic)) :].strip("/") if topic else path
             fields.setdefault((topic, field), []).append(path)
     first = marks.fields if marks is not None else ()
-    ranked = sorted(fields, key=lambda key: (_place(key, first), _rank(key), key))
+    names = {
+        key: " ".join((key[1], *(n for run in shown for n in run.seen.curves.get(paths[0], ()))))
+        for key, paths in fields.items()
+    }
+    ranked = sorted(fields, key=lambda key: (_place(key, first), _rank(key[0], names[key]), key))
     chosen: list[tuple[str, str]] = []
     rest: list[tuple[str, str]] = []
     topics: set[str] = set()
@@ -111,6 +119,7 @@ def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
         new = key[0] not in topics or _place(key, first) < len(first)
         (chosen if new and len(chosen) < _PLOTS_SHOWN else rest).append(key)
         topics.add(key[0])
+    chosen.sort(key=ranked.index)
     views: list[Part] = [_plot(key, fields[key]) for key in chosen]
     more = [_plot(key, fields[key]) for key in rest[: _PLOTS_MAX - len(views)]]
     if not views:
@@ -135,10 +144,13 @@ def _place(key: tuple[str, str], first: Sequence[tuple[str, str]]) -> int:
     return first.index(key) if key in first else len(first)
 
 
-def _rank(key: tuple[str, str]) -> tuple[bool, int]:
-    topic, field = key
-    places = [i for i, name in enumerate(_FIRST_FIELDS) if name in field]
-    return topic in _LAST_TOPICS, min(places, default=len(_FIRST_FIELDS))
+def _rank(topic: str, names: str) -> tuple[bool, bool, int]:
+    places = [i for i, name in enumerate(_FIRST_FIELDS) if name in names]
+    return (
+        topic.startswith(_LAST_TOPICS),
+        any(name in names for name in _LAST_FIELDS),
+        min(places, default=len(_FIRST_FIELDS)),
+    )
 
 
 def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
@@ -147,11 +159,13 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
     rates: list[str] = []
     for run in shown:
         nodes = sorted(run.nodes, key=lambda name: name == NO_NODE)
-        lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX]]
+        lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX] if name != NO_NODE]
         rates += [f"{run.paths.node(name)}/rate" for name in nodes]
         logs += [f"{run.paths.node(name)}/log" for name in nodes]
+    nanoseconds = max(_EVENTS_IN_SIGHT * run.mean_gap_ns // 2 for run in shown)
     parts: list[Part] = [
-        rrb.StateTimelineView(origin="/", contents=_only(lanes), name="Callbacks"),
+        _lanes(lanes, "Callbacks by time", nanoseconds),
+        _lanes(lanes, "Callbacks by event", _EVENTS_IN_SIGHT // 2),
     ]
     if any(run.log_records for run in shown):
         parts.append(
@@ -171,12 +185,23 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
     return parts
 
 
+def _lanes(paths: list[str], name: str, around: int) -> rrb.StateTimelineView:
+    """Lanes around the cursor, in units of the timeline they are meant for."""
+    start, end = (rr.TimeRangeBoundary.cursor_relative(seq=n) for n in (-around, around))
+    return rrb.StateTimelineView(
+        origin="/",
+        contents=_only(paths),
+        name=name,
+        time_view=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+    )
+
+
 def _table(run: Shown) -> rrb.DataframeView:
     path = run.paths.events
     return rrb.DataframeView(
         origin=path,
         contents="$origin",
-        name=f"Events {run.paths.root}".strip(),
+        name=f"Events {run.paths.label}".strip(),
         query=rrb.archetypes.DataframeQuery(
             timeline=EVENT,
             select=[EVENT, SIM_TIME, *(f"{path}:{name}" for name in _TABLE)],

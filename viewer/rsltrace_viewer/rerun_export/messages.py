@@ -32,18 +32,16 @@ from rsltrace_viewer.rerun_export.columns import (
     SIM_TIME,
     Clock,
     Column,
-    constant,
     lists,
     make_chunk,
-    vectors,
 )
 from rsltrace_viewer.rerun_export.fields import Curves, curves_of
 from rsltrace_viewer.rerun_export.frames import FrameTree
-from rsltrace_viewer.rerun_export.markers import MarkerBoard
+from rsltrace_viewer.rerun_export.marker_rows import MarkerRows
 from rsltrace_viewer.rerun_export.moments import Moments
 from rsltrace_viewer.rerun_export.paths import Paths, join
-from rsltrace_viewer.rerun_export.shapes import SHAPES, Drawing, Paint, frames_of
-from rsltrace_viewer.rerun_export.tracks import Track
+from rsltrace_viewer.rerun_export.shapes import SHAPES, Drawing, Paint, frames_of, pose_drawing
+from rsltrace_viewer.rerun_export.trails import Trails
 from rsltrace_viewer.rerun_export.values import messages_of, numbers
 
 _OWN = (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS, TOPIC_ROSOUT)
@@ -51,6 +49,9 @@ _DECODERS = ("ros2msg", "ros2_reflection", "raw")
 _LOG_TIME = "message_log_time"
 _FRAME_TYPE = b"rerun.components.TransformFrameId"
 _MARKERS = ("visualization_msgs.msg.Marker", "visualization_msgs.msg.MarkerArray")
+_IMAGES = {"Image:buffer", "EncodedImage:blob", "DepthImage:buffer", "EncodedDepthImage:blob"}
+_SOLID = {"Points3D:positions", "GridMap:data", "Pinhole:image_from_camera"}
+"""What the loader draws, flat and in space."""
 _RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
 """The bytes of a cloud, beside its points: the same once more."""
 
@@ -90,14 +91,12 @@ class MessageRows:
         self._trace = trace
         self._paths = paths
         self._clock = clock
-        self._recording = recording
         self._moments = Moments(trace)
         self._topics = {join(c.topic): c.topic for c in trace.channels.values()}
         self._numbers = {topic: i for i, topic in enumerate(sorted(self._topics.values()))}
-        self._tracks: dict[str, tuple[Track, str]] = {}
-        self._fix_tracks: dict[str, Track] = {}
-        self._boards: dict[str, MarkerBoard] = {}
-        self._expiring: dict[str, int] = {}
+        self._prefix = f"{paths.label}/" if paths.label else ""
+        self._trails = Trails()
+        self._markers = MarkerRows(paths.label, clock, recording, self.seen.frames)
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
@@ -151,7 +150,7 @@ class MessageRows:
         """Names of curves and the like."""
         for f, column in columns:
             if f.name == "SeriesLines:names":
-                names = tuple(f"{self._paths.root} {n}".strip() for n in column[0].as_py())
+                names = tuple(f"{self._paths.label} {n}".strip() for n in column[0].as_py())
                 self.seen.curves[path] = names
                 return self._curve_names(path, names)
         return _batch(path, (), columns)
@@ -168,8 +167,10 @@ class MessageRows:
                 column = self._own_frames(column)
             columns.append((f, column))
         names = {f.name for f, _ in rows.columns}
-        if names & {"Image:buffer", "EncodedImage:blob", "DepthImage:buffer"}:
+        if names & _IMAGES:
             self.seen.images[rows.path] = None
+        if names & _SOLID:
+            self.seen.frames.drawn.add(rows.path)
         self.seen.topic_of.setdefault(rows.path, rows.topic)
         return _batch(rows.path, rows.times, columns) if columns else []
 
@@ -181,7 +182,10 @@ class MessageRows:
             if messages is None:
                 continue
             if type_name in _MARKERS:
-                self._draw_markers(rows, messages)
+                for message, stamp_ns, event in zip(
+                    messages.to_pylist(), rows.stamps_ns.tolist(), rows.events.tolist(), strict=True
+                ):
+                    self._markers.log(rows.path, message, stamp_ns, event)
                 continue
             yield from self._curves(rows, curves_of(messages))
             draw = SHAPES.get(type_name)
@@ -202,19 +206,19 @@ class MessageRows:
     # Frames.
 
     def _own_frames(self, column: pa.Array) -> pa.Array:
-        if not self._paths.root:
+        if not self._prefix:
             return column
         names = [
-            None if row is None else [f"{self._paths.root}/{name}" for name in row]
+            None if row is None else [f"{self._prefix}{name}" for name in row]
             for row in column.to_pylist()
         ]
         return pa.array(names, type=column.type)
 
     def _note_frame(self, path: str, column: pa.Array) -> None:
-        if path not in self.seen.frames.drawn and len(column):
+        if path not in self.seen.frames.frames and len(column):
             first = column[0].as_py()
             if first:
-                self.seen.frames.drawn[path] = first[0]
+                self.seen.frames.frames[path] = first[0]
 
     def _note_transforms(self, by_name: dict[str, pa.Array]) -> None:
         parents = by_name["Transform3D:parent_frame"].flatten()
@@ -225,7 +229,7 @@ class MessageRows:
     # What is drawn.
 
     def _paint(self, topic: str) -> Paint:
-        return Paint(colour(self._paths.root, self._numbers[topic]))
+        return Paint(colour(self._paths.label, self._numbers[topic]))
 
     def _draw(self, rows: _Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
         frames = frames_of(messages) or [""] * len(messages)
@@ -234,19 +238,18 @@ class MessageRows:
     def _drawing(self, rows: _Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
         path = f"{rows.path}/{drawing.part}"
         names = pa.array([str(name) for name in frames])
-        self.seen.frames.drawn.setdefault(path, str(frames[0]))
+        self.seen.frames.frames.setdefault(path, str(frames[0]))
+        self.seen.frames.drawn.add(path)
         self.seen.topic_of.setdefault(path, rows.topic)
         frame = self._own_frames(lists(np.ones(len(frames), dtype=np.int64), names))
         columns = (*drawing.columns, (rr.CoordinateFrame.descriptor_frame(), frame))
         yield from make_chunk(path, rows.times, columns)
         if drawing.position is not None:
-            track, _ = self._tracks.setdefault(rows.path, (Track(), str(frames[0])))
-            track.add(drawing.position)
+            first = f"{self._prefix}{frames[0]}"
+            self._trails.add_poses(rows.path, first, self._paint(rows.topic), drawing.position)
 
     def _loaded_pose(self, rows: _Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
         """The loader knows poses, but draws nothing where they are."""
-        from rsltrace_viewer.rerun_export.shapes import pose_drawing
-
         positions = _flat(by_name["InstancePoses3D:translations"], 3)
         quaternions = _flat(by_name["InstancePoses3D:quaternions"], 4)
         frames = by_name["CoordinateFrame:frame"].flatten().to_pylist()
@@ -257,47 +260,12 @@ class MessageRows:
     def _fix(self, rows: _Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
         self.seen.fixes[rows.path] = None
         positions = _flat(fixes, 2)
-        self._fix_tracks.setdefault(rows.path, Track()).add(positions)
+        self._trails.add_fixes(rows.path, self._paint(rows.topic), positions)
         yield from self._curves(rows, _vector_curves("position", ("latitude", "longitude"), fixes))
         if altitude is not None:
             counts = np.ones(len(altitude), dtype=np.int64)
             scalars = lists(counts, pa.array(numbers(altitude.flatten())))
             yield from self._curves(rows, iter((Curves("altitude", ("altitude",), scalars),)))
-
-    def _draw_markers(self, rows: _Rows, messages: pa.StructArray) -> None:
-        board = self._boards.setdefault(rows.topic, MarkerBoard())
-        recording = self._recording
-        for message, stamp_ns, event in zip(
-            messages.to_pylist(), rows.stamps_ns.tolist(), rows.events.tolist(), strict=True
-        ):
-            for change in board.changes(message, stamp_ns):
-                path = rows.path + join(*change.parts)
-                self._expire(path, stamp_ns)
-                self._set_time(stamp_ns)
-                recording.set_time(EVENT, sequence=event)
-                recording.log(path, change.what)
-                if change.frame:
-                    self.seen.frames.drawn.setdefault(path, change.frame)
-                    name = f"{self._paths.root}/{change.frame}" if self._paths.root else change.frame
-                    recording.log(path, rr.CoordinateFrame(frame=name))
-                if change.expires_ns is not None:
-                    self._expiring[path] = change.expires_ns
-        recording.reset_time()
-
-    def _set_time(self, stamp_ns: int) -> None:
-        if self._clock.dated:
-            self._recording.set_time(SIM_TIME, timestamp=np.datetime64(stamp_ns, "ns"))
-        else:
-            self._recording.set_time(SIM_TIME, duration=np.timedelta64(stamp_ns, "ns"))
-
-    def _expire(self, path: str, before_ns: int) -> None:
-        """Clear a marker whose lifetime ended before it was replaced. No event does that, so it
-        is on the timeline of simulated time only."""
-        expires_ns = self._expiring.pop(path, None)
-        if expires_ns is not None and expires_ns < before_ns:
-            self._recording.reset_time()
-            self._set_time(expires_ns)
-            self._recording.log(path, rr.Clear(recursive=False))
 
     # Curves.
 
@@ -308,7 +276,7 @@ class MessageRows:
             yield from make_chunk(path, rows.times, ((scalars, curve.scalars),))
             known = self.seen.curves.get(path, ())
             if len(curve.names) > len(known):
-                names = tuple(f"{self._paths.root} {name}".strip() for name in curve.names)
+                names = tuple(f"{self._paths.label} {name}".strip() for name in curve.names)
                 self.seen.curves[path] = names
                 self.seen.topic_of[path] = rows.topic
                 yield from self._curve_names(path, names)
@@ -318,59 +286,19 @@ class MessageRows:
         columns: list[Column] = [
             (rr.SeriesLines.descriptor_names(), lists(one, pa.array(list(names))))
         ]
-        if self._paths.root:
-            paints = [colour(self._paths.root, i) for i in range(len(names))]
+        if self._paths.label:
+            paints = [colour(self._paths.label, i) for i in range(len(names))]
             paint = pa.array(paints, type=pa.uint32())
             columns.append((rr.SeriesLines.descriptor_colors(), lists(one, paint)))
         return make_chunk(path, (), columns)
 
-    # At the end.
-
     def _ends(self) -> Iterator[Chunk]:
-        for path, expires_ns in list(self._expiring.items()):
-            if expires_ns <= self._trace.end_ns:
-                self._expire(path, self._trace.end_ns + 1)
-        self._recording.reset_time()
-        for path, (track, frame) in self._tracks.items():
-            if len(track.points):
-                topic = self.seen.topic_of[path]
-                root = self._paths.root
-                at = f"{path}/track"
-                self.seen.frames.drawn[at] = frame
-                name = f"{root}/{frame}" if root else frame
-                yield from make_chunk(
-                    at,
-                    (),
-                    (
-                        (rr.LineStrips3D.descriptor_strips(), _strip(track, 3)),
-                        (rr.LineStrips3D.descriptor_colors(), self._paint(topic).column(1)),
-                        (rr.LineStrips3D.descriptor_radii(), constant(-1.0, 1, pa.float32())),
-                        (rr.CoordinateFrame.descriptor_frame(), pa.array([name])),
-                    ),
-                )
-        for path, track in self._fix_tracks.items():
-            if len(track.points):
-                paint = self._paint(self.seen.topic_of[path])
-                flat = pa.array(track.points.reshape(-1))
-                kind = pa.list_(pa.field("item", pa.float64(), nullable=False), 2)
-                points = pa.FixedSizeListArray.from_arrays(flat, type=kind)
-                strip = lists(np.array([len(points)]), points)
-                yield from make_chunk(
-                    f"{path}/track",
-                    (),
-                    (
-                        (
-                            rr.GeoLineStrings.descriptor_line_strings(),
-                            lists(np.array([1]), strip),
-                        ),
-                        (rr.GeoLineStrings.descriptor_colors(), paint.column(1)),
-                    ),
-                )
-
-
-def _strip(track: Track, size: int) -> pa.Array:
-    points = track.points[:, :size]
-    return lists(np.array([1]), lists(np.array([len(points)]), vectors(points)))
+        self._markers.end(self._trace.end_ns)
+        for path, frame, chunks in self._trails.poses():
+            self.seen.frames.frames[path] = frame.removeprefix(self._prefix)
+            self.seen.frames.drawn.add(path)
+            yield from chunks
+        yield from self._trails.fixes()
 
 
 def _flat(column: pa.Array, size: int) -> npt.NDArray[np.float64]:

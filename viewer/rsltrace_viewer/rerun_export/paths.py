@@ -1,16 +1,16 @@
 """Where things are in Rerun's tree of entities, and what they are called there.
 
-    [a|b/] events                          the table of all events
+    [run_a/] events                        the table of all events
            nodes/NODE                      its callbacks, as a lane of states
            nodes/NODE/log                  its log records, and the tracebacks of exceptions
            nodes/NODE/rate                 its callbacks per simulated second
            nodes/NODE/KIND/NAME            the events of one entity, and its rate
            topics/TOPIC                    its messages as data, and what Rerun draws of them
            services/SERVICE/request        the same for the messages of services
-    frames/FRAME                           where the three-dimensional views look from
-    divergence                             of two runs: what the diff says
+    frames/FRAME                           of two runs: what joins their frames
+    divergence                             of two runs: what the diff says, and marks
 
-The prefix is there when two runs are shown.
+The prefix, ``run_a`` or ``run_b``, is there when two runs are shown.
 """
 
 from __future__ import annotations
@@ -33,10 +33,15 @@ def join(*parts: str) -> str:
 
 
 class Paths:
-    """The paths of one run below ``root`` (empty, ``a`` or ``b``)."""
+    """The paths of one run. ``label`` is empty for a single run, or ``a`` or ``b``.
 
-    def __init__(self, root: str, trace: Trace) -> None:
-        self.root = root
+    ``root`` is above all of them; it comes behind ``divergence`` in the alphabet, in which the
+    viewer lists.
+    """
+
+    def __init__(self, label: str, trace: Trace) -> None:
+        self.label = label
+        self.root = f"run_{label}" if label else ""
         self._trace = trace
         self._ordinals: dict[int, int] = {}
         seen: dict[tuple[int, EntityKind, str], int] = {}
@@ -73,10 +78,10 @@ class Paths:
         if entity.kind in (EntityKind.NODE, EntityKind.SYSTEM):
             return join(self.root, "nodes", self.node_name(entity), entity.kind.label)
         return join(
-            self.root, "nodes", self.node_name(entity), entity.kind.label, self.label(entity)
+            self.root, "nodes", self.node_name(entity), entity.kind.label, self.name(entity)
         )
 
-    def label(self, entity: Entity) -> str:
+    def name(self, entity: Entity) -> str:
         """Return an entity's name, with a number if its node has several of that name."""
         name = printable(entity.name) or f"{entity.kind.label} {entity.id}"
         ordinal = self._ordinals.get(entity.id, 1)

@@ -22,15 +22,18 @@ class Shown:
     seen: Seen
     nodes: tuple[str, ...]
     log_records: int
+    mean_gap_ns: int
+    """Simulated time per event, on average."""
 
 
-def export_run(trace: Trace, root: str, clock: Clock, recording: rr.RecordingStream) -> Shown:
-    """Send a run below ``root`` (empty, ``a`` or ``b``). Raises TraceError for damage in it."""
-    paths = Paths(root, trace)
+def export_run(trace: Trace, label: str, clock: Clock, recording: rr.RecordingStream) -> Shown:
+    """Send a run as ``label`` (empty, ``a`` or ``b``). Raises TraceError for damage in it."""
+    paths = Paths(label, trace)
     events = EventRows(trace, paths, clock)
     recording.send_chunks(events.chunks())
     logs = LogRows(trace, paths, clock)
     recording.send_chunks(logs.chunks())
     messages = MessageRows(trace, paths, clock, recording)
     recording.send_chunks(messages.chunks())
-    return Shown(paths, messages.seen, tuple(events.active_nodes), logs.count)
+    gap_ns = max(trace.end_ns - trace.start_ns, 1) // max(trace.event_count, 1)
+    return Shown(paths, messages.seen, tuple(events.active_nodes), logs.count, max(gap_ns, 1))

@@ -15,12 +15,19 @@ import numpy.typing as npt
 import pyarrow as pa
 import rerun as rr
 
-from rsltrace_viewer.rerun_export.columns import Column, constant, lists, vectors
+from rsltrace_viewer.rerun_export.columns import (
+    Column,
+    constant,
+    lists,
+    strip_lists,
+    vectors,
+)
 from rsltrace_viewer.rerun_export.values import columns, get, items, numbers, rotated_x
 
 ARROW_LENGTH = 0.6
 """In metres: about a robot."""
-_POINT = -4.0
+_POINT = -3.0
+_HERE = -7.0
 _LINE = -1.5
 """Negative sizes are those on the screen: visible however far away the view is."""
 
@@ -40,6 +47,12 @@ class Paint:
 
     rgba: int
 
+    @property
+    def faint(self) -> Paint:
+        """The same, darker: for what is behind."""
+        channels = [(self.rgba >> shift & 255) * 3 // 5 for shift in (24, 16, 8)]
+        return Paint(channels[0] << 24 | channels[1] << 16 | channels[2] << 8 | 255)
+
     def column(self, rows: int) -> pa.Array:
         """Return it for every row."""
         return constant(self.rgba, rows, pa.uint32())
@@ -48,9 +61,14 @@ class Paint:
 def pose_drawing(
     positions: npt.NDArray[np.float64], quaternions: npt.NDArray[np.float64], paint: Paint
 ) -> Drawing:
-    """Return one pose per message: an arrow along its x axis."""
+    """Return one pose per message: a dot, and an arrow along its x axis."""
     ones = np.ones(len(positions), dtype=np.int64)
-    return Drawing("pose", _arrows(ones, positions, quaternions, paint), positions)
+    dot = (
+        (rr.Points3D.descriptor_positions(), vectors(positions)),
+        (rr.Points3D.descriptor_colors(), paint.column(len(ones))),
+        (rr.Points3D.descriptor_radii(), constant(_HERE, len(ones), pa.float32())),
+    )
+    return Drawing("pose", (*_arrows(ones, positions, quaternions, paint), *dot), positions)
 
 
 def _arrows(
@@ -102,7 +120,7 @@ def _polygon(messages: pa.StructArray, paint: Paint) -> Drawing:
 def _strips(
     part: str, counts: npt.NDArray[np.int64], points: npt.NDArray[np.float64], paint: Paint
 ) -> Drawing:
-    strips = lists(counts, vectors(points))
+    strips = strip_lists(counts, vectors(points))
     rows = len(counts)
     return Drawing(
         part,

@@ -10,6 +10,7 @@ from textual.widgets import Static
 
 from rsltrace_viewer.keys import KEYS
 from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.lanes import KIND_LETTERS
 from rsltrace_viewer.model.query import FIELDS
 
 _KEY_WIDTH = 13
@@ -42,7 +43,7 @@ def help_text(width: int, *, two: bool) -> Content:
     """Return the help for a screen of ``width`` cells: two columns where there is room."""
     blocks = [_keys_block(group, two) for group in _groups(two)]
     blocks.append(_signs_block(two))
-    blocks.append(_filter_block())
+    blocks += [_lanes_block(), _filter_block()]
     if width < 2 * _COLUMN + 6:
         return Content("\n").join([line for block in blocks for line in [*block, Content("")]])
     total = sum(len(block) + 1 for block in blocks)
@@ -96,6 +97,14 @@ def _signs_block(two: bool) -> list[Content]:
     lines = [Content.styled("Signs at the left of an event", "bold $text-primary")]
     for sign, text in signs:
         lines.append(Content.assemble("  ", (fit(sign, _KEY_WIDTH), "bold $text-accent"), text))
+    return lines
+
+
+def _lanes_block() -> list[Content]:
+    lines = [Content.styled("Lanes, zoomed in to one event per column (+)", "bold $text-primary")]
+    pairs = [f"{letter} {kind.label}" for kind, letter in KIND_LETTERS.items()]
+    for start in range(0, len(pairs), 4):
+        lines.append(Content("  " + "  ".join(pairs[start : start + 4])))
     return lines
 
 

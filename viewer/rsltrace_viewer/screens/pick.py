@@ -21,6 +21,7 @@ class PickScreen(ModalScreen[int | None]):
     PickScreen > Vertical { width: 90%; max-width: 110; height: auto; max-height: 80%;
                             background: $surface; border: round $primary; padding: 0 1; }
     PickScreen OptionList { border: none; background: $surface; height: auto; max-height: 100%; }
+    PickScreen OptionList:focus { border: none; }
     """
 
     def __init__(self, title: str, choices: Sequence[str]) -> None:

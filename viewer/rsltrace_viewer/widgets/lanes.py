@@ -62,7 +62,7 @@ class LanesView(Widget, can_focus=True):
     @property
     def columns(self) -> int:
         """How many columns there are for events."""
-        return max(self.size.width - self._label_width - 2, 1)
+        return max(self.size.width - self._label_width - 3, 1)
 
     def fit_labels(self, labels: list[str], width: int) -> None:
         """Make room for the names of the lanes in ``width`` cells."""
@@ -96,7 +96,7 @@ class LanesView(Widget, can_focus=True):
 
     def on_click(self, event: events.Click) -> None:
         """Go to the column that was clicked, in the lane that was clicked."""
-        column = event.x - self._label_width - 1
+        column = event.x - self._label_width - 2
         if self.lanes is None or not 0 <= column < self.lanes.columns:
             return
         place = self._first_lane() + event.y
@@ -137,7 +137,7 @@ class LanesView(Widget, can_focus=True):
     def _lane(self, lane: Lane, width: int) -> Strip:
         own = lane.label == self._own
         label = fit(printable(lane.label), self._label_width)
-        pieces = [Piece((">" if own else " ") + label, self._style("own" if own else "label"))]
+        pieces = [Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))]
         text = lane.letters or "".join(_BLOCKS[level] for level in lane.levels)
         bar = self._style("bar")
         for column, character in enumerate(text):
@@ -179,7 +179,7 @@ class LanesView(Widget, can_focus=True):
             text = here if start == self.cursor else f"{here[2:]} ▲"
             start = start if start == self.cursor else self.cursor - len(text) + 1
             _put(line, max(start, 0), text, gap=True)
-        text = " " * (self._label_width + 1) + "".join(line)
+        text = " " * (self._label_width + 2) + "".join(line)
         return Strip([Piece(fit(text, width), self._style("axis"))], width)
 
 

@@ -1,0 +1,207 @@
+"""One divergence of two traces as sections of a report."""
+
+from __future__ import annotations
+
+from difflib import SequenceMatcher
+from itertools import zip_longest
+
+from rsltrace.diff.model import CauseStep, Divergence, EventView, MessageDifference
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report.line import (
+    BAD,
+    FAINT,
+    NOTHING,
+    SIDE_A,
+    SIDE_B,
+    TITLE,
+    Line,
+    Piece,
+    Section,
+    in_columns,
+    line,
+    wrapped,
+)
+from rsltrace.diff.report.words import (
+    cut,
+    event_cells,
+    event_key,
+    event_text,
+    field_lines,
+    hashes_text,
+    message_title,
+)
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_duration, format_seconds
+
+CONTEXT = 5
+"""Events before a divergence that are shown unless another number is asked for."""
+_DEPTH_MAX = 10
+
+
+def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
+    """Return what a report says of one divergence: what differs, why, what was before, what after."""
+    return [
+        _event(found, width),
+        _cause(found, width),
+        *_before(found, width, options),
+        _reaches(found, width),
+    ]
+
+
+def _event(found: Divergence, width: int) -> Section:
+    a, b = found.a, found.b
+    rows: list[Line] = []
+    some = a or b
+    assert some is not None or not found.messages
+    if a is not None and b is not None and a.entity == b.entity and a.kind is b.kind:
+        title = event_text(a)
+        if min(a.position, b.position) >= 0:
+            title += f", its event {a.position + 1}"
+            title += f" (b: {b.position + 1})" if a.position != b.position else ""
+        if (a.index, a.stamp_ns) == (b.index, b.stamp_ns):
+            title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
+        if not title.startswith("event ") or a.flags != b.flags or not found.messages:
+            rows += _did([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
+    elif some is not None:
+        title = "what happened instead" if a and b else "the event"
+        rows += _events_of([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
+    else:
+        title = ""
+    for message in found.messages:
+        rows += _message(message, width)
+    return Section(line((title, TITLE)) if title else (), rows, 12, "lines of differences", least=4)
+
+
+def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
+    """Return when an event was and what it did, for one that is in both runs."""
+    rows = []
+    for name, style, event in sides:
+        index, time, _, done = event_cells(event)
+        rows.append([(name, style), (f"event {index[0]}", ""), (f"{time[0]} s", ""), done])
+    return [cut(row, width) for row in in_columns(rows)]
+
+
+def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> list[Line]:
+    rows = []
+    for name, style, event in sides:
+        cells = event_cells(event) if event is not None else [("nothing here", FAINT)]
+        rows.append([(name, style), *cells])
+    return [cut(row, width) for row in in_columns(rows, widest=44)]
+
+
+def _message(message: MessageDifference, width: int) -> list[Line]:
+    rows = [line(f"  {message_title(message)}")]
+    if message.fields:
+        rows += field_lines(message.fields, width)
+        if message.more_fields:
+            rows.append(line((f"    … {message.more_fields} more fields", FAINT)))
+        return rows
+    if message.preview:
+        rows.append(line(f"    {shortened(printable(message.preview), width - 4)}"))
+    if message.reason:
+        rows += wrapped(f"    {printable(message.reason)}", width, style=FAINT, indent="    ")
+    if not message.preview:
+        rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
+    return rows
+
+
+def _cause(found: Divergence, width: int) -> Section:
+    if not found.root_sentence and len(found.chain) < 2:
+        return NOTHING
+    title, *more = wrapped(f"cause: {printable(found.root_sentence)}", width, indent="  ")
+    title = line(("cause:", TITLE), title[0][0].removeprefix("cause:"))
+    last = len(found.chain) - 1
+    rows = [cut(_step(step, at, last=at == last), width) for at, step in enumerate(found.chain)]
+    if last == 0:
+        rows = []  # the divergence itself, which is shown already
+    return Section(title, [*more, *rows], 5, "steps", least=2, drop="middle")
+
+
+def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
+    event = step.a or step.b
+    assert event is not None
+    side = "" if step.a and step.b else " (only a)" if step.a else " (only b)"
+    branch = "  " * min(depth, _DEPTH_MAX) + ("└ " if depth else "")
+    index = str(event.index)
+    if step.a and step.b and step.a.index != step.b.index:
+        index = f"{step.a.index}/{step.b.index}"
+    relation = printable(step.relation)
+    end: Piece = ("  <- here they part" if last and depth else "", BAD)
+    return line(
+        f"  {branch}",
+        (f"{index} ", FAINT),
+        f"{event_text(event)}{side}",
+        (f"  {relation}" if relation else "", FAINT),
+        end,
+    )
+
+
+def _before(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
+    """Return the last events before: of both runs, and of the node where that says more."""
+    keep = options.context if options.context > CONTEXT else 2
+    sections = [_listed("before it", found.before_a, found.before_b, width, keep, least=1)]
+    seen = {event.index for event in (*found.before_a, *found.before_b)}
+    own = (*found.same_node_a, *found.same_node_b)
+    some = found.a or found.b
+    if some is not None and any(event.index not in seen for event in own):
+        title = f"before it in {printable(some.entity.node) or 'the run'}"
+        sections.append(_listed(title, found.same_node_a, found.same_node_b, width, keep, least=0))
+    return sections
+
+
+def _listed(
+    title: str,
+    a: tuple[EventView, ...],
+    b: tuple[EventView, ...],
+    width: int,
+    keep: int,
+    least: int,
+) -> Section:
+    if not a and not b:
+        return NOTHING
+    alike = list(map(event_key, a)) == list(map(event_key, b))
+    if alike:
+        rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
+        heading = line((f"{title} (the same in both)", TITLE))
+        return Section(heading, rows, keep, "events", least, drop="first")
+    heading = line((f"{title} ", TITLE), ("(a left, b right; = is the same in both)", FAINT))
+    return Section(heading, _side_by_side(a, b, width), keep, "events", least, drop="first")
+
+
+def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
+    """Return two lists of events as two columns, with the same events beside each other."""
+    half = (width - 5) // 2
+    keys_a, keys_b = ([event_key(event) for event in side] for side in (a, b))
+    rows = []
+    for tag, i, i_end, j, j_end in SequenceMatcher(None, keys_a, keys_b, False).get_opcodes():
+        if tag == "equal":
+            for one, other in zip(a[i:i_end], b[j:j_end], strict=True):
+                rows.append(line("  ", f"{_brief(one, half):<{half}}", f"= {other.index}"))
+            continue
+        for left, right in zip_longest(a[i:i_end], b[j:j_end]):
+            text = f"  {_brief(left, half):<{half}}"
+            rows.append(line((text, SIDE_A), ("| ", FAINT), (_brief(right, half), SIDE_B)))
+    return rows
+
+
+def _brief(event: EventView | None, width: int) -> str:
+    if event is None:
+        return ""
+    done = f" -> {printable(event.summary)}" if event.summary else ""
+    seconds = format_seconds(event.stamp_ns).rstrip("0")
+    time = f"{seconds}0" if seconds.endswith(".") else seconds
+    return shortened(f"{event.index} {time} {event_text(event)}{done}", width)
+
+
+def _reaches(found: Divergence, width: int) -> Section:
+    if not found.reaches:
+        return NOTHING
+    parts = []
+    for reach in found.reaches:
+        when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "at once"
+        parts.append(f"{printable(reach.topic)} {when}")
+    rows = wrapped(f"reaches {', '.join(parts)}", width, indent="  ")
+    rows = (
+        rows[:2] if len(rows) <= 2 else [*rows[:1], line("  ", (f"… {len(parts)} topics", FAINT))]
+    )
+    return Section((), rows, 2, "topics")

@@ -1,0 +1,498 @@
+"""Reports of hand-made diffs: what people read is a golden file, what programs read a contract.
+
+``UPDATE_GOLDEN=1 pytest tests/diff/test_report.py`` rewrites the golden files; look at their diff.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsltrace.diff.bag_model import (
+    BagDiff,
+    BagMessage,
+    BagVerdict,
+    LoneTopic,
+    MessageDivergence,
+    Presence,
+    Recording,
+    TopicDiff,
+)
+from rsltrace.diff.model import (
+    CauseStep,
+    Diff,
+    Divergence,
+    EntityCount,
+    EntityKey,
+    EventView,
+    FieldDifference,
+    MessageDifference,
+    Reach,
+    Root,
+    Setting,
+    Side,
+    Verdict,
+)
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import FORMATS, render
+from rsltrace.diff.report.words import sentence_text
+from rsltrace.errors import TraceError
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+
+GOLDEN = Path(__file__).parent.parent / "golden" / "diff"
+DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "diff.md"
+MS = 1_000_000
+
+SCAN_TYPE = "sensor_msgs/msg/LaserScan"
+SCAN = EntityKey("/scan_filter", "subscription", "/scan", SCAN_TYPE)
+TICK = EntityKey("/driver", "timer", "tick", "")
+PLAN = EntityKey("/planner", "subscription", "/points", SCAN_TYPE, ordinal=1)
+ALL_FIELDS = (
+    FieldDifference("header.stamp", "1.350000000", "1.350000001", 1e-9),
+    FieldDifference("ranges[17]", "0.1", "0.2", 0.1, 13421773, elements=(1, 360)),
+    FieldDifference(
+        "intensities",
+        "[0.0, 1.0, … 360]",
+        "[0.0, 2.0, … 360]",
+        ulp=99,
+        note="NaN in b only: 1",
+        elements=(17, 360),
+        first=((1, "1.0", "2.0"), (4, "1.0", "nan"), (9, "3.0", "4.0")),
+        smallest=1e-7,
+        largest=1.0,
+    ),
+    FieldDifference("header.frame_id", '"laser of the front bumper"', '"laser"'),
+    FieldDifference(
+        "data",
+        "500 bytes",
+        "500 bytes",
+        note="first at byte 18",
+        elements=(2, 500),
+        first=((16, "00 01 02 03 04 05 06 07 08 09 0a", "00 01 ff 03 04 05 06 07 08 09 0a"),),
+    ),
+)
+
+
+def event(
+    index: int,
+    ms: int,
+    entity: EntityKey = SCAN,
+    kind: EventKind = EventKind.SUBSCRIPTION,
+    **changes: Any,
+) -> EventView:
+    made = EventView(
+        index=index,
+        stamp_ns=ms * MS,
+        entity=entity,
+        kind=kind,
+        flags=EventFlag.NONE,
+        cause_event=NO_EVENT,
+        cause_output=0,
+        input_hash=1,
+        output_hash=0xABC,
+        state_hash=0,
+        outputs=1,
+        position=index // 3,
+        summary="/points",
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def side(name: str, digest: str, **changes: Any) -> Side:
+    made = Side(f"runs/{name}.mcap", digest, 5210, 10_000 * MS, True, "duration of 10.000000000 s")
+    return dataclasses.replace(made, **changes)
+
+
+def identical() -> Diff:
+    sides = (side("run1", "0123456789abcdef"), side("run2", "0123456789abcdef"))
+    return Diff(*sides, Verdict.IDENTICAL, "The two runs are identical: 5210 events.", 5210)
+
+
+def nondeterministic() -> Diff:
+    """A callback that got the same and did something else; everything there can be is there."""
+    a = event(123, 1350, cause_event=122)
+    b = event(123, 1350, cause_event=122, output_hash=0xDEF)
+    tick = event(122, 1350, TICK, EventKind.TIMER, summary="/scan")
+    before = tuple(
+        event(i, 730 + 5 * i, *((TICK, EventKind.TIMER) if i % 2 else (PLAN,)), summary="/cmd_vel")
+        for i in range(118, 123)
+    )
+    message = MessageDifference(
+        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, "both", 1, 2, ALL_FIELDS, more_fields=3
+    )
+    log = MessageDifference(
+        OutputKind.LOG, "/rosout", "", 1, "only b", None, 5, preview='msg: "nothing in reach"'
+    )
+    found = Divergence(
+        Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
+        "Event 123 at 1.350000000 s: /scan_filter got the same /scan and published something else.",
+        a,
+        b,
+        Root.CALLBACK,
+        "the callback of /scan in /scan_filter itself",
+        (CauseStep(tick, tick, "published /scan"), CauseStep(a, b)),
+        (message, log),
+        before,
+        before,
+        (event(100, 1200),),
+        (event(100, 1200),),
+        (Reach("/points", 0, 3), Reach("/cmd_vel", 50 * MS, 2)),
+        "rsltrace cat runs/run1.mcap --node /scan_filter --from 1.35 --to 1.35",
+    )
+    later = dataclasses.replace(
+        found,
+        verdict=Verdict.EXCEPTION,
+        sentence="Event 200: /planner raised in b only.",
+        a=event(200, 2000, PLAN),
+        b=event(201, 2000, PLAN, flags=EventFlag.RAISED, summary="exception"),
+        chain=(),
+        root_sentence="",
+        messages=(),
+    )
+    return Diff(
+        side("run1", "0123456789abcdef"),
+        side("run2", "fedcba9876543210", events=5208),
+        found.verdict,
+        found.sentence,
+        123,
+        (found, later),
+        (
+            Setting("job.yaml:12", "  gain: 1.0", "  gain: 1.5"),
+            Setting("environment: numpy", "1.26.4", None),
+        ),
+        (EntityCount(SCAN, 100, 3, 1, 0), EntityCount(PLAN, 90, 2, 0, 1)),
+        (200, 199),
+        (2123, 2122),
+        4096,
+        ("run2.mcap was recorded on another machine",),
+    )
+
+
+def missing() -> Diff:
+    """An event of a that b does not have, in a run that was interrupted, without payloads."""
+    gone = event(40, 900, TICK, EventKind.TIMER)
+    instead = event(40, 950, PLAN)
+    found = Divergence(
+        Verdict.MISSING,
+        "Event 40 of a at 0.900000000 s is missing in b: /driver: timer tick.",
+        gone,
+        instead,
+        Root.MISSING,
+        "",
+        messages=(
+            MessageDifference(
+                OutputKind.MESSAGE,
+                "/scan",
+                SCAN_TYPE,
+                0,
+                "only a",
+                77,
+                None,
+                reason="payloads were not recorded: set record.payloads to true and record again",
+            ),
+        ),
+        before_a=(event(38, 880, TICK, EventKind.TIMER), event(39, 890)),
+        before_b=(event(37, 880, TICK, EventKind.TIMER), event(38, 890, output_hash=1)),
+        next_step="rsltrace cat runs/run1.mcap --from 0.9 --to 0.9",
+    )
+    return Diff(
+        side("run1", "0123456789abcdef"),
+        side("run2", "fedcba9876543210", complete=False, stop_reason=""),
+        found.verdict,
+        found.sentence,
+        40,
+        (found,),
+    )
+
+
+def tolerated() -> Diff:
+    base = nondeterministic()
+    close = (dataclasses.replace(ALL_FIELDS[1], within_tolerance=True),)
+    message = MessageDifference(
+        OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, "both", 1, 2, close, more_fields=4
+    )
+    found = dataclasses.replace(base.divergences[0], messages=(message,))
+    return dataclasses.replace(base, divergences=(found,), notes=(), settings=())
+
+
+def recordings() -> BagDiff:
+    first = MessageDivergence(
+        "/odom",
+        "nav_msgs/msg/Odometry",
+        Presence.BOTH,
+        BagMessage(500, 129 * 1000 * MS, "header: {stamp: 129.1}"),
+        BagMessage(499, 229 * 1000 * MS, "header: {stamp: 129.1}"),
+        16_691 * MS,
+        ALL_FIELDS[:2],
+        2,
+        before=(BagMessage(499, 128 * 1000 * MS, 'header: {stamp: 128.9, frame_id: "odom"}'),),
+    )
+    lost = MessageDivergence(
+        "/imu",
+        "sensor_msgs/msg/Imu",
+        Presence.ONLY_A,
+        BagMessage(7, 130 * 1000 * MS, "header: {stamp: 130.0}"),
+        None,
+        17_000 * MS,
+    )
+    return BagDiff(
+        Recording("bags/monday", "mcap", 4, 1207, 112 * 1000 * MS, 203 * 1000 * MS),
+        Recording("bags/tuesday", "sqlite3", 3, 1199, 212 * 1000 * MS, 303 * 1000 * MS, False),
+        BagVerdict.DIFFERENT,
+        "The recordings first part on /odom, 16.691000000 s after the start: message 500 has "
+        "another header.stamp (and 3 other fields).",
+        "order",
+        (
+            TopicDiff(
+                "/odom", "nav_msgs/msg/Odometry", "nav_msgs/msg/Odometry", 690, 5, 3, 0, 1, first
+            ),
+            TopicDiff("/scan", SCAN_TYPE, SCAN_TYPE, 400, 0, 0, 0, 0),
+            TopicDiff("/imu", "sensor_msgs/msg/Imu", "sensor_msgs/msg/Imu", 90, 0, 0, 1, 0, lost),
+        ),
+        (LoneTopic("/tf", "tf2_msgs/msg/TFMessage", 17),),
+        (),
+        first,
+        "rsltrace diff bags/monday bags/tuesday --topic /odom --context 20",
+        ("log times are not compared (--by stamp matches messages by them)",),
+    )
+
+
+def equal_within_tolerance() -> BagDiff:
+    return dataclasses.replace(
+        recordings(),
+        verdict=BagVerdict.WITHIN_TOLERANCE,
+        sentence="The recordings are equal within tolerance, not identical.",
+        topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 5, 0, 0, 0),),
+        topics_only_a=(),
+        first=None,
+        next_step="",
+    )
+
+
+CASES: dict[str, Callable[[], Diff | BagDiff]] = {
+    "identical": identical,
+    "nondeterministic": nondeterministic,
+    "missing": missing,
+    "tolerated": tolerated,
+    "recordings": recordings,
+    "equal_within_tolerance": equal_within_tolerance,
+}
+SUFFIXES = {
+    "text": "txt",
+    "json": "json",
+    "markdown": "md",
+    "junit": "xml",
+    "github": "github.txt",
+}
+
+
+def check_golden(name: str, text: str) -> None:
+    path = GOLDEN / name
+    if os.environ.get("UPDATE_GOLDEN"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    assert text == path.read_text(encoding="utf-8"), f"{path} differs; see the docstring above"
+
+
+@pytest.mark.parametrize("form", FORMATS)
+@pytest.mark.parametrize("case", list(CASES))
+def test_golden_reports(case: str, form: str) -> None:
+    check_golden(f"{case}.{SUFFIXES[form]}", render(CASES[case](), form))
+
+
+def test_golden_report_of_everything() -> None:
+    text = render(nondeterministic(), "text", DiffOptions(everything=True))
+    check_golden("nondeterministic_all.txt", text)
+    assert "independent divergence 2: exception" in text
+    assert "… 3 more fields" in text
+    check_golden("recordings_all.txt", render(recordings(), "text", DiffOptions(everything=True)))
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_golden_reports_of_several_runs(form: str) -> None:
+    runs: list[Diff | BagDiff] = [nondeterministic(), identical(), missing(), tolerated()]
+    check_golden(f"several.{SUFFIXES[form]}", render(runs, form))
+
+
+@pytest.mark.parametrize("case", list(CASES))
+def test_the_first_line_is_the_verdict_in_one_sentence(case: str) -> None:
+    diff = CASES[case]()
+    text = render(diff, "text", width=400)
+    assert text.splitlines()[0] == sentence_text(diff.sentence)
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_report_fits_a_screen_whatever_there_is_to_say(width: int) -> None:
+    crowded = crowd(nondeterministic())
+    lines = render(crowded, "text", width=width).splitlines()
+    assert len(lines) <= 40
+    text = "\n".join(lines)
+    for needed in ("ranges[17]", "<- here they part", "before it", "reaches", "next: ", "job.yaml"):
+        assert needed in text, needed
+    # only what names the two files (a digest must not be cut) and commands may be wider
+    wide = [row for row in lines if len(row) > width]
+    assert all("digest" in row or row.startswith("next: ") for row in wide), wide
+    assert len(render(crowded, "text", DiffOptions(everything=True)).splitlines()) > 100
+
+
+def crowd(diff: Diff) -> Diff:
+    """Give a diff too much of everything."""
+    found = diff.divergences[0]
+    step = found.chain[0]
+    events = tuple(event(i, i) for i in range(60, 80))
+    others = tuple(event(i, i, PLAN) for i in range(61, 81))
+    found = dataclasses.replace(
+        found,
+        sentence=found.sentence * 3,
+        chain=(step,) * 15 + found.chain[1:],
+        messages=found.messages * 6,
+        before_a=events,
+        before_b=others,
+        same_node_a=tuple(event(i, i) for i in range(20)),
+        same_node_b=tuple(event(i, i, PLAN) for i in range(20)),
+        reaches=found.reaches * 20,
+    )
+    return dataclasses.replace(
+        diff,
+        sentence=found.sentence,
+        divergences=(found, *diff.divergences),
+        settings=diff.settings * 20,
+        counts=diff.counts * 20,
+        notes=diff.notes * 10,
+    )
+
+
+def test_a_longer_context_is_shown() -> None:
+    found = nondeterministic().divergences[0]
+    events = tuple(event(i, i) for i in range(60, 90))
+    found = dataclasses.replace(found, before_a=events, before_b=events)
+    diff = dataclasses.replace(nondeterministic(), divergences=(found,))
+    lines = render(diff, "text", DiffOptions(context=30)).splitlines()
+    assert sum("  0.0" in row for row in lines) == 30
+
+
+HOSTILE = "/x\x1b]0;pwned\x07\n::error::injected\r`|<script>&\u202e@everyone"
+
+
+def poisoned(value: Any) -> Any:
+    """Put hostile text in every text of a diff that comes from a file."""
+    if isinstance(value, str):
+        return value + HOSTILE
+    if isinstance(value, tuple):
+        return tuple(map(poisoned, value))
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        kept = ("presence", "digest", "by")
+        # values of fields are printable when they are made
+        made = isinstance(value, FieldDifference)
+        return dataclasses.replace(
+            value,
+            **{
+                field.name: poisoned(getattr(value, field.name))
+                for field in dataclasses.fields(value)
+                if field.name not in kept and not made
+            },
+        )
+    return value
+
+
+@pytest.mark.parametrize("case", ["nondeterministic", "missing", "recordings"])
+@pytest.mark.parametrize("form", ["text", "markdown", "junit", "github"])
+def test_what_a_file_says_cannot_steer_a_terminal_or_a_build(case: str, form: str) -> None:
+    clean, text = render(CASES[case](), form), render(poisoned(CASES[case]()), form)
+    for character in ("\x1b", "\x07", "\r", "\u202e"):
+        assert character not in text
+    assert not re.search(r"^::error::injected", text, re.MULTILINE)
+    if form == "github":
+        commands = [row for row in text.splitlines() if not row.startswith("::")]
+        assert commands == []
+        assert 0 < len(text.splitlines()) <= len(clean.splitlines())
+    if form == "junit":
+        ElementTree.fromstring(text)
+    if form == "markdown":
+        outside = re.sub(r"^(`{3,})text$.*?^\1$", "", text, flags=re.MULTILINE | re.DOTALL)
+        assert "<script>" not in outside
+        assert not re.search(r"(?<!\\)@everyone", outside)
+
+
+@settings(max_examples=50)
+@given(st.text(max_size=30))
+def test_junit_is_well_formed_whatever_the_sentence(sentence: str) -> None:
+    text = render(dataclasses.replace(missing(), sentence=sentence or "x"), "junit")
+    ElementTree.fromstring(text)
+
+
+def test_junit_counts() -> None:
+    suite = ElementTree.fromstring(render([missing(), identical()], "junit"))[0]
+    assert (suite.attrib["tests"], suite.attrib["failures"]) == ("2", "1")
+    failure = suite[0][0]
+    assert (failure.tag, failure.attrib["type"]) == ("failure", "missing")
+    assert suite[1][0].tag == "system-out"
+
+
+def test_json_is_strict_and_versioned() -> None:
+    for make in CASES.values():
+        content = json.loads(render(make(), "json"))
+        assert (content["format"], content["version"]) == ("rsltrace-diff", 1)
+        assert content["kind"] in ("traces", "bags")
+        assert content["exit_code"] == make().exit_code
+    infinite = dataclasses.replace(ALL_FIELDS[0], absolute=float("inf"))
+    message = dataclasses.replace(tolerated().divergences[0].messages[0], fields=(infinite,))
+    found = dataclasses.replace(tolerated().divergences[0], messages=(message,))
+    text = render(dataclasses.replace(tolerated(), divergences=(found,)), "json")
+    strict = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+    fields = strict["divergences"][0]["messages"][0]["fields"]
+    assert fields[0]["absolute"] == "Infinity"
+
+
+def documented_keys() -> set[str]:
+    """The keys that the tables of docs/diff.md list: the first column, in backticks."""
+    rows = re.findall(r"^\| (`[^|]+`) \|", DOCUMENT.read_text(encoding="utf-8"), re.MULTILINE)
+    return {key for row in rows for key in re.findall(r"`([a-z_]+)`", row)}
+
+
+def all_keys(value: Any) -> set[str]:
+    if isinstance(value, dict):
+        return set(value) | {key for item in value.values() for key in all_keys(item)}
+    if isinstance(value, list):
+        return {key for item in value for key in all_keys(item)}
+    return set()
+
+
+def test_every_key_of_the_json_is_documented() -> None:
+    used = set()
+    for make in CASES.values():
+        used |= all_keys(json.loads(render(make(), "json")))
+    used |= all_keys(json.loads(render([missing(), identical()], "json")))
+    assert used - documented_keys() == set()
+
+
+def test_verdicts_are_documented() -> None:
+    text = DOCUMENT.read_text(encoding="utf-8")
+    for verdict in (*Verdict, *Root, *BagVerdict):
+        assert f"`{verdict.value}`" in text, verdict
+
+
+def test_tolerance_is_said_but_does_not_change_the_exit_status() -> None:
+    text = render(tolerated(), "text")
+    assert "equal within tolerance, not identical" in text
+    assert tolerated().exit_code == 1
+    assert "equal within tolerance" not in render(nondeterministic(), "text")
+    assert json.loads(render(tolerated(), "json"))["within_tolerance"] is True
+    assert "::notice" in render(equal_within_tolerance(), "github")
+
+
+def test_unknown_format_and_nothing_to_report() -> None:
+    with pytest.raises(TraceError, match="no report format 'yaml'; there are text, json"):
+        render(identical(), "yaml")
+    with pytest.raises(TraceError, match="nothing to report"):
+        render([], "text")

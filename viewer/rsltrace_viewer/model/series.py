@@ -1,0 +1,232 @@
+"""Numbers over time: fields of messages, rates, latencies, thinned out to what a plot can show."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import NO_EVENT, Output, OutputKind
+from rsltrace_viewer.model.run import Run
+
+SAMPLES_MAX = 1500
+"""Messages decoded for a plot; of more, every n-th is taken, and the plot says so."""
+
+_RATE_BINS = 240
+_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
+_NUMBERS_MAX = 16
+"""Items of an array that are offered one by one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """Something that can be plotted. ``field`` is ``pose.position.x`` or empty."""
+
+    kind: str
+    name: str
+    field: str = ""
+
+    @property
+    def label(self) -> str:
+        """What it is called."""
+        if self.kind == "field":
+            return f"{self.name}  {self.field}"
+        return f"{self.kind} of {self.name}"
+
+    @property
+    def unit(self) -> str:
+        """The unit of the values, where it is known."""
+        return {"rate": "Hz", "latency": "ms"}.get(self.kind, "")
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Points of one run: times in seconds and values, shape (n,); ``note`` says what was left out.
+    """
+
+    times: npt.NDArray[np.float64]
+    values: npt.NDArray[np.float64]
+    note: str = ""
+
+
+_NO_POINTS: npt.NDArray[np.float64] = np.zeros(0)
+
+
+def sources_of(run: Run) -> list[Source]:
+    """Return rates and latencies of a run; fields of a topic come from ``fields_of``."""
+    found = []
+    for entity in _publishers(run):
+        found.append(Source("rate", entity.name))
+    for entity in run.entities.values():
+        if entity.kind is EntityKind.SUBSCRIPTION and entity.name in {e.name for e in found}:
+            found.append(Source("latency", f"{entity.name} → {run.node_name(entity.id)}"))
+    return found
+
+
+def topics_with_messages(run: Run) -> list[str]:
+    """Return the topics that have recorded messages, in the order of their publishers."""
+    counts = run.trace.message_counts
+    topics = [
+        channel.topic
+        for channel in run.trace.channels.values()
+        if counts.get(channel.id) and not channel.topic.startswith("/rsltrace/")
+    ]
+    return list(dict.fromkeys(topics))
+
+
+def fields_of(run: Run, topic: str) -> list[Source]:
+    """Return the numeric fields of a topic, as its first message has them. Raises TraceError."""
+    for _, _, data in run.trace.messages(topic):
+        message = run.trace.decode(topic, data)
+        return [Source("field", topic, path) for path in _numeric_paths(message, "")]
+    return []
+
+
+def series_of(run: Run, source: Source) -> Iterator[Series]:
+    """Yield a series as it becomes known, the last one whole. Raises TraceError."""
+    if source.kind == "field":
+        yield from _field_series(run, source)
+    elif source.kind == "rate":
+        yield from _rate_series(run, source.name)
+    else:
+        topic, _, node = source.name.partition(" → ")
+        yield from _latency_series(run, topic, node)
+
+
+def _publishers(run: Run) -> list[Entity]:
+    seen: dict[str, Entity] = {}
+    for entity in run.entities.values():
+        if entity.kind is EntityKind.PUBLISHER and entity.name != "/parameter_events":
+            seen.setdefault(entity.name, entity)
+    return list(seen.values())
+
+
+def _numeric_paths(value: Any, path: str) -> Iterator[str]:
+    if isinstance(value, (bool, int, float)):
+        yield path
+    elif isinstance(value, np.ndarray):
+        for place in range(min(len(value), _NUMBERS_MAX)):
+            yield f"{path}[{place}]"
+    elif isinstance(value, list):
+        for place in range(min(len(value), 4)):
+            yield from _numeric_paths(value[place], f"{path}[{place}]")
+    elif dataclasses.is_dataclass(value):
+        for field in dataclasses.fields(value):
+            if field.name not in _NOT_OF_THE_MESSAGE:
+                inner = f"{path}.{field.name}" if path else field.name
+                yield from _numeric_paths(getattr(value, field.name), inner)
+
+
+def _value_at(message: Any, path: str) -> float:
+    """Return a number by its path; NaN where an array is shorter."""
+    value = message
+    for part in path.replace("[", ".[").split("."):
+        if part.startswith("["):
+            place = int(part[1:-1])
+            if place >= len(value):
+                return float("nan")
+            value = value[place]
+        elif part:
+            value = getattr(value, part)
+    return float(value)
+
+
+def _field_series(run: Run, source: Source) -> Iterator[Series]:
+    trace = run.trace
+    publisher = next((e for e in _publishers(run) if e.name == source.name), None)
+    probe = Output(0, publisher.id if publisher else 0, OutputKind.MESSAGE, 0, 0)
+    channel = trace.channel_of(probe) if publisher is not None else None
+    if channel is None:
+        return
+    count = trace.message_counts.get(channel.id, 0)
+    step = max(-(-count // SAMPLES_MAX), 1)
+    note = f"every {step}th of {count:,} messages" if step > 1 else f"{count:,} messages"
+    times, values = [], []
+    for sequence in range(0, count, step):
+        found = trace.payload(dataclasses.replace(probe, sequence=sequence))
+        if found is None:
+            continue
+        times.append(found[0] / 1e9)
+        values.append(_value_at(trace.decode(channel, found[2]), source.field))
+        if len(times) % 100 == 0:
+            yield Series(np.array(times), np.array(values), f"{note}, {sequence / count:.0%} read")
+    yield Series(np.array(times), np.array(values), note)
+
+
+def _rate_series(run: Run, topic: str) -> Iterator[Series]:
+    ids = np.array(
+        [e.id for e in _publishers_of(run, topic)], dtype=np.uint32
+    )
+    start, end = run.start_ns, run.end_ns + 1
+    counts = np.zeros(_RATE_BINS)
+    width_s = (end - start) / _RATE_BINS / 1e9
+    times = start / 1e9 + (np.arange(_RATE_BINS) + 0.5) * width_s
+    for number in range(len(run.segments)):
+        try:
+            segment = run.segment(number)
+            outputs = run.segment_outputs(number)
+        except TraceError:
+            continue
+        own = outputs[np.isin(outputs["entity"], ids) & (outputs["kind"] == OutputKind.MESSAGE)]
+        events = (own["event"] - np.uint64(segment.first)).astype(np.intp)
+        stamps = segment.events["stamp"][events].astype(np.float64)
+        places = ((stamps - start) / (end - start) * _RATE_BINS).astype(np.int64)
+        counts += np.bincount(places, minlength=_RATE_BINS)[:_RATE_BINS]
+        yield Series(times, counts / width_s, f"{(number + 1) / len(run.segments):.0%} read")
+    yield Series(times, counts / width_s, f"in steps of {width_s:.3g} s")
+
+
+def _publishers_of(run: Run, topic: str) -> list[Entity]:
+    return [
+        e for e in run.entities.values() if e.kind is EntityKind.PUBLISHER and e.name == topic
+    ]
+
+
+def _latency_series(run: Run, topic: str, node: str) -> Iterator[Series]:
+    """Yield the simulated time from a publish call to the callback that received the message."""
+    ids = np.array(
+        [
+            e.id
+            for e in run.entities.values()
+            if e.kind is EntityKind.SUBSCRIPTION
+            and e.name == topic
+            and run.node_name(e.id) == node
+        ],
+        dtype=np.uint32,
+    )
+    times: list[npt.NDArray[np.float64]] = []
+    values: list[npt.NDArray[np.float64]] = []
+    known_first, known = 0, np.zeros(0, dtype=np.uint64)
+    total = 0
+    for number in range(len(run.segments)):
+        try:
+            segment = run.segment(number)
+        except TraceError:
+            continue
+        # Stamps of this segment and the one before: no message is on its way for longer here.
+        if len(known) and known_first + len(known) == segment.first:
+            known = np.concatenate([known[-len(segment.events) :], segment.events["stamp"]])
+        else:
+            known = segment.events["stamp"]
+        known_first = segment.last - len(known)
+        own = segment.events[np.isin(segment.events["entity"], ids)]
+        causes = own["cause_event"]
+        usable = (causes != np.uint64(NO_EVENT)) & (causes >= np.uint64(known_first))
+        own, causes = own[usable], causes[usable]
+        sent = known[(causes - np.uint64(known_first)).astype(np.intp)]
+        times.append(own["stamp"].astype(np.float64) / 1e9)
+        values.append((own["stamp"] - sent).astype(np.float64) / 1e6)
+        total += len(own)
+        if number % 16 == 15:
+            share = f"{(number + 1) / len(run.segments):.0%} read"
+            yield Series(np.concatenate(times), np.concatenate(values), share)
+    if times:
+        yield Series(np.concatenate(times), np.concatenate(values), f"{total:,} messages")
+    else:
+        yield Series(_NO_POINTS, _NO_POINTS)

@@ -1,0 +1,66 @@
+"""Markers, logged: each at the time and event of its message, and gone when its life is over."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock
+from rsltrace_viewer.rerun_export.frames import FrameTree
+from rsltrace_viewer.rerun_export.markers import MarkerBoard
+from rsltrace_viewer.rerun_export.paths import join
+
+
+class MarkerRows:
+    """Logs the markers of one run, a row at a time: they are of many kinds, and few."""
+
+    def __init__(
+        self, label: str, clock: Clock, recording: rr.RecordingStream, frames: FrameTree
+    ) -> None:
+        self._label = label
+        self._clock = clock
+        self._recording = recording
+        self._frames = frames
+        self._boards: dict[str, MarkerBoard] = {}
+        self._expiring: dict[str, int] = {}
+
+    def log(self, path: str, message: dict[str, Any], stamp_ns: int, event: int) -> None:
+        """Log what a message on the topic at ``path`` changes."""
+        board = self._boards.setdefault(path, MarkerBoard())
+        for change in board.changes(message, stamp_ns):
+            at = path + join(*change.parts)
+            self._expire(at, stamp_ns)
+            self._set_time(stamp_ns)
+            self._recording.set_time(EVENT, sequence=event)
+            self._recording.log(at, change.what)
+            if change.frame:
+                self._frames.frames.setdefault(at, change.frame)
+                self._frames.drawn.add(at)
+                name = f"{self._label}/{change.frame}" if self._label else change.frame
+                self._recording.log(at, rr.CoordinateFrame(frame=name))
+            if change.expires_ns is not None:
+                self._expiring[at] = change.expires_ns
+        self._recording.reset_time()
+
+    def end(self, end_ns: int) -> None:
+        """Clear the markers whose life ended before the run did."""
+        for path in list(self._expiring):
+            self._expire(path, end_ns + 1)
+        self._recording.reset_time()
+
+    def _expire(self, path: str, before_ns: int) -> None:
+        """Clear a marker whose life ended before it was replaced. No event does that, so it is on
+        the timeline of simulated time only."""
+        expires_ns = self._expiring.pop(path, None)
+        if expires_ns is not None and expires_ns < before_ns:
+            self._recording.reset_time()
+            self._set_time(expires_ns)
+            self._recording.log(path, rr.Clear(recursive=False))
+
+    def _set_time(self, stamp_ns: int) -> None:
+        if self._clock.dated:
+            self._recording.set_time(SIM_TIME, timestamp=np.datetime64(stamp_ns, "ns"))
+        else:
+            self._recording.set_time(SIM_TIME, duration=np.timedelta64(stamp_ns, "ns"))
