@@ -19,6 +19,8 @@ CAUSE = "cause"
 NODE = "node"
 REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
 
+UNDECIDED = -1
+
 _REMEMBERED_MAX = 50_000
 _DEPTH_MAX = 100
 """Steps of a way back that are kept."""
@@ -26,7 +28,8 @@ _DEPTH_MAX = 100
 
 @dataclass(slots=True)
 class Mark:
-    """Why an event differs. ``root`` is the number of the divergence it follows from (or is).
+    """Why an event differs. ``root`` is the number of the divergence it follows from (or is), or
+    UNDECIDED until the end of the instant.
 
     ``why`` is ``cause`` or ``node``, and ``previous`` the mark of the event it follows from that
     way; None for a root. ``depth`` counts the steps back to it.
@@ -77,7 +80,7 @@ class Cone:
         self._marks_a: dict[int, Mark] = {}
         self._marks_b: dict[int, Mark] = {}
         self._stretch: Stretch
-        self._moment: list[tuple[Item, Mark]] = []
+        self._moment: list[Mark] = []
         self._moment_stamp = -1
         self._inverted_in: dict[int, int] = {}
 
@@ -120,15 +123,18 @@ class Cone:
             self._end_moment()
             self._moment_stamp = rows.stamp[place]
         why, previous = self._explanation(item)
-        if previous is not None:
+        if previous is not None and previous.root == UNDECIDED and not item.same:
+            self._end_moment()
+            why, previous = self._explanation(item)
+        if previous is not None and previous.root != UNDECIDED:
             self._consequence(item, why, previous)
         elif rows.owner[place] in self._tainted_from_start and self.found:
             self._consequence(item, None, self.found[0].mark)
         elif item.same:
             # It only changed places: with whom, and whether that was due to something, is known
             # when the instant is over.
-            mark = Mark(item, len(self.found), None, None)
-            self._moment.append((item, mark))
+            mark = Mark(item, UNDECIDED, why, previous)
+            self._moment.append(mark)
             self._remember(item, mark)
         elif rows.kind[place] != SHUTDOWN:  # when the run ends is said elsewhere
             self._spread(item, self._root(item).mark)
@@ -189,20 +195,23 @@ class Cone:
         if not moment:
             return
         # Those that only changed places with a consequence were passed by it and did nothing.
-        copies = [Item(item.a, item.b, True) for item, _ in moment]
+        copies = [Item(mark.item.a, mark.item.b, True) for mark in moment]
         mark_inverted(copies)
-        still = {(copy.a, copy.b) for copy in copies if copy.inverted}
-        root: Mark | None = None
-        for item, _ in moment:
+        still = {copy.a: copy.b for copy in copies if copy.inverted}
+        root: Found | None = None
+        for mark in moment:
+            item = mark.item
             self._marks_a.pop(item.a, None)
             self._marks_b.pop(item.b, None)
-            if (item.a, item.b) not in still:
+            if item.a not in still:
                 continue
             if root is None:
-                root = self._root(item).mark
-                self._spread(item, root)
+                root = self._root(item)
+                root.place_a, root.place_b = min(still), min(still.values())
+                self._spread(item, root.mark)
             else:
-                self._consequence(item, None, root)
+                known = mark.previous and self.mark_of(mark.previous.item)
+                self._consequence(item, mark.why if known else None, known or root.mark)
 
     # -- why -------------------------------------------------------------------------------------
 

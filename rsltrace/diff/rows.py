@@ -23,7 +23,8 @@ SHUTDOWN = int(EventKind.SHUTDOWN)
 _ENTITY = int(OutputKind.ENTITY)
 
 OutputRow = tuple[int, int, int, int]
-"""(kind, number of the entity, content hash, payload sequence) of an output."""
+"""(kind, number of the entity, content hash, payload sequence) of an output. The content hash of a
+new entity is 0: its number says what it is, in both runs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +89,10 @@ def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
     rows: list[OutputRow] = []
     for part in run.trace.outputs(first, last):
         numbers = run.identity.numbers(run.trace, part["entity"], of_b=run.of_b).tolist()
-        columns = (part["kind"].tolist(), numbers, part["hash"].tolist(), part["sequence"].tolist())
+        kinds = part["kind"]
+        # The recorder hashes an entity's description with the id of its node; the number says it.
+        hashes = np.where(kinds == _ENTITY, np.uint64(0), part["hash"])
+        columns = (kinds.tolist(), numbers, hashes.tolist(), part["sequence"].tolist())
         rows.extend(zip(*columns, strict=True))
     return rows
 
@@ -125,7 +129,7 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
             rows.owner[place] = rows.number[place]
     if not run.identity.same_ids:
         rows.content = [
-            hash(tuple(map(_hashed, rows.outputs(first + place)))) if count else 0
+            hash(tuple(output[:3] for output in rows.outputs(first + place))) if count else 0
             for place, count in enumerate(rows.output_counts)
         ]
     return rows
@@ -134,12 +138,6 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
 _COLUMNS = (
     "kind stamp input_hash output_hash flags state_hash cause_event cause_output outputs"
 ).split()
-
-
-def _hashed(output: OutputRow) -> tuple[int, int, int]:
-    kind, number, content, _ = output
-    # The recorder hashes an entity's description with the id of its node; the number says it all.
-    return (kind, number, 0 if kind == _ENTITY else content)
 
 
 def _constructed(rows: Rows, place: int) -> int:

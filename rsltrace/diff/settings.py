@@ -12,6 +12,7 @@ from typing import Any
 
 from rsltrace.diff.identity import Identity
 from rsltrace.diff.model import Setting
+from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 
 _ENTITIES_MAX = 50
@@ -34,10 +35,15 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
 
 
 def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
-    """Return the versions that differ, by name."""
-    names = sorted({*a.environment, *b.environment})
-    pairs = ((name, a.environment.get(name), b.environment.get(name)) for name in names)
-    return tuple(Setting(f"environment: {name}", x, y) for name, x, y in pairs if x != y)
+    """Return the modules of the nodes whose code differs, and the versions that differ."""
+    found = []
+    for label, record in (("code of module", METADATA_SOURCES), ("environment:", None)):
+        of_a = a.environment if record is None else a.metadata(record)
+        of_b = b.environment if record is None else b.metadata(record)
+        for name in sorted({*of_a, *of_b}):
+            if of_a.get(name) != of_b.get(name):
+                found.append(Setting(f"{label} {name}", of_a.get(name), of_b.get(name)))
+    return tuple(found)
 
 
 def entity_settings(identity: Identity) -> tuple[Setting, ...]:

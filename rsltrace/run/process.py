@@ -71,7 +71,22 @@ def search_path(job: Job) -> Iterator[None]:
         yield
     finally:
         sys.path[:] = old_path
-        for name in set(sys.modules) - old_modules:
-            file = getattr(sys.modules[name], "__file__", None)
-            if file and any(Path(file).is_relative_to(folder) for folder in folders):
-                del sys.modules[name]
+        for name in set(user_modules(folders)) - old_modules:
+            del sys.modules[name]
+
+
+def user_modules(folders: list[str]) -> dict[str, Path]:
+    """Return the files of the loaded modules that lie in ``folders``, by module name.
+
+    Installed packages are not the user's, even where a virtual environment lies in the folder.
+    """
+    found: dict[str, Path] = {}
+    for name, module in sorted(sys.modules.items()):
+        file = getattr(module, "__file__", None)
+        if not file:
+            continue
+        path = Path(file)
+        installed = {"site-packages", "dist-packages"} & set(path.parts)
+        if not installed and any(path.is_relative_to(folder) for folder in folders):
+            found[name] = path
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import json
 import platform
@@ -11,6 +12,7 @@ from pathlib import Path
 
 from rsltrace._version import __version__
 from rsltrace.job import Job
+from rsltrace.run.process import user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.writer import TraceWriter
 
@@ -40,6 +42,15 @@ def write_job(writer: TraceWriter, job: Job) -> None:
     name = Path(job.source_name).name
     writer.add_metadata(METADATA_JOB, {"name": name, "resolved": resolved})
     writer.add_attachment(ATTACHMENT_JOB, "application/yaml", job.source_text.encode())
+
+
+def sources(job: Job) -> dict[str, str]:
+    """Return a hash of the code of every module loaded from the job's search path, by name."""
+    folders = [str(job.resolve(folder)) for folder in job.search_path]
+    modules = user_modules(folders)
+    return {
+        name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in modules.items()
+    }
 
 
 def environment() -> dict[str, str]:

@@ -17,9 +17,9 @@ from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.bags import check_bag_types, open_bag_of, start_ns_of, start_players
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
-from rsltrace.run.provenance import environment, payload_filter, write_job
+from rsltrace.run.provenance import environment, payload_filter, sources, write_job
 from rsltrace.run.stopping import end_ns_of, stop_conditions
-from rsltrace.trace.format import METADATA_ENVIRONMENT
+from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
@@ -100,6 +100,7 @@ def run(
             world.core.recorder = Recorder(writer, keep_payload=payload_filter(job))
             write_job(writer, job)
             writer.add_metadata(METADATA_ENVIRONMENT, environment())
+            writer.add_metadata(METADATA_SOURCES, sources(job))
         if observer.interrupt is not None:
             observer.interrupt(loop.stop)
         stack.enter_context(quiet_gc())

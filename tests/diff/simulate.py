@@ -190,7 +190,8 @@ class Simulation:
     # -- construction --------------------------------------------------------------------------
 
     def _write_job(self, writer: TraceWriter) -> None:
-        nodes = "".join(f"  - node: sim:{node.name[1:]}\n" for node in self.plan.nodes)
+        # What a node is made of is in the job, as parameters would be.
+        nodes = "".join(f"  - {node}\n" for node in self.plan.nodes)
         text = f"seed: {self.plan.seed}\nnodes:\n{nodes}"
         writer.add_metadata(METADATA_JOB, {"name": "job.yaml", "resolved": "{}"})
         writer.add_metadata(METADATA_ENVIRONMENT, {"sim": self.plan.version})
@@ -237,7 +238,13 @@ class Simulation:
 
     def _draw(self, node: Node) -> int:
         node.draws += 1
-        return mix(self.plan.seed, node.id, node.draws)
+        return mix(self.plan.seed, hash64(node.plan.name.encode()), node.draws)
+
+    def _stable(self, entity: int) -> int:
+        """Return a number for an entity that does not depend on how many others there are."""
+        node = self._owner[entity]
+        first = node.id
+        return mix(hash64(node.plan.name.encode()), entity - first)
 
     # -- the loop --------------------------------------------------------------------------------
 
@@ -293,7 +300,8 @@ class Simulation:
         timer[0] = deadline + period
         timer[4:] = 0, 0
         node = self._owner[entity]
-        value = mix(node.state, entity) if node.plan.memory != "none" else mix(deadline, entity)
+        who = self._stable(entity)
+        value = mix(node.state if node.plan.memory != "none" else deadline, who)
         if node.plan.draws:
             value = mix(value, self._draw(node))
         self._act(node, entity, value, 0)
@@ -311,11 +319,8 @@ class Simulation:
         self._log(kind, entity, 0, entry)
         node = self._owner[entity]
         _, hops, _, value = _VALUE.unpack(data)
-        made = {
-            "all": mix(node.state, entity, value),
-            "last": mix(node.state, entity, value),
-            "none": mix(entity, value),
-        }[node.plan.memory]
+        who = self._stable(entity)
+        made = mix(node.state if node.plan.memory != "none" else 0, who, value)
         if kind is EventKind.SERVICE:
             answer = self._bent(message(hops + 1, made))
             position = self._output(OutputKind.RESPONSE, entity, answer)
@@ -326,7 +331,7 @@ class Simulation:
         elif kind is EventKind.SUBSCRIPTION:
             self._act(node, entity, made, hops + 1)
         if node.plan.memory == "all":
-            node.state = mix(node.state, value, entity)
+            node.state = mix(node.state, value, who)
         elif node.plan.memory == "last":
             node.state = value
         self._end_event(kind, entity, *cause, hash64(data))

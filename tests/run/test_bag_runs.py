@@ -1,4 +1,4 @@
-"""Bags as input: recorded times exactly, canonical bytes, and what is wrong with a bag said early."""
+"""Bags as input: recorded times exactly, canonical bytes; what is wrong is said early."""
 
 from __future__ import annotations
 
@@ -68,7 +68,9 @@ def test_messages_arrive_at_their_recorded_times(
     with Trace.open(result.path) as trace:
         texts = [trace.decode("/rosout", data).msg for _, _, data in trace.messages("/rosout")]
         stamps = [stamp for stamp, _, _ in trace.messages("/numbers")]
-        bag_events = [e for e in map(trace.event, range(trace.event_count)) if e.kind.label == "bag"]
+        bag_events = [
+            e for e in map(trace.event, range(trace.event_count)) if e.kind.label == "bag"
+        ]
     assert texts == [f"{STAMPS[0]} 1", f"{STAMPS[1]} two", f"{STAMPS[1]} 2", f"{STAMPS[2]} 3"]
     assert stamps == STAMPS
     assert [event.stamp_ns for event in bag_events] == sorted([*STAMPS, STAMPS[1]])

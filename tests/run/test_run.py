@@ -285,3 +285,18 @@ def test_a_failing_stop_function_is_an_error_of_the_run(record_job: Any) -> None
     result = record_job(job, function)
     assert isinstance(result.error, RunError)
     assert "nodes_under_test:enough" in str(result.error)
+
+
+def test_a_virtual_environment_in_the_search_path_is_not_the_users_code(
+    record_job: Any, tmp_path: Path
+) -> None:
+    library = tmp_path / ".venv" / "lib" / "site-packages"
+    library.mkdir(parents=True)
+    (library / "installed_library.py").write_text("LOADED = object()\n")
+    code = f"import sys\nsys.path.append({str(library)!r})\nimport installed_library\n"
+    result = record_job(f"{TALKER}stop: {{duration: 1s}}\n", code)
+    assert "installed_library" in sys.modules
+    assert "nodes_under_test" not in sys.modules
+    with Trace.open(result.path) as trace:
+        assert list(trace.metadata("rsltrace:sources")) == ["nodes_under_test"]
+    del sys.modules["installed_library"]

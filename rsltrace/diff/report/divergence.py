@@ -39,7 +39,7 @@ _DEPTH_MAX = 10
 
 
 def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
-    """Return what a report says of one divergence: what differs, why, what was before, what after."""
+    """Return what a report says of one divergence: what, why, what was before, what it reaches."""
     return [
         _event(found, width),
         _cause(found, width),
@@ -86,7 +86,7 @@ def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> li
     for name, style, event in sides:
         cells = event_cells(event) if event is not None else [("nothing here", FAINT)]
         rows.append([(name, style), *cells])
-    return [cut(row, width) for row in in_columns(rows, widest=44)]
+    return [cut(row, width) for row in in_columns(rows, widest=52)]
 
 
 def _message(message: MessageDifference, width: int) -> list[Line]:
@@ -161,7 +161,7 @@ def _listed(
         return NOTHING
     alike = list(map(event_key, a)) == list(map(event_key, b))
     if alike:
-        rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=44)]
+        rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=52)]
         heading = line((f"{title} (the same in both)", TITLE))
         return Section(heading, rows, keep, "events", least, drop="first")
     heading = line((f"{title} ", TITLE), ("(a left, b right; = is the same in both)", FAINT))
@@ -173,7 +173,10 @@ def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int
     half = (width - 5) // 2
     keys_a, keys_b = ([event_key(event) for event in side] for side in (a, b))
     rows = []
-    for tag, i, i_end, j, j_end in SequenceMatcher(None, keys_a, keys_b, False).get_opcodes():
+    found = SequenceMatcher(None, keys_a, keys_b, autojunk=False).get_opcodes()
+    if len(found) > 1 and found[0][0] in ("delete", "insert"):
+        found = found[1:]  # what the other list, which is as long, does not reach back to
+    for tag, i, i_end, j, j_end in found:
         if tag == "equal":
             for one, other in zip(a[i:i_end], b[j:j_end], strict=True):
                 rows.append(line("  ", f"{_brief(one, half):<{half}}", f"= {other.index}"))

@@ -32,7 +32,7 @@ from rsltrace.model.stamp import format_seconds
 HEIGHT = 40
 """Lines of a report unless more is asked for: what fits a screen."""
 _SENTENCE_LINES = 3
-_ALL_HINT = ": --all shows them"
+_ALL_HINT = "--all shows them"
 
 
 def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Line]:
@@ -49,19 +49,16 @@ def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Lin
         hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
         notes = tuple(note for note in diff.notes if not note.endswith(_ALL_HINT))
         sections.append(_notes(dataclasses.replace(diff, notes=notes), width))
-        more = f"{len(others)} or more" if hidden else str(len(others) or "")
-        sections.append(_next(first, more, width))
+        sections.append(_next(first, len(others), hidden=hidden))
         # Whoever asks for a longer context wants to see it.
         return fitted(head, sections, HEIGHT + 2 * max(options.context - CONTEXT, 0))
     sections.append(_notes(diff, width))
-    sections.append(_next(first, "", width))
+    sections.append(_next(first, 0))
     lines = fitted(head, sections, None)
     for number, other in enumerate(others, start=2):
         lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
         lines += wrapped(sentence_text(other.sentence), width, style=BAD)
-        lines += fitted(
-            [], [*divergence_sections(other, width, options), _next(other, "", width)], None
-        )
+        lines += fitted([], [*divergence_sections(other, width, options), _next(other, 0)], None)
     return lines
 
 
@@ -164,11 +161,12 @@ def _notes(diff: Diff, width: int) -> Section:
     return Section((), rows, min(len(rows), 2), "notes")
 
 
-def _next(found: Divergence, more: str, width: int) -> Section:
+def _next(found: Divergence, others: int, *, hidden: bool = False) -> Section:
     rows = []
-    if more:
-        word = "divergence" if more == "1" else "divergences"
-        rows.append(line(f"{more} more independent {word}{_ALL_HINT}"))
+    if others:
+        count = f"more than {others}" if hidden else str(others)
+        word = "divergence" if count == "1" else "divergences"
+        rows.append(line(f"{count} further independent {word}: {_ALL_HINT}"))
     if found.next_step:
         rows.append(line(("next: ", TITLE), (printable(found.next_step), COMMAND)))
     return Section((), rows, len(rows), "", len(rows))

@@ -52,7 +52,7 @@ def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Bluepri
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=SIM_TIME),
+        rrb.TimePanel(state="collapsed", timeline=SIM_TIME, play_state="paused", loop_mode="selection", time_selection=rr.encodings.AbsoluteTimeRange(7_000_000_000, 7_200_000_000)),
         auto_views=False,
         auto_layout=False,
     )
@@ -80,7 +80,11 @@ def _world(shown: Sequence[Shown]) -> Part | None:
         contents = [f"+ {path}" for fix in fixes for path in (fix, f"{fix}/track")]
         views.append(rrb.MapView(origin="/", contents=contents, name="Map (online)"))
     images: list[Part] = [
-        rrb.Spatial2DView(origin=path, contents="$origin", name=path)
+        rrb.Spatial2DView(
+            origin=path,
+            contents="$origin",
+            name=f"{run.paths.label} {run.seen.topic_of[path]}".strip(),
+        )
         for run in shown
         for path in list(run.seen.images)[:_IMAGES_MAX]
     ]

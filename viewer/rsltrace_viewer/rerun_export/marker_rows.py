@@ -25,6 +25,7 @@ class MarkerRows:
         self._frames = frames
         self._boards: dict[str, MarkerBoard] = {}
         self._expiring: dict[str, int] = {}
+        self._shown_in: dict[str, str] = {}
 
     def log(self, path: str, message: dict[str, Any], stamp_ns: int, event: int) -> None:
         """Log what a message on the topic at ``path`` changes."""
@@ -38,8 +39,8 @@ class MarkerRows:
             if change.frame:
                 self._frames.frames.setdefault(at, change.frame)
                 self._frames.drawn.add(at)
-                name = f"{self._label}/{change.frame}" if self._label else change.frame
-                self._recording.log(at, rr.CoordinateFrame(frame=name))
+                self._shown_in[at] = change.frame
+            self._log_frame(at)
             if change.expires_ns is not None:
                 self._expiring[at] = change.expires_ns
         self._recording.reset_time()
@@ -58,6 +59,15 @@ class MarkerRows:
             self._recording.reset_time()
             self._set_time(expires_ns)
             self._recording.log(path, rr.Clear(recursive=False))
+            self._log_frame(path)
+
+    def _log_frame(self, path: str) -> None:
+        """Log in which frame a marker is; once more after clearing it, or a view would complain
+        that the nothing that is left is in no frame."""
+        frame = self._shown_in.get(path)
+        if frame is not None:
+            name = f"{self._label}/{frame}" if self._label else frame
+            self._recording.log(path, rr.CoordinateFrame(frame=name))
 
     def _set_time(self, stamp_ns: int) -> None:
         if self._clock.dated:
