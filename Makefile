@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included:
-#   make demo   record the sample job twice and compare
+#   make demo   record the sample job twice and compare; show where two other runs part
 #   make test   lint, types, architecture and tests
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
@@ -8,8 +8,9 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT ?= out
+SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test lint types architecture unit setup bench clean
+.PHONY: demo test lint types architecture unit setup samples bench clean
 
 setup: $(INSTALLED)
 
@@ -27,6 +28,9 @@ demo: $(INSTALLED)
 	$(BIN)/rsltrace record examples/rslcpp_determinism/job.yaml -o $(OUT)/run2.mcap --force --quiet
 	@cmp $(OUT)/run1.mcap $(OUT)/run2.mcap && echo "the two runs are identical, byte for byte"
 	$(BIN)/rsltrace info $(OUT)/run1.mcap
+	$(BIN)/rsltrace diff $(OUT)/run1.mcap $(OUT)/run2.mcap
+	@echo; echo "and two runs of a robot with a bug:"; echo
+	$(BIN)/rsltrace diff $(SAMPLE)/a.mcap $(SAMPLE)/b.mcap || test $$? -eq 1
 
 test: lint types architecture unit
 
@@ -42,6 +46,9 @@ architecture: $(INSTALLED)
 
 unit: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto
+
+samples: $(INSTALLED)
+	$(BIN)/python sample_traces/make_samples.py
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/throughput.py

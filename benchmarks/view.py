@@ -11,6 +11,7 @@ step, a page, a jump to the end and back. Prints the 95th percentiles and the mo
 from __future__ import annotations
 
 import argparse
+import contextlib
 import fcntl
 import os
 import pty
@@ -135,6 +136,9 @@ class Terminal:
     def quit(self) -> None:
         """End the viewer."""
         os.write(self._fd, b"q")
+        with contextlib.suppress(OSError):  # how a pseudo-terminal says that the other end is gone
+            while os.read(self._fd, 1 << 16):
+                pass
         os.waitpid(self.pid, 0)
         os.close(self._fd)
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.errors import NodeError
+from rsltrace.errors import JobError, NodeError
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
@@ -81,7 +81,10 @@ def _changed(job: Job, *, seed: int | None, until: str | None) -> Job:
     if until is not None:
         from rsltrace.job import StopSpec
 
-        given = StopSpec(time=f"{until}s" if until[-1:].isdigit() else until)
+        try:
+            given = StopSpec(time=f"{until}s" if until[-1:].isdigit() else until)
+        except JobError as error:
+            raise JobError(str(error).replace("StopSpec: time", "--until", 1)) from None
         changes["stop"] = job.stop.model_copy(update={"time_ns": given.time_ns})
     return job.model_copy(update=changes) if changes else job
 
@@ -141,7 +144,7 @@ def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
 @contextmanager
 def _progress(*, quiet: bool) -> Iterator[Callable[[int, int | None, int], None] | None]:
     """Show a progress bar on a terminal, nothing elsewhere."""
-    if quiet or not sys.stderr.isatty():
+    if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield None
         return
     from rich.console import Console

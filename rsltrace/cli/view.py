@@ -31,9 +31,7 @@ _PORT = 8321
     type=click.Path(path_type=Path, dir_okay=False),
     help="Write one screen to a file (.svg or .txt) instead; needs no terminal.",
 )
-@click.option(
-    "--size", default="120x36", show_default=True, help="With --export: columns x rows."
-)
+@click.option("--size", default="120x36", show_default=True, help="With --export: columns x rows.")
 @click.option("--keys", default="", help="With --export: keys to press first, as in 'n down z'.")
 @click.option("--serve", is_flag=True, help="Open it in a browser on this machine instead.")
 @click.option("--port", default=_PORT, show_default=True, help="With --serve: the port.")

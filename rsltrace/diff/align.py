@@ -18,6 +18,9 @@ from statistics import median_low
 from rsltrace.diff.rows import Rows
 from rsltrace.model.event import NO_EVENT
 
+NO_CAUSE = -1
+UNKNOWN = -2
+
 Key = tuple[int, ...]
 Partners = Mapping[int, int]
 """By index of an event in b: the index of its counterpart in a."""
@@ -74,19 +77,29 @@ def _groups(
 def _causes(
     a: Rows, b: Rows, pairs: Pairs, same_before: int, known: Partners
 ) -> tuple[list[int], list[int]]:
-    """Return the causes of all events as indexes in a; what has none there is negative."""
-    causes_a = [-1 if cause == NO_EVENT else cause for cause in a.cause]
-    causes_b = []
+    """Return the causes of all events as indexes in a, so that equal causes are equal numbers.
+
+    NO_CAUSE for events without one, UNKNOWN where the cause has (as yet) no counterpart.
+    """
+    known_a = set(known.values())
+    causes_a, causes_b = [], []
+    for cause in a.cause:
+        if cause == NO_EVENT:
+            causes_a.append(NO_CAUSE)
+        elif a.first <= cause < a.first + len(pairs.a):
+            causes_a.append(cause if pairs.a[cause - a.first] >= 0 else UNKNOWN)
+        else:
+            causes_a.append(cause if cause < same_before or cause in known_a else UNKNOWN)
     for cause in b.cause:
         if cause == NO_EVENT:
-            causes_b.append(-1)
+            causes_b.append(NO_CAUSE)
         elif cause < same_before:
             causes_b.append(cause)
         elif b.first <= cause < b.first + len(pairs.b):
             place = pairs.b[cause - b.first]
-            causes_b.append(a.first + place if place >= 0 else -2 - cause)
+            causes_b.append(a.first + place if place >= 0 else UNKNOWN)
         else:
-            causes_b.append(known.get(cause, -2 - cause))
+            causes_b.append(known.get(cause, UNKNOWN))
     return causes_a, causes_b
 
 
@@ -113,7 +126,7 @@ class _Group:
         self._pairs = pairs
         self.free_a = list(range(len(self.places_a)))
         self.free_b = list(range(len(self.places_b)))
-        for signs in _SIGNS[:2] if surest_only else _SIGNS:
+        for signs in _SIGNS[:_SUREST] if surest_only else _SIGNS:
             if not self.free_a or not self.free_b:
                 return
             self._tier(*signs)
@@ -157,7 +170,9 @@ class _Group:
             (self.a, self.causes_a, self.places_a),
             (self.b, self.causes_b, self.places_b),
         ):
-            columns = [{"s": rows.stamp, "i": rows.input, "c": causes}[name] for name in names]
+            columns = [
+                {"s": rows.stamp, "i": rows.input, "c": causes, "?": causes}[name] for name in names
+            ]
             outputs = rows.cause_output if "c" in names else None
             sides.append((columns, outputs, places))
         counts: list[Counter[int]] = []
@@ -172,7 +187,7 @@ class _Group:
             def key(position: int) -> Key | None:
                 place = places[position]
                 values = [column[place] for column in columns]
-                if cause_at >= 0 and values[cause_at] == -1:
+                if cause_at >= 0 and values[cause_at] < 0:
                     return None
                 if input_at >= 0 and values[input_at] == 0 and "s" not in names:
                     return None
@@ -208,55 +223,65 @@ class _Group:
             some_a = _between(self.free_a, begin_a, end_a)
             some_b = _between(self.free_b, begin_b, end_b)
             if some_a and some_b:
-                stamps_a = [self.a.stamp[self.places_a[p]] for p in some_a]
-                stamps_b = [self.b.stamp[self.places_b[p]] for p in some_b]
-                for i, j in _nearest(stamps_a, stamps_b, limit):
-                    self._pairs.pair(self.places_a[some_a[i]], self.places_b[some_b[j]])
+                places_a = [self.places_a[p] for p in some_a]
+                places_b = [self.places_b[p] for p in some_b]
+                whens_a = [(self.a.stamp[p], self.causes_a[p]) for p in places_a]
+                whens_b = [(self.b.stamp[p], self.causes_b[p]) for p in places_b]
+                for i, j in _nearest(whens_a, whens_b, limit):
+                    self._pairs.pair(places_a[i], places_b[j])
             begin_a, begin_b = end_a, end_b
 
     def _usual_gap(self) -> int:
         """Return the usual time between events of this entity; -1 if it has too few to tell."""
-        gaps = []
+        medians = []
         for rows, places in ((self.a, self.places_a), (self.b, self.places_b)):
             stamps = [rows.stamp[place] for place in places]
-            gaps += [late - early for early, late in itertools.pairwise(stamps)]
-        return median_low(gaps) if gaps else -1
+            gaps = [late - early for early, late in itertools.pairwise(stamps)]
+            medians += [median_low(gaps)] if gaps else []
+        return max(medians, default=-1)
 
 
 _SIGNS = (
     ("sic", True, False),
-    ("si", True, False),
     ("sic", False, False),
+    ("si", True, False),
     ("si", False, False),
     ("sc", True, False),
     ("ic", True, False),
     ("ic", False, False),
-    ("i", True, True),
-    ("i", False, True),
-    ("s", True, False),
+    ("i?", True, True),
+    ("i?", False, True),
+    ("s?", True, False),
 )
-"""(what has to be equal: stamp, input, cause; only in order; only inputs that come once)."""
+"""(what has to be equal: stamp, input, cause, cause or the lack of one; only in order; only inputs
+that come once)."""
+
+_SUREST = 3
 
 
 def _between(positions: list[int], begin: int, end: int) -> list[int]:
     return positions[bisect_right(positions, begin) : bisect_left(positions, end)]
 
 
-def _nearest(a: list[int], b: list[int], limit: int) -> list[tuple[int, int]]:
-    """Pair stamps in order, as many as can be that are at most ``limit`` apart (-1: any), and of
-    these ways the one with the least distance."""
+When = tuple[int, int]
+"""(stamp, cause or NO_CAUSE or UNKNOWN) of an event."""
+
+
+def _nearest(a: list[When], b: list[When], limit: int) -> list[tuple[int, int]]:
+    """Pair events in order, as many as can be that are at most ``limit`` apart (-1: any) and not
+    known to come from different causes, and of these ways the one with the least distance."""
     if len(a) * len(b) > _TABLE_MAX:
         return _nearest_in_passing(a, b, limit)
-    # best[j]: (pairs, -distance, the pairs) of the first i stamps of a and the first j of b.
+    # best[j]: (pairs, -distance, the pairs) of the first i events of a and the first j of b.
     best: list[tuple[int, int, tuple[object, ...]]] = [(0, 0, ())] * (len(b) + 1)
-    for i, stamp_a in enumerate(a):
+    for i, when_a in enumerate(a):
         previous, best = best, [best[0]]
-        for j, stamp_b in enumerate(b):
+        for j, when_b in enumerate(b):
             choice = max(previous[j + 1], best[j], key=lambda option: option[:2])
-            distance = abs(stamp_a - stamp_b)
-            if limit < 0 or distance <= limit:
+            if _can_be(when_a, when_b, limit):
                 pairs, closeness, chosen = previous[j]
-                candidate = (pairs + 1, closeness - distance, (chosen, i, j))
+                closeness -= abs(when_a[0] - when_b[0])
+                candidate = (pairs + 1, closeness, (chosen, i, j))
                 choice = max(choice, candidate, key=lambda option: option[:2])
             best.append(choice)
     result = []
@@ -267,10 +292,10 @@ def _nearest(a: list[int], b: list[int], limit: int) -> list[tuple[int, int]]:
     return result[::-1]
 
 
-def _nearest_in_passing(a: list[int], b: list[int], limit: int) -> list[tuple[int, int]]:
+def _nearest_in_passing(a: list[When], b: list[When], limit: int) -> list[tuple[int, int]]:
     result, i, j = [], 0, 0
     while i < len(a) and j < len(b):
-        if len(a) == len(b) or limit < 0 or abs(a[i] - b[j]) <= limit:
+        if _can_be(a[i], b[j], limit):
             result.append((i, j))
             i, j = i + 1, j + 1
         elif a[i] < b[j]:
@@ -278,3 +303,7 @@ def _nearest_in_passing(a: list[int], b: list[int], limit: int) -> list[tuple[in
         else:
             j += 1
     return result
+
+
+def _can_be(a: When, b: When, limit: int) -> bool:
+    return a[1] == b[1] and (limit < 0 or abs(a[0] - b[0]) <= limit)

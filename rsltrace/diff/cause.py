@@ -47,8 +47,8 @@ class Found:
     """A divergence before it is put in words.
 
     ``place_a`` and ``place_b`` say where it stands in runs that have no such event. ``reached``
-    holds for each topic: first stamp, number of messages. ``cause_only`` is set where nothing but
-    the cause differs.
+    holds for each publisher, client or service: first stamp, number of messages. ``cause_only`` is
+    set where nothing but the cause differs. ``swapped`` are the entities that changed places.
     """
 
     mark: Mark
@@ -57,6 +57,7 @@ class Found:
     place_b: int
     reached: dict[int, tuple[int, int]] = field(default_factory=dict)
     cause_only: bool = False
+    swapped: frozenset[int] = frozenset()
 
 
 class Cone:
@@ -109,8 +110,15 @@ class Cone:
         self._spread(first, found.mark)
         if first.inverted:
             # All that changed places at this instant is one divergence, and so is what follows.
-            for item in self._stretch.items:
-                if item.inverted and item is not first and self._stretch.stamp(item) == found.stamp:
+            found.place_a = found.place_b = min(first.a, first.b)
+            swapped = [
+                item
+                for item in self._stretch.items
+                if item.inverted and self._stretch.stamp(item) == found.stamp
+            ]
+            found.swapped = self._entities(swapped)
+            for item in swapped:
+                if item is not first:
                     why, previous = self._explanation(item)
                     self._consequence(item, why, previous or found.mark)
 
@@ -153,6 +161,10 @@ class Cone:
         if item.a >= 0:
             return self._stretch.rows_a, item.a
         return self._stretch.rows_b, item.b
+
+    def _entities(self, items: list[Item]) -> frozenset[int]:
+        rows = self._stretch.rows_a
+        return frozenset(rows.number[item.a - rows.first] for item in items)
 
     def _root(self, item: Item) -> Found:
         mark = Mark(item, len(self.found), None, None)
@@ -198,7 +210,9 @@ class Cone:
         copies = [Item(mark.item.a, mark.item.b, True) for mark in moment]
         mark_inverted(copies)
         still = {copy.a: copy.b for copy in copies if copy.inverted}
-        root: Found | None = None
+        swapped = self._entities([mark.item for mark in moment if mark.item.a in still])
+        # What decides between two that are due at once decides every time: that is one divergence.
+        root = next((found for found in self.found if swapped and swapped <= found.swapped), None)
         for mark in moment:
             item = mark.item
             self._marks_a.pop(item.a, None)
@@ -208,6 +222,7 @@ class Cone:
             if root is None:
                 root = self._root(item)
                 root.place_a, root.place_b = min(still), min(still.values())
+                root.swapped = swapped
                 self._spread(item, root.mark)
             else:
                 known = mark.previous and self.mark_of(mark.previous.item)

@@ -142,6 +142,8 @@ def _schedule(case: Case) -> Judgement:
         "both were ready at the same simulated time; whatever decides between them (order of "
         "creation, of subscription, of delivery) is not the same in the two runs"
     )
+    if because := _because_of_settings(case.settings):
+        root_sentence = f"both were ready at the same simulated time, and {because}"
     return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, root_sentence, first, second)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rsltrace.diff.classify import Judgement
+from rsltrace.diff.engine import stop_reason
 from rsltrace.diff.model import EventView, Root, Verdict
 from rsltrace.diff.views import at
 from rsltrace.model.event import EventKind
@@ -56,10 +57,3 @@ def judge_ended(a: Trace, b: Trace, over: Trace, view_a: EventView | None) -> Ju
         )
     a_view, b_view = (view_a, None) if over is b else (None, view_a)
     return Judgement(verdict, Root.UNKNOWN, sentence, why, a_view, b_view)
-
-
-def stop_reason(trace: Trace) -> str:
-    """Return why a run ended, in words."""
-    if not trace.complete:
-        return "interrupted"
-    return trace.result.get("stop_reason") or "no reason given"

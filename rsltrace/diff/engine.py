@@ -8,30 +8,11 @@ around the divergence, unless everything is asked for.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from itertools import islice
-
-from rsltrace.diff.cause import Cone, Found, different_outputs
-from rsltrace.diff.ended import judge_ended, stop_reason, who_ended
-from rsltrace.diff.explain import Explainer
-from rsltrace.diff.identity import Identity, identify
-from rsltrace.diff.model import Diff, Divergence, Setting, Side, Verdict
+from rsltrace.diff.model import Diff, Side, Verdict
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.rows import Run
 from rsltrace.diff.search import first_difference
-from rsltrace.diff.settings import entity_settings, environment_settings, job_settings
-from rsltrace.diff.stretches import Item, Stretch, Stretches
-from rsltrace.diff.tally import Tally
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-
-DIVERGENCES_MAX = 10
-"""Independent divergences told unless everything is asked for."""
-
-EVERY_DIVERGENCE_MAX = 1000
-"""Told even then; each takes some milliseconds and some lines."""
-
-_EVENTS_PER_STRETCH = 4096
 
 
 def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
@@ -39,11 +20,42 @@ def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
 
     Raises TraceError where a part that has to be read is damaged.
     """
-    options = options or DiffOptions()
     start = first_difference(a, b)
     if start is None:
         return _identical(a, b)
-    return _Comparison(a, b, start, options).run()
+    # Most runs are compared in the hope that they are identical: those load no more than this.
+    from rsltrace.diff.comparison import compare
+
+    return compare(a, b, start, options or DiffOptions())
+
+
+def stop_reason(trace: Trace) -> str:
+    """Return why a run ended, in words."""
+    if not trace.complete:
+        return "interrupted"
+    return trace.result.get("stop_reason") or "no reason given"
+
+
+def side(trace: Trace) -> Side:
+    """Return what is said of a run as a whole."""
+    return Side(
+        path=trace.name,
+        digest=trace.digest,
+        events=trace.event_count,
+        end_ns=trace.end_ns,
+        complete=trace.complete,
+        stop_reason=stop_reason(trace),
+    )
+
+
+def interruptions(a: Trace, b: Trace) -> list[str]:
+    """Return a note for each run whose recording was cut off."""
+    return [
+        f"the recording of {name} ({trace.name}) was interrupted: compared is what is there, "
+        f"{trace.event_count} events up to {format_seconds(trace.end_ns)} s"
+        for name, trace in (("a", a), ("b", b))
+        if not trace.complete
+    ]
 
 
 def _identical(a: Trace, b: Trace) -> Diff:
@@ -54,172 +66,12 @@ def _identical(a: Trace, b: Trace) -> Diff:
             notes.append(f"{what.replace('_', ' ')}: {ended_a} in a, {ended_b} in b")
     events = a.event_count
     return Diff(
-        a=_side(a),
-        b=_side(b),
+        a=side(a),
+        b=side(b),
         verdict=Verdict.IDENTICAL,
         sentence=f"the two runs are identical: {events} events, digest {a.digest}",
         agreeing=events,
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
-        notes=(*_interruptions(a, b), *notes),
-    )
-
-
-class _Comparison:
-    """Of two runs that differ from event ``start`` on."""
-
-    def __init__(self, a: Trace, b: Trace, start: int, options: DiffOptions) -> None:
-        self._a = a
-        self._b = b
-        self._start = start
-        self._options = options
-        self._identity: Identity = identify(a, b)
-        self._run_a = Run(a, self._identity, of_b=False)
-        self._run_b = Run(b, self._identity, of_b=True)
-        self._job = job_settings(a, b)
-        self._environment = environment_settings(a, b)
-        self._notes = list(_interruptions(a, b))
-        if self._identity.nothing_in_common:
-            self._notes.insert(0, "these are traces of different jobs: no entity is in both")
-        self._tally = Tally()
-        self._aligned_to = (start, start)
-
-    def run(self) -> Diff:
-        """Return the answer."""
-        over = who_ended(self._a, self._b, self._start)
-        divergences = [self._ended(over)] if over is not None else self._aligned()
-        first = divergences[0]
-        return Diff(
-            a=_side(self._a),
-            b=_side(self._b),
-            verdict=first.verdict,
-            sentence=first.sentence,
-            agreeing=self._start,
-            divergences=tuple(divergences),
-            settings=(*self._job, *self._environment, *entity_settings(self._identity)),
-            counts=self._tally.counts(self._identity),
-            resync_index=self._tally.resync,
-            aligned_to=self._aligned_to,
-            bytes_read=self._a.bytes_read + self._b.bytes_read,
-            notes=tuple(self._notes),
-        )
-
-    def _explainer(self, found: list[Found]) -> Explainer:
-        settings: tuple[Setting, ...] = (*self._job, *self._environment)
-        return Explainer(self._run_a, self._run_b, self._options, settings, found)
-
-    def _ended(self, over: Trace) -> Divergence:
-        explainer = self._explainer([])
-        view = explainer.view(self._start, of_b=over is self._a)
-        judgement = judge_ended(self._a, self._b, over, view)
-        return explainer.ended(self._start, judgement)
-
-    def _aligned(self) -> list[Divergence]:
-        options = self._options
-        watch = self._wanted if options.nodes or options.topics else None
-        cone = Cone(self._nodes_in_one_run(), watch)
-        per_stretch = options.window
-        if options.everything:
-            per_stretch = max(options.window, _EVENTS_PER_STRETCH)
-        stretches = Stretches(self._run_a, self._run_b, self._start, per_stretch)
-        wanted: list[Found] = []
-        for stretch in islice(stretches, None if options.everything else 1):
-            known = len(cone.found)
-            first = first_item(stretch, self._start) if not known else None
-            cone.take(stretch, first)
-            self._tally.take(stretch)
-            self._aligned_to = (stretch.end_a, stretch.end_b)
-            new = cone.found[known:]
-            wanted += [f for f in new if watch is None or watch(f.mark.item, stretch)]
-        return self._divergences(cone, wanted)
-
-    def _divergences(self, cone: Cone, wanted: list[Found]) -> list[Divergence]:
-        chosen = list(wanted)
-        if cone.watched is not None:
-            chosen.append(cone.watched)
-            chosen.sort(key=lambda found: (found.place_a, found.place_b))
-        if not chosen:
-            chosen = cone.found[:1]
-            self._notes.append(
-                f"nothing that was asked for ({self._asked()}) differs among the events that were "
-                "aligned; shown is where the runs part"
-            )
-        elif cone.found[0] is not chosen[0]:
-            self._notes.append(
-                f"the runs part at event {self._start}; shown is where {self._asked()} differs"
-            )
-        most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
-        if len(chosen) > most:
-            hint = "" if self._options.everything else "; --all shows them"
-            self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
-        explainer = self._explainer(cone.found)
-        return [explainer.explain(found) for found in chosen[:most]]
-
-    def _nodes_in_one_run(self) -> Iterable[int]:
-        """Return nodes that only one run has: that they act in one run only needs no reason."""
-        identity = self._identity
-        only = {*identity.only_a, *identity.only_b}
-        return [n for n in only if identity.nodes[n] == n]
-
-    def _asked(self) -> str:
-        return ", ".join((*self._options.nodes, *self._options.topics))
-
-    def _wanted(self, item: Item, stretch: Stretch) -> bool:
-        """Whether an item is of a node and touches a topic that was asked for."""
-        options, keys = self._options, self._identity.keys
-        a, b = stretch.rows_a, stretch.rows_b
-        rows, index = (a, item.a) if item.a >= 0 else (b, item.b)
-        number = rows.number[index - rows.first]
-        if not options.wants_node(keys[number].node):
-            return False
-        if not options.topics:
-            return True
-        outputs_a = a.outputs(item.a) if item.a >= 0 else []
-        outputs_b = b.outputs(item.b) if item.b >= 0 else []
-        touched = {number, *(n for _, n, _, _ in different_outputs(outputs_a, outputs_b))}
-        return any(options.wants_topic(keys[n].name) for n in touched)
-
-
-def first_item(stretch: Stretch, start: int) -> Item:
-    """Return the item that the runs part with: of event ``start`` of a, or of b.
-
-    If neither run has the other's event there, it is that of a that is said to be missing; if
-    both only changed places, or only times, the one that moved.
-    """
-    of_a = next((item for item in stretch.items if item.a == start), None)
-    of_b = next((item for item in stretch.items if item.b == start), None)
-    if of_a is None or of_b is None:
-        only = of_a or of_b
-        assert only is not None, "a stretch holds the event it starts with"
-        return only
-    if of_a is of_b or of_a.b < 0:
-        return of_a
-    if of_b.a < 0:
-        return of_b
-    moved_a, moved_b = _moved(stretch, of_a), _moved(stretch, of_b)
-    return of_b if moved_b and not moved_a else of_a
-
-
-def _moved(stretch: Stretch, item: Item) -> bool:
-    a, b = stretch.rows_a, stretch.rows_b
-    return a.stamp[item.a - a.first] != b.stamp[item.b - b.first]
-
-
-def _interruptions(a: Trace, b: Trace) -> list[str]:
-    return [
-        f"the recording of {name} ({trace.name}) was interrupted: compared is what is there, "
-        f"{trace.event_count} events up to {format_seconds(trace.end_ns)} s"
-        for name, trace in (("a", a), ("b", b))
-        if not trace.complete
-    ]
-
-
-def _side(trace: Trace) -> Side:
-    return Side(
-        path=trace.name,
-        digest=trace.digest,
-        events=trace.event_count,
-        end_ns=trace.end_ns,
-        complete=trace.complete,
-        stop_reason=stop_reason(trace),
+        notes=(*interruptions(a, b), *notes),
     )

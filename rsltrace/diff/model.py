@@ -95,8 +95,9 @@ class FieldDifference:
     numbers ``absolute`` is |a-b| and ``ulp`` the distance in units in the last place (floats of
     the field's own width); ``note`` calls out NaN, -0.0, infinities, lengths. For arrays and
     binary fields ``elements`` says how many differ of how many, ``first`` lists the first few as
-    (index or byte offset, a, b), ``smallest`` and ``largest`` are the least and greatest |a-b|.
-    ``within_tolerance`` is set when a tolerance covers the difference.
+    (index, a, b) (binary: offset of a row of 16 bytes, and the row as hex), ``smallest`` and
+    ``largest`` are the least and greatest |a-b|, ``ulp`` is the greatest. Times and durations are
+    one field, in seconds. ``within_tolerance`` is set when a tolerance covers the difference.
     """
 
     path: str

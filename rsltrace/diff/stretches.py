@@ -16,6 +16,9 @@ from rsltrace.diff.rows import CONSTRUCT, SHUTDOWN, Rows, Run, load_rows
 
 NOTHING = -1
 
+_MARGIN_MIN = 1024
+"""Events looked at beyond the cut: an event that came later by more than that is called missing."""
+
 
 @dataclass(slots=True)
 class Item:
@@ -100,7 +103,7 @@ class Stretches:
     def _next(
         self, first_a: int, first_b: int, taken_a: set[int], taken_b: set[int]
     ) -> tuple[Stretch, Pairs]:
-        events, margin = self.events, max(256, self.events // 4)
+        events, margin = self.events, max(_MARGIN_MIN, self.events // 4)
         while True:
             rows_a = load_rows(self.run_a, first_a, first_a + events + margin)
             rows_b = load_rows(self.run_b, first_b, first_b + events + margin)
@@ -149,21 +152,25 @@ def _items(
     taken_b: set[int],
 ) -> list[Item]:
     times_a, times_b = _times(a), _times(b)
+    spine = _spine(a, b, pairs, times_a, times_b)
     keyed: list[tuple[int, float, int, Item]] = []
-    last = -1
+    last = -0.5  # where an event stands that is only in b, or earlier in b: behind the spine so far
     for place in range(end_b):
         partner, time = pairs.b[place], times_b[place]
+        position = last
         if partner >= 0:
             item = _pair(a, b, partner, place)
-            if times_a[partner] <= time:  # it stands where it is in a, like whatever is only in a
-                keyed.append((times_a[partner], partner, place, item))
-                last = max(last, partner)
-                continue
+            if place in spine:
+                position, last = partner, partner + 0.5
+            elif times_a[partner] < time:
+                position, time = partner, times_a[partner]
+            elif times_a[partner] == time:
+                position = min(partner, last)
         elif b.first + place in taken_b:
             continue
         else:
             item = Item(NOTHING, b.first + place, False)
-        keyed.append((time, last + 0.5, place, item))
+        keyed.append((time, position, place, item))
     for place in range(end_a):
         partner = pairs.a[place]
         if partner >= end_b:
@@ -173,6 +180,34 @@ def _items(
             keyed.append((times_a[place], place, NOTHING, Item(a.first + place, NOTHING, False)))
     keyed.sort(key=lambda entry: entry[:3])
     return [item for _, _, _, item in keyed]
+
+
+def _spine(
+    a: Rows, b: Rows, pairs: Pairs, times_a: list[int], times_b: list[int]
+) -> frozenset[int]:
+    """Return the places in b of as many pairs as can be that are in the same order in both runs,
+    have the same input and happened at the same time: what the rest is ordered by."""
+    tails: list[int] = []  # of the best chain of each length, the partner it ends with
+    ends: list[int] = []
+    before: dict[int, int] = {}
+    for place, partner in enumerate(pairs.b):
+        if (
+            partner >= 0
+            and times_a[partner] == times_b[place]
+            and a.input[partner] == b.input[place]
+        ):
+            length = bisect_left(tails, partner)
+            if length == len(tails):
+                tails.append(partner)
+                ends.append(place)
+            tails[length], ends[length] = partner, place
+            before[place] = ends[length - 1] if length else -1
+    spine = set()
+    place = ends[-1] if ends else -1
+    while place >= 0:
+        spine.add(place)
+        place = before[place]
+    return frozenset(spine)
 
 
 def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> Item:
@@ -192,9 +227,10 @@ def _mark_inversions(stretch: Stretch) -> None:
     moments: dict[int, list[Item]] = {}
     for item in stretch.items:
         if item.a >= 0 and item.b >= 0:
-            stamp = a.stamp[item.a - a.first]
-            if stamp == b.stamp[item.b - b.first]:
-                moments.setdefault(stamp, []).append(item)
+            i, j = item.a - a.first, item.b - b.first
+            # What only stands in another's place, with another input, has no order of its own.
+            if a.stamp[i] == b.stamp[j] and a.input[i] == b.input[j]:
+                moments.setdefault(a.stamp[i], []).append(item)
     for items in moments.values():
         mark_inverted(items)
 

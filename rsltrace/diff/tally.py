@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from rsltrace.diff.identity import Identity
 from rsltrace.diff.model import EntityCount
+from rsltrace.diff.rows import SHUTDOWN
 from rsltrace.diff.stretches import Item, Stretch
 
 AGREEING_MIN = 32
-"""So many events in a row have to agree before it is called agreement, unless the runs end."""
+"""So many events in a row have to agree before it is called agreement …"""
+
+AGREEING_AT_END_MIN = 8
+"""… or so many if they are the last ones of both runs. Shutting down is no agreement."""
 
 
 class Tally:
@@ -27,10 +31,9 @@ class Tally:
             counts[_column(item)] += 1
             if not item.plain:
                 self._agreeing, self._resync = 0, None
-            elif not self._agreeing:
-                self._agreeing, self._resync = 1, (item.a, item.b)
-            else:
+            elif rows.kind[index - rows.first] != SHUTDOWN:
                 self._agreeing += 1
+                self._resync = self._resync or (item.a, item.b)
         self._ended = stretch.at_end
 
     def counts(self, identity: Identity) -> tuple[EntityCount, ...]:
@@ -43,7 +46,8 @@ class Tally:
     @property
     def resync(self) -> tuple[int, int] | None:
         """The indexes from which on the runs agree to the end of what was aligned, if they do."""
-        return self._resync if self._ended or self._agreeing >= AGREEING_MIN else None
+        enough = AGREEING_AT_END_MIN if self._ended else AGREEING_MIN
+        return self._resync if self._agreeing >= enough else None
 
 
 def _column(item: Item) -> int:

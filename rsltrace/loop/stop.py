@@ -81,12 +81,17 @@ def stop_when(function: Callable[[Progress], object], name: str) -> StopConditio
     def condition(progress: Progress) -> Stop | None:
         try:
             answer = function(progress)
+        except SystemExit as error:
+            answer = 0 if error.code is None else error.code
+            if not isinstance(answer, int):
+                return Stop(f"function {name} raised SystemExit: {answer}", 1)
         except Exception as error:
             raise RunError(
                 f"the stop function {name} raised {type(error).__qualname__}: {error}"
             ) from error
-        if answer is None or answer is False:
-            return None
+        else:
+            if answer is None or answer is False:
+                return None
         code = 0 if answer is True else answer
         if not isinstance(code, int):
             raise RunError(

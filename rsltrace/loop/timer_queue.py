@@ -7,10 +7,12 @@ heap; it exists to compare runs with RSLCPP, and is part of no other promise.
 
 from __future__ import annotations
 
-from heapq import heappop, heappush, heapreplace
+from heapq import heapify, heappop, heappush, heapreplace
 from typing import Protocol
 
 from rsltrace.loop.timer import TimerState
+
+_ROOM = 256
 
 
 class TimerQueue(Protocol):
@@ -38,11 +40,20 @@ class CreationOrderQueue:
     def __init__(self) -> None:
         # An entry is valid while its timer's ticket is that very entry: changes push a new one.
         self._heap: list[tuple[int, int, TimerState]] = []
+        self._room = _ROOM
 
     def add(self, timer: TimerState) -> None:
         entry = (timer.deadline_ns, timer.order, timer)
         timer.ticket = entry
         heappush(self._heap, entry)
+        if len(self._heap) > self._room:
+            self._tidy()
+
+    def _tidy(self) -> None:
+        """Drop what changes have left behind: a watchdog is reset more often than it is due."""
+        self._heap = [entry for entry in self._heap if entry[2].ticket is entry]
+        heapify(self._heap)
+        self._room = _ROOM + 2 * len(self._heap)
 
     moved = add
 

@@ -34,7 +34,7 @@ _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
-_PATIENCE = 1000
+_PATIENCE = 100
 
 # Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
 # be collected: that would raise in them once more.

@@ -10,7 +10,6 @@ import contextlib
 import os
 import random
 import struct
-import sys
 import threading
 import uuid
 from collections.abc import Callable, Iterator
@@ -166,6 +165,12 @@ class Core:
             self.runner_maker = greenlet(self._make_runners, self.main)
         return self.runner_maker
 
+    def end_runners(self) -> None:
+        """Let go of the stack that makes runners, or it would keep this world alive for ever."""
+        maker, self.runner_maker = self.runner_maker, None
+        if maker is not None:
+            maker.throw()
+
     def _make_runners(self) -> None:
         while True:
             greenlet(self.take_over, self.main).switch()
@@ -191,7 +196,7 @@ class Core:
         """Remember who still waits if the run has ended because nothing can happen any more."""
         stopped = self.loop.stopped
         if stopped is not None and stopped.reason == NOTHING_LEFT and not self.stuck:
-            self.stuck = [run.waits_for() for run in self.suspended]
+            self.stuck = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
             self.stuck += [blocked.waits_for() for blocked in self.blocked]
 
     # -- entities ----------------------------------------------------------------------------

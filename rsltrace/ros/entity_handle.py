@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import Entity, EntityKind
@@ -149,10 +151,10 @@ def callback_name(callback: Any) -> str:
     """Name a callback as in ``Talker.on_timer``; never with an address in it."""
     if callback is None:
         return ""
-    name = getattr(callback, "__qualname__", None)
-    if isinstance(name, str):
-        return name
-    inner = getattr(callback, "func", None)  # functools.partial
-    if inner is not None:
-        return f"partial({callback_name(inner)})"
+    if isinstance(callback, partial):
+        return f"partial({callback_name(callback.func)})"
+    with suppress(Exception):  # a callable object may answer anything: a mock does
+        name = callback.__qualname__
+        if isinstance(name, str):
+            return name
     return type(callback).__qualname__

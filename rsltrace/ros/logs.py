@@ -75,8 +75,7 @@ class Logs:
         now_ns = self._core.loop.now_ns
         severity = int(severity)
         if self._echo:
-            label = _SEVERITY.get(severity, str(severity))
-            sys.stderr.write(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}\n")
+            self._print(severity, now_ns, name, message)
         node = self._nodes.get(name) or self._core.current_node
         if node is None or node.rosout is None or node.rosout._destroyed:
             return
@@ -92,6 +91,14 @@ class Logs:
         )
         content = f"{severity}\0{name}\0{message}".encode(errors="surrogateescape")
         node.rosout.send(node.rosout._serialize(record), hash64(content))
+
+    def _print(self, severity: int, now_ns: int, name: str, message: str) -> None:
+        """Show a record; who cannot be told any more (``2>&1 | head``) changes nothing in a run."""
+        label = _SEVERITY.get(severity, str(severity))
+        try:
+            sys.stderr.write(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}\n")
+        except (OSError, ValueError, AttributeError):  # gone, closed, or never there
+            self._echo = False
 
     def _portable(self, file: str) -> str:
         """Return a source path that is the same wherever the job's folder lies."""

@@ -50,7 +50,7 @@ class TimerHandle(EntityHandle):
         self._coroutine = False
 
     def activate(self) -> None:
-        if not self.state.canceled and not self._destroyed:
+        if self.wrapper is not None and not self.state.canceled and not self._destroyed:
             self.core.loop.timers.add(self.state)
 
     def deactivate(self) -> None:

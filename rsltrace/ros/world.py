@@ -86,6 +86,7 @@ class World:
 
         self.core.main_context = None  # from here on a shutdown is ours
         self.core.current_handle = None
+        self.core.end_runners()
         self.core.executor.shutdown()
         rclpy.try_shutdown()
         # What user code has left behind must meet its finalizers while rclpy is still simulated.
@@ -166,7 +167,7 @@ class World:
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
         core = self.core
-        core.ending = True
+        end_blocked(core)  # constructors that still wait, if the run never began
         for node in self.nodes:
             core.shutdown_ns = 0
             handle = node.handle

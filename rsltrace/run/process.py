@@ -8,10 +8,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rsltrace.job import Job
-from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
 
 _GC_EVERY_EVENTS = 10_000
 
@@ -26,7 +29,7 @@ class Observer:
 
 
 def housekeeping(
-    loop: Callable[[], EventLoop], observer: Observer, end_ns: int | None
+    core: Callable[[], Core], observer: Observer, end_ns: int | None
 ) -> Callable[[], None]:
     """Return what is done between time steps: progress, and collecting garbage.
 
@@ -39,12 +42,13 @@ def housekeeping(
     def between_steps() -> None:
         nonlocal collect_at, steps
         steps += 1
-        events = loop().events
+        events = core().loop.events
         if events >= collect_at:
             collect_at = events + _GC_EVERY_EVENTS
-            gc.collect(1)
+            with core().outside_events():
+                gc.collect(1)
         if steps % 1000 == 0 and observer.progress is not None:
-            observer.progress(loop().now_ns, end_ns, events)
+            observer.progress(core().loop.now_ns, end_ns, events)
 
     return between_steps
 

@@ -87,11 +87,11 @@ def run(
             start_ns=start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
-            between_steps=housekeeping(lambda: loop, observer, end_ns_of(job, start_ns)),
+            between_steps=housekeeping(lambda: world.core, observer, end_ns_of(job, start_ns)),
         )
         world = stack.enter_context(World(loop, base_dir=job.base_dir, seed=job.seed, echo=echo))
         # Whatever can be known to be wrong is found before a file is made.
-        loop.stop_conditions = tuple(stop_conditions(job, start_ns))
+        loop.stop_conditions = tuple(stop_conditions(job, start_ns, world.core.outside_events))
         entries = _prepare(job)
         check_bag_types(job, bags)
         writer = None

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from rsltrace.job import Job, locate
 from rsltrace.loop.stop import (
+    Progress,
     StopCondition,
     stop_after_events,
     stop_at,
@@ -14,6 +16,8 @@ from rsltrace.loop.stop import (
     stop_when_quiet,
 )
 from rsltrace.model.stamp import format_seconds
+
+_Context = Callable[[], AbstractContextManager[None]]
 
 
 def end_ns_of(job: Job, start_ns: int) -> int | None:
@@ -26,8 +30,15 @@ def end_ns_of(job: Job, start_ns: int) -> int | None:
     return min(ends, default=None)
 
 
-def stop_conditions(job: Job, start_ns: int) -> Iterator[StopCondition]:
-    """Yield the conditions of a job. Raises JobError if its stop function cannot be imported."""
+def stop_conditions(
+    job: Job,
+    start_ns: int,
+    outside_events: _Context = nullcontext,
+) -> Iterator[StopCondition]:
+    """Yield the conditions of a job; its stop function runs within ``outside_events()``.
+
+    :raises JobError: if the stop function cannot be imported.
+    """
     stop = job.stop
     if stop.duration_ns is not None:
         reason = f"duration of {format_seconds(stop.duration_ns)} s"
@@ -49,7 +60,17 @@ def stop_conditions(job: Job, start_ns: int) -> Iterator[StopCondition]:
             function = load_target(function, where=locate(job, ("stop", "function")))
         else:
             name = f"{function.__module__}:{function.__qualname__}"
-        yield stop_when(function, name)
+        yield stop_when(_within(outside_events, function), name)
+
+
+def _within(
+    context: _Context, function: Callable[[Progress], object]
+) -> Callable[[Progress], object]:
+    def call(progress: Progress) -> object:
+        with context():
+            return function(progress)
+
+    return call
 
 
 def has_stop(job: Job) -> bool:

@@ -7,9 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from simulate import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
+
 from rsltrace.diff.model import Diff, Divergence, Root, Verdict
 from rsltrace.model.event import EventKind
-from simulate import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
 
 EVENTS_MAX = 1500
 
@@ -48,6 +49,10 @@ class Planted:
                 wrong.append(f"names node {view.entity.node} instead of {self.nodes}")
             if view is not None and view.entity.name not in self.names:
                 wrong.append(f"names {view.entity.name} instead of {self.names}")
+        if self.verdict is Verdict.SCHEDULE and first.a and first.b:
+            named = {first.a.entity.name, first.b.entity.name}
+            if named != set(self.names):
+                wrong.append(f"names {named} instead of {self.names}")
         if len(diff.divergences) > 1:
             others = [_short(divergence) for divergence in diff.divergences[1:]]
             wrong.append(f"claims further independent divergences: {others}")
@@ -117,9 +122,7 @@ Made = tuple[Plan, Plan, "Fault | None", Expected]
 Planter = Callable[[random.Random, Plan, Simulation], "Made | None"]
 
 
-def _pick(
-    rng: random.Random, clean: Simulation, suits: Callable[[Logged], bool]
-) -> Logged | None:
+def _pick(rng: random.Random, clean: Simulation, suits: Callable[[Logged], bool]) -> Logged | None:
     suitable = [event for event in clean.log if suits(event)]
     return rng.choice(suitable) if suitable else None
 
@@ -138,11 +141,13 @@ def _bit(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
 
 
 def _swap(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
-    event = _pick(rng, clean, lambda e: len(e.ready) > 1)
+    event = _pick(rng, clean, lambda e: len(e.ready) > 1 and e.kind is not EventKind.BAG)
     if event is None:
         return None
     which = rng.randrange(1, len(event.ready))
     one, other = event.ready[0], event.ready[which]
+    if one == other:
+        return None
     names = [_entity_name(clean, entity) for entity, _, _ in (one, other)]
     fault = Fault("swap", event.index, which)
     return plan, plan, fault, (Verdict.SCHEDULE, Root.SCHEDULE, event.index, names)
@@ -161,7 +166,7 @@ def _swap_timers(rng: random.Random, plan: Plan, clean: Simulation) -> Made | No
 
 
 def _drop(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
-    event = _pick(rng, clean, lambda e: bool(e.ready))
+    event = _pick(rng, clean, lambda e: bool(e.ready) and e.kind is not EventKind.BAG)
     if event is None:
         return None
     expected = (Verdict.MISSING, Root.MISSING, event.index, [_name(event)])
@@ -206,12 +211,13 @@ def _seed(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
         if node.draws_at_start:
             expected = (Verdict.ENVIRONMENT, Root.JOB, index, [(node.name, node.name)])
             return (plan, other, None, expected) if _first_only(plan, index) else None
-    first = next(
-        (e for e in clean.log if e.node in drawing and e.kind is EventKind.TIMER and e.outputs),
-        None,
-    )
-    if first is None or len(drawing) > 1:
+    if len(drawing) > 1:
         return None  # further nodes that draw are further divergences, and rightly so
+    twin = Simulation(other, clean.path.with_name("twin.mcap")).run()
+    both = zip(clean.log, twin.log, strict=False)
+    first = next((x for x, y in both if x.node in drawing and (x.outputs or y.outputs)), None)
+    if first is None or first.kind is not EventKind.TIMER:
+        return None
     verdict = Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     return plan, other, None, (verdict, Root.CALLBACK, first.index, [_name(first)])
 

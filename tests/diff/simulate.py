@@ -144,7 +144,7 @@ class Simulation:
         self.deliveries: list[Ready] = []
         self._faults = {fault.at: fault for fault in faults}
         self._storage = storage
-        self._path = path
+        self.path = path
         self._entities: dict[int, Entity] = {}
         self._nodes: list[Node] = []
         self._owner: dict[int, Node] = {}
@@ -163,7 +163,7 @@ class Simulation:
         storage = self._storage
         with (
             mock.patch.object(writer_module, "EVENTS_PER_SEGMENT", storage.events_per_segment),
-            TraceWriter(self._path, force=True, compression=storage.compression) as writer,
+            TraceWriter(self.path, force=True, compression=storage.compression) as writer,
         ):
             self.recorder = Recorder(writer, keep_payload=lambda topic: storage.payloads)
             self._write_job(writer)

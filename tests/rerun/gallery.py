@@ -89,7 +89,11 @@ def messages(step: int, stamp_ns: int, shift: float = 0.0) -> dict[str, tuple[st
     ]
     image = np.full((8, 8, 3), step % 256, dtype=np.uint8)
     stamped = [
-        new("geometry_msgs/msg/PoseStamped", header=odom, pose=pose(3 * math.cos(a), 3 * math.sin(a)))
+        new(
+            "geometry_msgs/msg/PoseStamped",
+            header=odom,
+            pose=pose(math.cos(a), math.sin(a)),
+        )
         for a in np.linspace(0, 6, 20).tolist()
     ]
     transform = new(
@@ -227,7 +231,7 @@ def messages(step: int, stamp_ns: int, shift: float = 0.0) -> dict[str, tuple[st
 def write_gallery(
     path: Path, steps: int, *, differs_from: int | None = None, close: bool = True
 ) -> trace_maker.Feeder:
-    """Write ``steps`` steps; from step ``differs_from`` on, what is published is shifted by 0.5 m."""
+    """Write ``steps`` steps; from ``differs_from`` on, what is published is shifted by 0.5 m."""
     with trace_maker.Opened(path, force=True) as feeder:
         writer = feeder.writer
         node = feeder.entity(EntityKind.NODE, "/robot", created_ns=START_NS)

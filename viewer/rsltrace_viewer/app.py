@@ -277,7 +277,7 @@ class ViewerApp(App[None]):
 
     def _inspect_if_still(self, place: int) -> Any:
         def inspect() -> None:
-            if self.session.place == place:
+            if self.session.place == place and self.screen_stack:
                 self._show_inspector()
                 self.busy = False
 
@@ -373,13 +373,12 @@ class ViewerApp(App[None]):
         """Go to the nearest place where a condition holds, looking for it in the background."""
 
         def steps() -> Iterator[int | None]:
-            looked = 0
-            for place in self.session.seek(condition, step, wrap=wrap):
+            looked = enumerate(self.session.seek(condition, step, wrap=wrap), start=1)
+            for count, place in looked:
                 if place is not None:
                     yield place
                     return
-                looked += 1
-                yield -looked
+                yield -count
 
         def arrive(found: int | None, done: bool) -> None:
             if found is not None and found >= 0:
@@ -438,11 +437,11 @@ class ViewerApp(App[None]):
     def _go_to_event(self, index: int, *, other: bool) -> None:
         self.go(self.session.view.place_of(index, other=other))
 
-    def action_back(self) -> None:
+    def action_go_back(self) -> None:
         """Go back to where one was."""
         self._travel(self.session.history.back(self.session.place), "the start of your way")
 
-    def action_forward(self) -> None:
+    def action_go_forward(self) -> None:
         """Go forward again."""
         self._travel(self.session.history.forward(self.session.place), "where you came from last")
 
@@ -490,14 +489,12 @@ class ViewerApp(App[None]):
             "filter": Question(
                 "filter",
                 "filter",
-                "node: topic: kind: level: time: text: …  Tab completes, ? explains, empty shows all",
+                "node: topic: kind: level: time: text: …  Tab completes, empty shows all",
                 session.filter_text,
                 check_query,
                 complete,
             ),
-            "time": Question(
-                "time", "go to time", "seconds, or 20ms, 3us, 500ns", "", parse_time
-            ),
+            "time": Question("time", "go to time", "seconds, or 20ms, 3us, 500ns", "", parse_time),
             "index": Question(
                 "index", "go to event", f"0 to {max(session.a.count - 1, 0)}", "", _parse_index
             ),
@@ -614,7 +611,7 @@ class ViewerApp(App[None]):
         """Go to the next part of the screen."""
         panes = [self.timeline, self.inspector, self.lanes]
         shown = [pane for pane in panes if pane.display and pane.size.height]
-        place = shown.index(self.focused) if self.focused in shown else -step  # type: ignore[arg-type]
+        place = shown.index(self.focused) if self.focused in shown else -step
         shown[(place + step) % len(shown)].focus()
 
     def action_zoom(self, step: int) -> None:

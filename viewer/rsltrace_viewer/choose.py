@@ -65,7 +65,7 @@ class ChooseApp(App[list[Path]]):
     ENABLE_COMMAND_PALETTE = False
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("q,escape", "quit", "quit"),
-        Binding("space", "toggle", "choose two to compare"),
+        Binding("space", "mark", "choose two to compare"),
         Binding("j", "move(1)", show=False),
         Binding("k", "move(-1)", show=False),
     ]
@@ -93,7 +93,7 @@ class ChooseApp(App[list[Path]]):
         mark = f"[{'ab'[self._marked.index(place)]}]" if place in self._marked else "   "
         return f"{mark} {self._found[place].text}"
 
-    def action_toggle(self) -> None:
+    def action_mark(self) -> None:
         """Mark or unmark."""
         options = self.query_one(OptionList)
         place = options.highlighted

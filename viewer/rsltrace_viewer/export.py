@@ -14,9 +14,7 @@ _SETTLE_S = 30.0
 _PAUSE_S = 0.05
 
 
-def screen_of(
-    app: ViewerApp, size: tuple[int, int], keys: Sequence[str] = (), *, svg: bool
-) -> str:
+def screen_of(app: ViewerApp, size: tuple[int, int], keys: Sequence[str] = (), *, svg: bool) -> str:
     """Return what ``app`` shows on a screen of ``size`` cells after ``keys`` were pressed.
 
     Keys are named as Textual does (``down``, ``n``, ``slash``).

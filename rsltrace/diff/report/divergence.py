@@ -35,7 +35,7 @@ from rsltrace.model.stamp import format_duration, format_seconds
 
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
-_DEPTH_MAX = 10
+_DEPTH_MAX = 6
 
 
 def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
@@ -69,7 +69,9 @@ def _event(found: Divergence, width: int) -> Section:
         title = ""
     for message in found.messages:
         rows += _message(message, width)
-    return Section(line((title, TITLE)) if title else (), rows, 12, "lines of differences", least=4)
+    return Section(
+        cut(line((title, TITLE)), width) if title else (), rows, 12, "lines of differences", least=4
+    )
 
 
 def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
@@ -126,7 +128,7 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
     if step.a and step.b and step.a.index != step.b.index:
         index = f"{step.a.index}/{step.b.index}"
     relation = printable(step.relation)
-    end: Piece = ("  <- here they part" if last and depth else "", BAD)
+    end: Piece = ("  <- here" if last and depth else "", BAD)
     return line(
         f"  {branch}",
         (f"{index} ", FAINT),

@@ -87,7 +87,8 @@ def _head(diff: Diff, width: int) -> list[Line]:
     lines += in_columns([_side_cells(*side) for side in sides], widest=60)
     if not diff.identical:
         word = "event agrees" if diff.agreeing == 1 else "events agree"
-        lines.append(line(f"  verdict: {diff.verdict.value}; {diff.agreeing} {word} before"))
+        verdict = f"  verdict: {diff.verdict.value}; {diff.agreeing} {word} before"
+        lines += wrapped(verdict, width, indent="  ")
         if within_tolerance(diff):
             lines.append(
                 line(("  equal within tolerance, not identical: the digests differ", TITLE))

@@ -202,7 +202,7 @@ def _sign(item: Item, stretch: Stretch) -> Sign:
 
 
 def _enter(places: array[int], offset: int, place: int) -> None:
-    """Note a place by index; what is between was matched with an earlier stretch, or comes later."""
+    """Note a place by index. What lies between was matched earlier, or will be later."""
     if offset < 0:
         return
     while len(places) <= offset:

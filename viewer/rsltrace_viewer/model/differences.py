@@ -81,7 +81,9 @@ def _title(
     else:
         later = format_duration(abs(stamps[1] - stamps[0]))
         which = "later" if stamps[1] > stamps[0] else "earlier"
-        text = f"{format_seconds(stamps[0])} s / {format_seconds(stamps[1])} s (b is {later} {which})"
+        text = (
+            f"{format_seconds(stamps[0])} s / {format_seconds(stamps[1])} s (b is {later} {which})"
+        )
         yield Line(1, "at", text, Role.DIFFERENCE, "event.at")
 
 
@@ -123,8 +125,13 @@ def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line
         if step.relation:
             text += f", {step.relation}"
         yield Line(
-            1 + depth, "└" if depth else "●", printable(text), Role.LINK, f"chain.{depth}",
-            link=view.index, other_run=other,
+            1 + depth,
+            "└" if depth else "●",
+            printable(text),
+            Role.LINK,
+            f"chain.{depth}",
+            link=view.index,
+            other_run=other,
         )
 
 
@@ -203,6 +210,8 @@ def _cause_lines(comparison: Comparison, a: int | None, b: int | None) -> Iterat
         shown.add(place)
         sign = comparison.sign(place)
         link = event_link(run, cause, f"cause.{'b' if other else 'a'}")
-        yield Line(1, f"→ {sign.value}", link.value, Role.LINK, link.path, link=cause, other_run=other)
+        yield Line(
+            1, f"→ {sign.value}", link.value, Role.LINK, link.path, link=cause, other_run=other
+        )
     if not shown:
         yield Line(1, "", "no other event", Role.NOTE, "cause.none")

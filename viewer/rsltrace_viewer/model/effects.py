@@ -14,8 +14,10 @@ from rsltrace_viewer.model.inspector import Effects
 from rsltrace_viewer.model.match import Mask, find
 from rsltrace_viewer.model.run import Run, Segment
 
-_SEGMENTS_AHEAD = 64
-"""How far to look: a quarter of a million events. Delays of a run are shorter than that."""
+_SEGMENTS_AHEAD = 32
+"""How far to look: over a hundred thousand events. Delays of a run are shorter than that."""
+_SEGMENTS_AHEAD_SILENT = 1
+"""The same for events without outputs, which cause something only by what no output says."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +48,8 @@ def effects_of(run: Run, index: int) -> Iterator[Effects]:
         return
     found: list[int] = []
     first = run.segment_of(index)
-    last = min(first + _SEGMENTS_AHEAD, len(run.segments)) - 1
+    ahead = _SEGMENTS_AHEAD if run.row(index)["outputs"] else _SEGMENTS_AHEAD_SILENT
+    last = min(first + ahead, len(run.segments)) - 1
     searched = index
     number = first
     for place in find(run, CausedBy(index), index, 1):

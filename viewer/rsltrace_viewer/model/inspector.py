@@ -44,9 +44,7 @@ class Effects:
     done: bool = False
 
 
-def inspect(
-    run: Run, index: int, openness: Openness, effects: Effects | None = None
-) -> list[Line]:
+def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = None) -> list[Line]:
     """Return the lines for event ``index``. Raises IndexError; damage becomes a line."""
     try:
         event = run.event(index)

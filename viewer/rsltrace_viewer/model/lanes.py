@@ -273,7 +273,7 @@ class LaneMaker:
         known: float,
     ) -> Lanes:
         lanes = []
-        most = max(int(counts.max(initial=0)), 1)
+        most = max(int(np.max(counts, initial=0)), 1)
         for row, label in enumerate(self.labels):
             own = counts[row]
             if label == RUN_LABEL and not own.any():
@@ -317,5 +317,3 @@ class LaneMaker:
             if label != RUN_LABEL or "".join(line).strip()
         ]
         return Lanes(window, columns, tuple(lanes), 1.0, cause)
-
-

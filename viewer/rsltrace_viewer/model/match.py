@@ -72,7 +72,8 @@ class OfKinds(_Anywhere):
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
         """Return the mask."""
-        return np.isin(segment.events["kind"], self.kinds)
+        found: Mask = np.isin(segment.events["kind"], self.kinds)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,8 +134,10 @@ class HashBegins(_Anywhere):
         shift = np.uint64(64 - 4 * len(self.digits))
         wanted = np.uint64(int(self.digits, 16))
         events = segment.events
-        found: Mask = (events["input_hash"] >> shift == wanted) & (events["input_hash"] != 0)
-        return found | ((events["output_hash"] >> shift == wanted) & (events["output_hash"] != 0))
+        found: Mask = np.zeros(len(events), dtype=np.bool_)
+        for name in ("input_hash", "output_hash"):
+            found |= (events[name] >> shift == wanted) & (events[name] != 0)
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +199,7 @@ class All:
 
     def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
         """Return the mask."""
-        left = among.copy()
+        left: Mask = among.copy()
         for part in self.parts:
             if not left.any():
                 break

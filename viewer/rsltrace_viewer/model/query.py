@@ -112,7 +112,9 @@ class _Parser:
     def _term(self) -> Condition:
         token = self._peek()
         if token is None:
-            raise QueryError("something to look for is missing here", self._length, self._length + 1)
+            raise QueryError(
+                "something to look for is missing here", self._length, self._length + 1
+            )
         self._place += 1
         if token.text.lower() == "not" or token.text == "-":
             return match.Not(self._term())
@@ -137,7 +139,9 @@ class _Parser:
         if field is None:
             known = ", ".join(FIELDS)
             raise QueryError(
-                f"there is no field {name!r}; there are {known}", token.start, token.start + len(name)
+                f"there is no field {name!r}; there are {known}",
+                token.start,
+                token.start + len(name),
             )
         rest = _Token(token.text[len(name) + 1 :], token.start + len(name) + 1)
         if not rest.text:
@@ -344,7 +348,9 @@ def _read_hash(run: Run, token: _Token) -> Condition:
 
 def _read_text(run: Run, token: _Token) -> Condition:
     folded = _value(token).casefold()
-    return match.Any((match.says(folded), match.EachEvent(lambda run, i: _contains(run, i, folded))))
+    return match.Any(
+        (match.says(folded), match.EachEvent(lambda run, i: _contains(run, i, folded)))
+    )
 
 
 def _contains(run: Run, index: int, folded: str) -> bool:
@@ -389,9 +395,7 @@ class Field:
 
 
 FIELDS: dict[str, Field] = {
-    "node": Field(
-        "events of nodes", _read_node, lambda run: [node.name for node in run.nodes]
-    ),
+    "node": Field("events of nodes", _read_node, lambda run: [node.name for node in run.nodes]),
     "topic": Field(
         "events that receive from or send to one",
         _read_topic,

@@ -47,8 +47,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Series:
-    """Points of one run: times in seconds and values, shape (n,); ``note`` says what was left out.
-    """
+    """Points of one run: times in s and values, shape (n,); ``note`` says what was left out."""
 
     times: npt.NDArray[np.float64]
     values: npt.NDArray[np.float64]
@@ -160,13 +159,11 @@ def _field_series(run: Run, source: Source) -> Iterator[Series]:
 
 
 def _rate_series(run: Run, topic: str) -> Iterator[Series]:
-    ids = np.array(
-        [e.id for e in _publishers_of(run, topic)], dtype=np.uint32
-    )
+    ids = np.array([e.id for e in _publishers_of(run, topic)], dtype=np.uint32)
     start, end = run.start_ns, run.end_ns + 1
     counts = np.zeros(_RATE_BINS)
     width_s = (end - start) / _RATE_BINS / 1e9
-    times = start / 1e9 + (np.arange(_RATE_BINS) + 0.5) * width_s
+    times = np.asarray(start / 1e9 + (np.arange(_RATE_BINS) + 0.5) * width_s, dtype=np.float64)
     for number in range(len(run.segments)):
         try:
             segment = run.segment(number)
@@ -183,9 +180,7 @@ def _rate_series(run: Run, topic: str) -> Iterator[Series]:
 
 
 def _publishers_of(run: Run, topic: str) -> list[Entity]:
-    return [
-        e for e in run.entities.values() if e.kind is EntityKind.PUBLISHER and e.name == topic
-    ]
+    return [e for e in run.entities.values() if e.kind is EntityKind.PUBLISHER and e.name == topic]
 
 
 def _latency_series(run: Run, topic: str, node: str) -> Iterator[Series]:
@@ -194,9 +189,7 @@ def _latency_series(run: Run, topic: str, node: str) -> Iterator[Series]:
         [
             e.id
             for e in run.entities.values()
-            if e.kind is EntityKind.SUBSCRIPTION
-            and e.name == topic
-            and run.node_name(e.id) == node
+            if e.kind is EntityKind.SUBSCRIPTION and e.name == topic and run.node_name(e.id) == node
         ],
         dtype=np.uint32,
     )

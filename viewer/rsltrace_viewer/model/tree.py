@@ -36,8 +36,14 @@ def _value_lines(
         yield Line(depth, name, preview(value), Role.FIELD, path)
         return
     is_open = openness.is_open(path, few and _is_message(value) and not _is_time(value))
-    yield Line(depth, name, "" if is_open and _is_message(value) else preview(value), Role.FIELD,
-               path, is_open)
+    yield Line(
+        depth,
+        name,
+        "" if is_open and _is_message(value) else preview(value),
+        Role.FIELD,
+        path,
+        is_open,
+    )
     if not is_open:
         return
     children = list(_children(value))
@@ -151,7 +157,9 @@ def bytes_lines(data: bytes, path: str, depth: int) -> Iterator[Line]:
     for offset in range(0, min(len(data), shown), 16):
         row = data[offset : offset + 16]
         text = "".join(chr(b) if 32 <= b < 127 else "." for b in row)
-        yield Line(depth, f"{offset:06x}", f"{row.hex(' ')}  {text}", Role.FIELD, f"{path}.{offset}")
+        yield Line(
+            depth, f"{offset:06x}", f"{row.hex(' ')}  {text}", Role.FIELD, f"{path}.{offset}"
+        )
     if len(data) > shown:
         more = f"… and {len(data) - shown} more bytes"
         yield Line(depth, "", more, Role.NOTE, f"{path}.more")

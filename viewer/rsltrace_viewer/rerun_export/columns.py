@@ -65,7 +65,8 @@ def make_chunk(
         [values for _, values in (*times, *columns)], schema=pa.schema(fields)
     )
     index = [name for name, _ in times] or None
-    return Chunk.from_record_batch(batch, index=index, entity_path=path)
+    chunks: list[Chunk] = Chunk.from_record_batch(batch, index=index, entity_path=path)
+    return chunks
 
 
 def _field(component: ComponentDescriptor | str, values: pa.Array) -> pa.Field:
@@ -95,7 +96,7 @@ def strip_lists(counts: npt.NDArray[np.integer[Any]], points: pa.Array) -> pa.Ar
 
 
 def vectors(values: npt.NDArray[np.floating[Any]]) -> pa.Array:
-    """Return an array of shape (n, k) as n fixed-size lists of k float32, as Rerun has positions."""
+    """Return an array of shape (n, k) as n lists of k float32, as Rerun has positions."""
     size = values.shape[1]
     flat = pa.array(np.ascontiguousarray(values, dtype=np.float32).reshape(-1))
     kind = pa.list_(pa.field("item", pa.float32(), nullable=False), size)

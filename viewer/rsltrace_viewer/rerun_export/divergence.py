@@ -30,6 +30,7 @@ _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
 _VALUE_WIDTH = 18
 _FIELDS_MAX = 20
+_BEFORE_NS, _AFTER_NS = 500_000_000, 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,10 +40,17 @@ class Marks:
     document: str
     lanes: tuple[str, ...]
     fields: tuple[tuple[str, str], ...]
+    around_ns: tuple[int, int] | None
+    """The time around the first divergence."""
 
 
 def marks_of(diff: Diff) -> Marks:
     """Return what the layout needs to know."""
+    first = diff.divergences[0] if diff.divergences else None
+    here = _either(first.a, first.b) if first is not None else None
+    around_ns = None
+    if here is not None:
+        around_ns = (max(here.stamp_ns - _BEFORE_NS, 0), here.stamp_ns + _AFTER_NS)
     fields: dict[tuple[str, str], None] = {}
     for divergence in diff.divergences:
         for message in divergence.messages:
@@ -51,11 +59,11 @@ def marks_of(diff: Diff) -> Marks:
                 inside = path.rpartition(".")[0] if path == field.path else path
                 fields[message.topic, join(inside).strip("/") if inside else ""] = None
     lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
-    return Marks(DOCUMENT, lanes, tuple(fields))
+    return Marks(DOCUMENT, lanes, tuple(fields), around_ns)
 
 
-def divergence_chunks(diff: Diff, clock: Clock) -> Iterator[Chunk]:
-    """Yield the text and the marks."""
+def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk]:
+    """Yield the text and the marks. ``start_ns`` is when the earlier of the runs started."""
     yield from make_chunk(
         DOCUMENT,
         (),
@@ -65,21 +73,22 @@ def divergence_chunks(diff: Diff, clock: Clock) -> Iterator[Chunk]:
         ),
     )
     first = diff.divergences[0] if diff.divergences else None
-    yield from _agreement(diff, first, clock)
+    yield from _agreement(diff, first, start_ns, clock)
     if first is not None:
         yield from _chain(first, clock)
 
 
-def _agreement(diff: Diff, first: Divergence | None, clock: Clock) -> Iterator[Chunk]:
+def _agreement(
+    diff: Diff, first: Divergence | None, start_ns: int, clock: Clock
+) -> Iterator[Chunk]:
     state = rr.StateChange.descriptor_state()
     here = _either(first.a, first.b) if first is not None else None
-    stamps, events, states = [0], [0], [_AGREE]
-    if here is not None:
-        stamps, events, states = [0, here.stamp_ns], [0, here.index], [_AGREE, _DIFFER]
-    elif not diff.identical:
+    stamps, events, states = [start_ns], [0], [_AGREE]
+    if here is not None or not diff.identical:
         end_ns = min(diff.a.end_ns, diff.b.end_ns)
-        stamps, events, states = [0, end_ns], [0, diff.agreeing], [_AGREE, _DIFFER]
-    stamps[0] = min(stamps[0], *stamps)
+        stamps.append(here.stamp_ns if here is not None else end_ns)
+        events.append(here.index if here is not None else diff.agreeing)
+        states.append(_DIFFER)
     yield from make_chunk(
         AGREEMENT,
         ((SIM_TIME, clock.array(np.array(stamps))), (EVENT, pa.array(events))),
@@ -103,7 +112,10 @@ def _agreement(diff: Diff, first: Divergence | None, clock: Clock) -> Iterator[C
 def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
     """Yield the lane of causes: each from its event to the next, the divergence to the end."""
     steps = [(view, step) for step in first.chain if (view := _either(step.a, step.b))]
-    rows = [(view.index, view.stamp_ns, f"{i + 1}. {printable(_step(s))}") for i, (view, s) in enumerate(steps)]
+    rows = [
+        (view.index, view.stamp_ns, f"{i + 1}. {printable(_step(s))}")
+        for i, (view, s) in enumerate(steps)
+    ]
     here = _either(first.a, first.b)
     if here is not None and (not rows or rows[-1][0] != here.index):
         rows.append((here.index, here.stamp_ns, f"divergence: {_event(here)}"))
@@ -120,7 +132,11 @@ def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
 
 def document(diff: Diff) -> str:
     """Return the diff as Markdown, for people."""
-    lines = [f"# {'Identical' if diff.identical else _text(diff.verdict.value)}", "", _text(diff.sentence)]
+    lines = [
+        f"# {'Identical' if diff.identical else _text(diff.verdict.value)}",
+        "",
+        _text(diff.sentence),
+    ]
     lines += ["", "| | a | b |", "|---|---|---|"]
     lines += [
         f"| trace | {_text(diff.a.path)} | {_text(diff.b.path)} |",
@@ -134,9 +150,7 @@ def document(diff: Diff) -> str:
         lines += ["", *_divergence(divergence, number, len(diff.divergences))]
     if diff.settings:
         lines += ["", "## Job and environment", "", "| | a | b |", "|---|---|---|"]
-        lines += [
-            f"| {_text(s.place)} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings
-        ]
+        lines += [f"| {_text(s.place)} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings]
     lines += [f"\n{_text(note)}" for note in diff.notes]
     return "\n".join(lines) + "\n"
 

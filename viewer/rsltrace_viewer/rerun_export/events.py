@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -70,10 +71,7 @@ class EventRows:
         ):
             events.append(more_events)
             outputs.append(more_outputs)
-            if (
-                sum(map(len, events)) >= _BATCH_EVENTS
-                or sum(map(len, outputs)) >= _BATCH_OUTPUTS
-            ):
+            if sum(map(len, events)) >= _BATCH_EVENTS or sum(map(len, outputs)) >= _BATCH_OUTPUTS:
                 yield np.concatenate(events), np.concatenate(outputs)
                 events, outputs = [], []
         if events:
@@ -113,12 +111,14 @@ class EventRows:
         nodes = self._node_of[np.minimum(events["entity"], len(self._node_of) - 1)]
         indexes = events["index"].astype(np.int64)
         following = np.append(nodes[1:], -1)
-        for number in np.unique(nodes).tolist():
+        by_node, numbers, starts = _grouped(nodes)
+        for number, own in zip(numbers.tolist(), np.split(by_node, starts[1:]), strict=True):
             self._active[number] = True
             path = self._paths.node(self.node_names[number])
-            own = np.flatnonzero(nodes == number)
             texts = callbacks.take(pa.array(own))
-            yield from make_chunk(path, ((SIM_TIME, stamps.take(pa.array(own))),), ((state, texts),))
+            yield from make_chunk(
+                path, ((SIM_TIME, stamps.take(pa.array(own))),), ((state, texts),)
+            )
             # Where another node runs next, an empty text ends the lane.
             last = own[following[own] != number]
             places = np.concatenate([indexes[own], indexes[last] + 1])
@@ -137,8 +137,7 @@ class EventRows:
         indexes: pa.Array,
         sent: pa.Array,
     ) -> Iterator[Chunk]:
-        order = np.argsort(events["entity"], kind="stable")
-        ids, starts = np.unique(events["entity"][order], return_index=True)
+        order, ids, starts = _grouped(events["entity"])
         raised = (events["flags"] & int(EventFlag.RAISED)) != 0
         levels = pa.array([_NORMAL, _RAISED]).take(pa.array(raised.astype(np.int32)))
         for entity_id, own in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
@@ -180,3 +179,17 @@ class EventRows:
         yield from make_chunk(
             path, (), ((rr.SeriesLines.descriptor_names(), pa.array([f"{label} [1/s]"])),)
         )
+
+
+def _grouped(
+    keys: npt.NDArray[np.integer[Any]],
+) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.int64], npt.NDArray[np.intp]]:
+    """Return the places of ``keys`` ordered by key, the keys there are, and where each begins.
+
+    The places of a key stay in order. There are rarely more than 65,536 keys, and numpy sorts
+    16-bit numbers ten times as fast.
+    """
+    small = keys.astype(np.uint16) if len(keys) and np.max(keys) < 2**16 else keys
+    order = np.argsort(small, kind="stable")
+    ids, starts = np.unique(keys[order], return_index=True)
+    return order, ids.astype(np.int64), starts

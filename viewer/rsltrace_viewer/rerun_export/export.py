@@ -85,7 +85,8 @@ def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | N
         recording.send_chunks(joining_chunks(list(labels), trees))
     if diff is not None:
         marks = marks_of(diff)
-        recording.send_chunks(divergence_chunks(diff, clock))
+        start_ns = min(trace.start_ns for trace in opened)
+        recording.send_chunks(divergence_chunks(diff, start_ns, clock))
     recording.send_blueprint(blueprint(shown, marks), make_active=True, make_default=True)
 
 

@@ -61,7 +61,7 @@ def _array(array: pa.Array, path: str) -> Iterator[Curves]:
     if not _is_number(array.type.value_type):
         return
     counts, values = items(array)
-    most = int(counts.max()) if len(counts) else 0
+    most = int(np.max(counts)) if len(counts) else 0
     if 0 < most <= _ITEMS_MAX:
         names = tuple(f"[{place}]" for place in range(most))
         yield Curves(path, names, lists(counts, pa.array(numbers(values))))

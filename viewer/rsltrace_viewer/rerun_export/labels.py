@@ -22,6 +22,9 @@ from rsltrace_viewer.rerun_export.paths import Paths
 _NAMES_MAX = 6
 """Names of outputs in a text; a constructor makes dozens of entities, which are counted instead."""
 
+_KINDS = 256
+"""More than there are kinds of outputs, ever."""
+
 _HEX = np.array([f"{byte:02x}" for byte in range(256)], dtype="S2")
 
 
@@ -39,6 +42,7 @@ class Labels:
         self._kind_texts = pa.array([_label(EventKind, number) for number in range(256)])
         self._sent: dict[bytes, int] = {b"": 0}
         self._sent_texts: list[str] = [""]
+        self._of_single = np.full(count * _KINDS, -1, dtype=np.int64)
 
     def nodes(self, entities: npt.NDArray[Any]) -> pa.Array:
         """Return the names of the nodes of entities."""
@@ -59,10 +63,7 @@ class Labels:
         ends = np.cumsum(counts, dtype=np.int64)
         numbers = np.zeros(len(counts), dtype=np.int64)
         single = counts == 1
-        keys, places = np.unique(what[ends[single] - 1], axis=0, return_inverse=True)
-        of_key = np.array([self._number(key.tobytes()) for key in keys], dtype=np.int64)
-        if len(keys):
-            numbers[single] = of_key[places.reshape(-1)]
+        numbers[single] = self._single(what[ends[single] - 1])
         data = what.tobytes()
         several = np.flatnonzero(counts > 1)
         begins = ((ends - counts)[several] * 8).tolist()
@@ -72,13 +73,24 @@ class Labels:
         ]
         return pa.array(self._sent_texts).take(pa.array(numbers))
 
+    def _single(self, what: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
+        """Return the numbers of the texts for single outputs, shape (n,), by a table of them."""
+        keys = what[:, 0].astype(np.int64) * _KINDS + np.minimum(what[:, 1], _KINDS - 1)
+        if len(keys) and np.max(keys) >= len(self._of_single):
+            more = int(np.max(keys)) + 1 - len(self._of_single)
+            self._of_single = np.append(self._of_single, np.full(more, -1, dtype=np.int64))
+        found = self._of_single[keys]
+        while (found < 0).any():
+            place = int(np.argmin(found))
+            self._of_single[keys[place]] = self._number(what[place].tobytes())
+            found = self._of_single[keys]
+        return found
+
     def flags(self, flags: npt.NDArray[Any]) -> pa.Array:
-        """Return the names of flags: empty, ``raised``, …"""
-        texts = [
-            " ".join(str(f.name).lower() for f in EventFlag if f and f in EventFlag(number & 3))
-            for number in range(4)
-        ]
-        return pa.array(texts).take(pa.array((flags & 3).astype(np.int32)))
+        """Return the names of flags: ``raised``, …; null for none."""
+        named = [(int(flag), str(flag.name).lower()) for flag in EventFlag if flag]
+        texts = [" ".join(name for bit, name in named if n & bit) or None for n in range(256)]
+        return pa.array(texts, type=pa.string()).take(pa.array(flags.astype(np.int32)))
 
     def _numbers(self, entities: npt.NDArray[Any]) -> pa.Array:
         return pa.array(np.minimum(entities, self._known).astype(np.int32))

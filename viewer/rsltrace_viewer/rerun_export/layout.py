@@ -8,10 +8,11 @@ verdict stands first, and what differs is what is plotted.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeAlias
 
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.blueprint.api import Container, View
 
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
 from rsltrace_viewer.rerun_export.paths import NO_NODE
@@ -32,7 +33,7 @@ _EVENTS_IN_SIGHT = 120
 """Lanes show so many events around the cursor: callbacks, not a grey bar."""
 _TABLE = ("node", "callback", "kind", "outputs", "cause", "flags", "input_hash", "output_hash")
 
-Part = rrb.Container | rrb.View
+Part: TypeAlias = Container | View
 
 
 def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Blueprint:
@@ -52,9 +53,22 @@ def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Bluepri
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=SIM_TIME, play_state="paused", loop_mode="selection", time_selection=rr.encodings.AbsoluteTimeRange(7_000_000_000, 7_200_000_000)),
+        _time_panel(marks),
         auto_views=False,
         auto_layout=False,
+    )
+
+
+def _time_panel(marks: Marks | None) -> rrb.TimePanel:
+    """Of two runs, the viewer opens on the divergence and plays what is around it."""
+    if marks is None or marks.around_ns is None:
+        return rrb.TimePanel(state="collapsed", timeline=SIM_TIME)
+    return rrb.TimePanel(
+        state="collapsed",
+        timeline=SIM_TIME,
+        play_state="playing",
+        loop_mode="selection",
+        time_selection=rr.encodings.AbsoluteTimeRange(*marks.around_ns),
     )
 
 
@@ -179,7 +193,9 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
                 name="Log",
                 columns=rrb.TextLogColumns(
                     timeline_columns=[SIM_TIME, EVENT],
-                    text_log_columns=["entitypath", "loglevel", "body"],
+                    text_log_columns=["loglevel", "body"]
+                    if len(shown) == 1
+                    else ["entitypath", "loglevel", "body"],
                 ),
             )
         )

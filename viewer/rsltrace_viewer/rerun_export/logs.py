@@ -46,7 +46,7 @@ class LogRows:
         try:
             reader = McapReader(
                 self._trace.name,
-                timeline_type=self._clock.timeline_type,  # type: ignore[arg-type]
+                timeline_type=self._clock.timeline_type,
                 decoders=("ros2msg", "ros2_reflection"),
                 include_topic_regex=[f"^{re.escape(TOPIC_ROSOUT)}$"],
                 recover=not self._trace.complete,
@@ -94,6 +94,7 @@ class LogRows:
                 entity = self._trace.entities.get(int(event["entity"]))
                 name = self._paths.node_name(entity) if entity else NO_NODE
                 text = self._trace.detail(output) or "an exception; its traceback was not kept"
+                text = f"[{name.strip('/')}] {text.rstrip()}"  # as the loader begins log records
                 self.count += 1
                 yield from make_chunk(
                     f"{self._paths.node(name)}/log",
@@ -102,7 +103,7 @@ class LogRows:
                         (EVENT, pa.array([output.event])),
                     ),
                     (
-                        (rr.TextLog.descriptor_text(), pa.array([text.rstrip()])),
+                        (rr.TextLog.descriptor_text(), pa.array([text])),
                         (rr.TextLog.descriptor_level(), pa.array(["CRITICAL"])),
                     ),
                 )

@@ -17,9 +17,16 @@ class MarkerRows:
     """Logs the markers of one run, a row at a time: they are of many kinds, and few."""
 
     def __init__(
-        self, label: str, clock: Clock, recording: rr.RecordingStream, frames: FrameTree
+        self,
+        label: str,
+        start_ns: int,
+        clock: Clock,
+        recording: rr.RecordingStream,
+        frames: FrameTree,
     ) -> None:
+        """``start_ns`` is that of the run; ``frames`` takes note of where markers are."""
         self._label = label
+        self._start_ns = start_ns
         self._clock = clock
         self._recording = recording
         self._frames = frames
@@ -33,13 +40,11 @@ class MarkerRows:
         for change in board.changes(message, stamp_ns):
             at = path + join(*change.parts)
             self._expire(at, stamp_ns)
+            if change.frame:
+                self._note_frame(at, change.frame)
             self._set_time(stamp_ns)
             self._recording.set_time(EVENT, sequence=event)
             self._recording.log(at, change.what)
-            if change.frame:
-                self._frames.frames.setdefault(at, change.frame)
-                self._frames.drawn.add(at)
-                self._shown_in[at] = change.frame
             self._log_frame(at)
             if change.expires_ns is not None:
                 self._expiring[at] = change.expires_ns
@@ -59,6 +64,16 @@ class MarkerRows:
             self._recording.reset_time()
             self._set_time(expires_ns)
             self._recording.log(path, rr.Clear(recursive=False))
+            self._log_frame(path)
+
+    def _note_frame(self, path: str, frame: str) -> None:
+        first = path not in self._shown_in
+        self._shown_in[path] = frame
+        if first:
+            self._frames.frames[path] = frame
+            self._frames.drawn.add(path)
+            self._set_time(self._start_ns)
+            self._recording.set_time(EVENT, sequence=0)
             self._log_frame(path)
 
     def _log_frame(self, path: str) -> None:

@@ -161,9 +161,7 @@ def _line_strip(marker: dict[str, Any]) -> rr.AsComponents:
 def _line_list(marker: dict[str, Any]) -> rr.AsComponents:
     points = _points(marker)
     pairs = points[: len(points) // 2 * 2].reshape(-1, 2, 3)
-    return rr.LineStrips3D(
-        pairs, radii=[_scale(marker)[0] / 2], colors=[_rgba(marker["color"])]
-    )
+    return rr.LineStrips3D(pairs, radii=[_scale(marker)[0] / 2], colors=[_rgba(marker["color"])])
 
 
 def _boxes(marker: dict[str, Any]) -> rr.AsComponents:
@@ -179,9 +177,7 @@ def _boxes(marker: dict[str, Any]) -> rr.AsComponents:
 
 def _dots(marker: dict[str, Any]) -> rr.AsComponents:
     points = _points(marker)
-    return rr.Points3D(
-        points, radii=[_scale(marker)[0] / 2], colors=_colours(marker, len(points))
-    )
+    return rr.Points3D(points, radii=[_scale(marker)[0] / 2], colors=_colours(marker, len(points)))
 
 
 def _triangles(marker: dict[str, Any]) -> rr.AsComponents:

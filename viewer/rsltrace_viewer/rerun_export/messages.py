@@ -40,12 +40,22 @@ from rsltrace_viewer.rerun_export.frames import FrameTree
 from rsltrace_viewer.rerun_export.marker_rows import MarkerRows
 from rsltrace_viewer.rerun_export.moments import Moments
 from rsltrace_viewer.rerun_export.paths import Paths, join
+from rsltrace_viewer.rerun_export.rows import (
+    LoadedColumns,
+    Rows,
+    Stream,
+    Waiting,
+    loaded_chunk,
+    loaded_columns,
+)
 from rsltrace_viewer.rerun_export.shapes import SHAPES, Drawing, Paint, frames_of, pose_drawing
 from rsltrace_viewer.rerun_export.trails import Trails
 from rsltrace_viewer.rerun_export.values import messages_of, numbers
 
 _OWN = (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS, TOPIC_ROSOUT)
-_DECODERS = ("ros2msg", "ros2_reflection", "raw")
+_DECODERS = ("ros2msg", "ros2_reflection", "raw", "schema")
+"""``schema`` puts the type of a topic beside its messages. That also helps the viewer: without a
+static row at its entity, 0.41 does not draw a grid map."""
 _LOG_TIME = "message_log_time"
 _FRAME_TYPE = b"rerun.components.TransformFrameId"
 _MARKERS = ("visualization_msgs.msg.Marker", "visualization_msgs.msg.MarkerArray")
@@ -55,7 +65,7 @@ _SOLID = {"Points3D:positions", "GridMap:data", "Pinhole:image_from_camera"}
 _RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
 """The bytes of a cloud, beside its points: the same once more."""
 
-Times = tuple[tuple[str, pa.Array], ...]
+_BYTES_WAITING_MAX = 32 << 20
 
 
 @dataclass(slots=True)
@@ -71,18 +81,6 @@ class Seen:
     """By path of curves or drawings, the topic."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Rows:
-    """The rows of one chunk: where they belong and what they hold."""
-
-    topic: str
-    path: str
-    times: Times
-    stamps_ns: npt.NDArray[np.int64]
-    events: npt.NDArray[np.int64]
-    columns: tuple[tuple[pa.Field, pa.Array], ...]
-
-
 class MessageRows:
     """Makes chunks of the messages of one trace; memory is that of a chunk of the file."""
 
@@ -94,9 +92,10 @@ class MessageRows:
         self._moments = Moments(trace)
         self._topics = {join(c.topic): c.topic for c in trace.channels.values()}
         self._numbers = {topic: i for i, topic in enumerate(sorted(self._topics.values()))}
+        self._waiting: dict[Stream, Waiting] = {}
         self._prefix = f"{paths.label}/" if paths.label else ""
         self._trails = Trails()
-        self._markers = MarkerRows(paths.label, clock, recording, self.seen.frames)
+        self._markers = MarkerRows(paths.label, trace.start_ns, clock, recording, self.seen.frames)
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
@@ -104,13 +103,15 @@ class MessageRows:
         try:
             reader = McapReader(
                 self._trace.name,
-                timeline_type=self._clock.timeline_type,  # type: ignore[arg-type]
+                timeline_type=self._clock.timeline_type,
                 decoders=_DECODERS,
                 exclude_topic_regex=own,
                 recover=not self._trace.complete,
             )
             for chunk in reader.stream():
                 yield from self._chunk(chunk)
+            for stream in list(self._waiting):
+                yield from self._flush(stream)
         except (RuntimeError, ValueError, OSError) as error:
             raise TraceError(
                 f"{self._trace.name}: Rerun cannot read its messages ({error})"
@@ -123,17 +124,24 @@ class MessageRows:
             return
         path = self._paths.topic(topic) + below
         batch = chunk.to_record_batch()
-        columns = tuple(
-            (f, batch.column(i)) for i, f in enumerate(batch.schema) if _kind(f) == b"data"
-        )
+        columns = loaded_columns(batch)
         if chunk.is_static:
             yield from self._static(path, columns)
             return
         stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
         stream = (path, tuple(f.name for f, _ in columns))
         events, _ = self._moments.of_messages(topic, stream, stamps)
-        times = ((SIM_TIME, self._clock.array(stamps)), (EVENT, pa.array(events)))
-        rows = _Rows(topic, path, times, stamps, events, columns)
+        waiting = self._waiting.setdefault(stream, Waiting(topic, path))
+        waiting.add(columns, stamps, events)
+        if waiting.full:
+            yield from self._flush(stream)
+        elif sum(each.bytes for each in self._waiting.values()) >= _BYTES_WAITING_MAX:
+            for each in list(self._waiting):
+                yield from self._flush(each)
+
+    def _flush(self, stream: Stream) -> Iterator[Chunk]:
+        """Yield what waits of a sequence of rows."""
+        rows = self._waiting.pop(stream).joined(self._clock)
         yield from self._as_it_is(rows)
         yield from self._derived(rows)
 
@@ -146,16 +154,16 @@ class MessageRows:
             path = path.rpartition("/")[0]
         return "", ""
 
-    def _static(self, path: str, columns: tuple[tuple[pa.Field, pa.Array], ...]) -> list[Chunk]:
+    def _static(self, path: str, columns: LoadedColumns) -> list[Chunk]:
         """Names of curves and the like."""
         for f, column in columns:
             if f.name == "SeriesLines:names":
                 names = tuple(f"{self._paths.label} {n}".strip() for n in column[0].as_py())
                 self.seen.curves[path] = names
                 return self._curve_names(path, names)
-        return _batch(path, (), columns)
+        return loaded_chunk(path, (), columns)
 
-    def _as_it_is(self, rows: _Rows) -> list[Chunk]:
+    def _as_it_is(self, rows: Rows) -> Iterator[Chunk]:
         """What the loader made, on our timelines, with the run's own frames."""
         columns = []
         for f, column in rows.columns:
@@ -163,7 +171,7 @@ class MessageRows:
                 continue
             if (f.metadata or {}).get(b"rerun:component_type") == _FRAME_TYPE:
                 if f.name == "CoordinateFrame:frame":
-                    self._note_frame(rows.path, column)
+                    yield from self._note_frame(rows.path, column)
                 column = self._own_frames(column)
             columns.append((f, column))
         names = {f.name for f, _ in rows.columns}
@@ -172,9 +180,10 @@ class MessageRows:
         if names & _SOLID:
             self.seen.frames.drawn.add(rows.path)
         self.seen.topic_of.setdefault(rows.path, rows.topic)
-        return _batch(rows.path, rows.times, columns) if columns else []
+        if columns:
+            yield from loaded_chunk(rows.path, rows.times, columns)
 
-    def _derived(self, rows: _Rows) -> Iterator[Chunk]:
+    def _derived(self, rows: Rows) -> Iterator[Chunk]:
         by_name = {f.name: column for f, column in rows.columns}
         for name, column in by_name.items():
             type_name, _, kind = name.partition(":")
@@ -214,11 +223,20 @@ class MessageRows:
         ]
         return pa.array(names, type=column.type)
 
-    def _note_frame(self, path: str, column: pa.Array) -> None:
-        if path not in self.seen.frames.frames and len(column):
-            first = column[0].as_py()
-            if first:
-                self.seen.frames.frames[path] = first[0]
+    def _note_frame(self, path: str, column: pa.Array) -> list[Chunk]:
+        """Return the frame of an entity's first data, as that of the start of the run: a view
+        complains about entities that are in no frame, even when they have no data yet."""
+        names = column.flatten()
+        if path in self.seen.frames.frames or not len(names):
+            return []
+        frame = names[0].as_py()
+        self.seen.frames.frames[path] = frame
+        start_ns = np.array([self._trace.start_ns])
+        return make_chunk(
+            path,
+            ((SIM_TIME, self._clock.array(start_ns)), (EVENT, pa.array([0]))),
+            ((rr.CoordinateFrame.descriptor_frame(), pa.array([f"{self._prefix}{frame}"])),),
+        )
 
     def _note_transforms(self, by_name: dict[str, pa.Array]) -> None:
         parents = by_name["Transform3D:parent_frame"].flatten()
@@ -231,24 +249,25 @@ class MessageRows:
     def _paint(self, topic: str) -> Paint:
         return Paint(colour(self._paths.label, self._numbers[topic]))
 
-    def _draw(self, rows: _Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
+    def _draw(self, rows: Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
         frames = frames_of(messages) or [""] * len(messages)
         yield from self._drawing(rows, drawing, frames)
 
-    def _drawing(self, rows: _Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
+    def _drawing(self, rows: Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
         path = f"{rows.path}/{drawing.part}"
         names = pa.array([str(name) for name in frames])
-        self.seen.frames.frames.setdefault(path, str(frames[0]))
+        column = lists(np.ones(len(frames), dtype=np.int64), names)
+        yield from self._note_frame(path, column)
         self.seen.frames.drawn.add(path)
         self.seen.topic_of.setdefault(path, rows.topic)
-        frame = self._own_frames(lists(np.ones(len(frames), dtype=np.int64), names))
+        frame = self._own_frames(column)
         columns = (*drawing.columns, (rr.CoordinateFrame.descriptor_frame(), frame))
         yield from make_chunk(path, rows.times, columns)
         if drawing.position is not None:
             first = f"{self._prefix}{frames[0]}"
             self._trails.add_poses(rows.path, first, self._paint(rows.topic), drawing.position)
 
-    def _loaded_pose(self, rows: _Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
+    def _loaded_pose(self, rows: Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
         """The loader knows poses, but draws nothing where they are."""
         positions = _flat(by_name["InstancePoses3D:translations"], 3)
         quaternions = _flat(by_name["InstancePoses3D:quaternions"], 4)
@@ -257,7 +276,7 @@ class MessageRows:
             drawing = pose_drawing(positions, quaternions, self._paint(rows.topic))
             yield from self._drawing(rows, drawing, frames)
 
-    def _fix(self, rows: _Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
+    def _fix(self, rows: Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
         self.seen.fixes[rows.path] = None
         positions = _flat(fixes, 2)
         self._trails.add_fixes(rows.path, self._paint(rows.topic), positions)
@@ -269,7 +288,7 @@ class MessageRows:
 
     # Curves.
 
-    def _curves(self, rows: _Rows, curves: Iterator[Curves]) -> Iterator[Chunk]:
+    def _curves(self, rows: Rows, curves: Iterator[Curves]) -> Iterator[Chunk]:
         for curve in curves:
             path = rows.path + (join(curve.path) if curve.path else "")
             scalars = rr.Scalars.descriptor_scalars()
@@ -312,20 +331,3 @@ def _vector_curves(path: str, names: str | tuple[str, ...], column: pa.Array) ->
     if len(values) == len(column):
         counts = np.full(len(values), len(names), dtype=np.int64)
         yield Curves(path, tuple(names), lists(counts, pa.array(values.reshape(-1))))
-
-
-def _kind(f: pa.Field) -> bytes:
-    return bytes((f.metadata or {}).get(b"rerun:kind", b""))
-
-
-def _batch(
-    path: str, times: Times, columns: list[tuple[pa.Field, pa.Array]] | tuple[Any, ...]
-) -> list[Chunk]:
-    fields = [pa.field(name, values.type) for name, values in times]
-    fields += [f for f, _ in columns]
-    batch = pa.RecordBatch.from_arrays(
-        [values for _, values in (*times, *columns)], schema=pa.schema(fields)
-    )
-    return Chunk.from_record_batch(
-        batch, index=[name for name, _ in times] or None, entity_path=path
-    )

@@ -29,7 +29,12 @@ class Moments:
 
     def __init__(self, trace: Trace) -> None:
         self._trace = trace
-        self._topic_of = _topics(trace)
+        topic_of = _topics(trace)
+        self._topics = ["", *dict.fromkeys(topic_of.values())]
+        numbers = {topic: number for number, topic in enumerate(self._topics)}
+        self._table = np.zeros((max(trace.entities) + 1, max(OutputKind) + 1), dtype=np.int64)
+        for place, topic in topic_of.items():
+            self._table[place] = numbers[topic]
         table = trace.segments
         self._starts = table["start_stamp"].astype(np.int64)
         self._ends = table["end_stamp"].astype(np.int64)
@@ -39,7 +44,7 @@ class Moments:
         self._seen: dict[object, tuple[int, int]] = {}
 
     def senders(self, topic: str, first_ns: int, last_ns: int) -> Senders:
-        """Return what was published on ``topic`` from ``first_ns`` to ``last_ns``, both included."""
+        """Return what was published on ``topic`` from ``first_ns`` to ``last_ns``, included."""
         low = int(np.searchsorted(self._ends_sorted, first_ns, side="left"))
         parts = []
         for segment in range(low, len(self._starts)):
@@ -67,7 +72,9 @@ class Moments:
         rows = len(stamps_ns)
         if rows == 0:
             return stamps_ns, stamps_ns
-        stamps, events, entities = self.senders(topic, int(stamps_ns.min()), int(stamps_ns.max()))
+        stamps, events, entities = self.senders(
+            topic, int(np.min(stamps_ns)), int(np.max(stamps_ns))
+        )
         starts = np.flatnonzero(np.diff(stamps_ns, prepend=stamps_ns[0] - 1))
         place = np.arange(rows) - np.repeat(starts, np.diff(starts, append=rows))
         last_ns, count = self._seen.get(stream, (-1, 0))
@@ -97,17 +104,22 @@ class Moments:
         stamps = events["stamp"][owners - first].astype(np.int64)
         entities = outputs["entity"].astype(np.int64)
         kinds = outputs["kind"].astype(np.int64)
-        places: dict[str, list[npt.NDArray[np.int64]]] = {}
-        keys = entities * 256 + kinds
-        for key in np.unique(keys).tolist():
-            topic = self._topic_of.get(divmod(key, 256))
-            if topic is not None:
-                places.setdefault(topic, []).append(np.flatnonzero(keys == key))
+        numbers = self._number_of(entities, kinds)
+        order = np.argsort(numbers.astype(np.uint16), kind="stable")
+        present, starts = np.unique(numbers[order], return_index=True)
         found = {}
-        for topic, parts in places.items():
-            order = np.sort(np.concatenate(parts))
-            found[topic] = (stamps[order], owners[order], entities[order])
+        for number, own in zip(present.tolist(), np.split(order, starts[1:]), strict=True):
+            if number:
+                found[self._topics[number]] = (stamps[own], owners[own], entities[own])
         return found
+
+    def _number_of(
+        self, entities: npt.NDArray[np.int64], kinds: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """Return the number of the topic of each output, 0 for none."""
+        known = (entities < len(self._table)) & (kinds < self._table.shape[1])
+        numbers = self._table[np.where(known, entities, 0), np.where(known, kinds, 0)]
+        return np.where(known, numbers, 0)
 
 
 def _topics(trace: Trace) -> dict[tuple[int, int], str]:

@@ -7,7 +7,6 @@ while the events pass and written at the end.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -78,5 +77,3 @@ class Rates:
     def running(self) -> Iterator[int]:
         """Yield the entities that had an event at all."""
         yield from np.flatnonzero(self._counts.any(axis=1)).tolist()
-
-

@@ -34,7 +34,7 @@ _LINE = -1.5
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Something to draw at ``TOPIC/part``. ``position``, shape (n, 3), is where it is, for tracks."""
+    """Something to draw at ``TOPIC/part``. ``position``, shape (n, 3), is for tracks."""
 
     part: str
     columns: tuple[Column, ...]

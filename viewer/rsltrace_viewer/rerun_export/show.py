@@ -52,7 +52,10 @@ def has_display(environ: Mapping[str, str], platform: str) -> bool:
 def command(recording: Path, how: How) -> list[str]:
     """Return the command line that opens a recording, bound to this machine either way."""
     line = [str(viewer()), "--bind", LOOPBACK, "--new", str(recording)]
-    return [*line, "--web-viewer", "--web-viewer-port", "0"] if how is How.BROWSER else line
+    if how is How.BROWSER:
+        # The server holds the recording for the browser; over 1 GB it would drop the beginning.
+        return [*line, "--web-viewer", "--web-viewer-port", "0", "--server-memory-limit", "50%"]
+    return line
 
 
 @contextmanager

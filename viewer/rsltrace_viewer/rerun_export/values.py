@@ -57,9 +57,7 @@ def items(array: pa.Array) -> tuple[npt.NDArray[np.int64], pa.Array]:
 def rotated_x(quaternions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return where the x axis points after rotations (x, y, z, w), shape (n, 3)."""
     x, y, z, w = quaternions.T
-    return np.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1
-    )
+    return np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], axis=1)
 
 
 def rotated(quaternion: Any, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 from textual.app import ComposeResult
+from textual.binding import BindingType
 from textual.containers import Vertical
 from textual.content import Content
 from textual.screen import ModalScreen
@@ -15,7 +17,11 @@ from textual.widgets.option_list import Option
 class PickScreen(ModalScreen[int | None]):
     """Gives the number of the choice, or None."""
 
-    BINDINGS = [("escape,q", "dismiss(None)", "close"), ("j", "down", ""), ("k", "up", "")]
+    BINDINGS: ClassVar[list[BindingType]] = [
+        ("escape,q", "dismiss(None)", "close"),
+        ("j", "down", ""),
+        ("k", "up", ""),
+    ]
     DEFAULT_CSS = """
     PickScreen { align: center middle; }
     PickScreen > Vertical { width: 90%; max-width: 110; height: auto; max-height: 80%;

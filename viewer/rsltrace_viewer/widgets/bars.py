@@ -33,7 +33,7 @@ class FooterBar(Static):
     FooterBar { height: 1; background: $panel; color: $text; padding: 0 1; }
     """
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self._places: list[tuple[int, str]] = []
 

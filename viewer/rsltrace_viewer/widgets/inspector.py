@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from rich.segment import Segment as Piece
 from rich.style import Style
 from textual import events
@@ -12,20 +14,21 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.lines import Line, Role
-from rsltrace_viewer.widgets.styles import background_of
+from rsltrace_viewer.widgets.styles import background_of, set_virtual_size
 
 _LABEL_MAX = 24
 
 
-class Inspector(ScrollView, can_focus=True):
+class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
     """Draws lines and has a cursor of its own."""
 
-    COMPONENT_CLASSES = {f"inspector--{role.value}" for role in Role} | {
+    COMPONENT_CLASSES: ClassVar[set[str]] = {f"inspector--{role.value}" for role in Role} | {
         "inspector--label",
         "inspector--cursor",
     }
     DEFAULT_CSS = """
-    Inspector { background: $surface; scrollbar-size: 1 1; overflow-x: hidden; padding: 0 0 0 1; }
+    Inspector { background: $surface; scrollbar-size: 1 1; overflow-x: hidden;
+                overflow-y: scroll; padding: 0 0 0 1; }
     Inspector > .inspector--section { color: $text; text-style: bold; }
     Inspector > .inspector--label { color: $text-muted; }
     Inspector > .inspector--field { color: $text; }
@@ -45,7 +48,7 @@ class Inspector(ScrollView, can_focus=True):
             super().__init__()
             self.line = line
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self.cursor = 0
         self._lines: list[Line] = []
@@ -69,13 +72,18 @@ class Inspector(ScrollView, can_focus=True):
 
     def show(self, lines: list[Line], *, top: bool = True) -> None:
         """Show other lines; ``top`` moves to the first, otherwise the place is kept."""
+        before, first = self._drawn, self.cursor
         self._lines = lines
         self._lay_out()
+        moved = top and self.scroll_y > 0
         if top:
             self.cursor = 0
             self.scroll_to(y=0, animate=False, force=True, immediate=True)
         self.cursor = min(self.cursor, max(len(self._drawn) - 1, 0))
-        self.refresh()
+        if moved:
+            self.refresh()
+        else:
+            self._refresh_changes(before, first)
 
     def move(self, step: int) -> None:
         """Move the cursor by lines."""
@@ -124,7 +132,7 @@ class Inspector(ScrollView, can_focus=True):
             else:
                 drawn.append((line, line.value))
         self._drawn = drawn
-        self.virtual_size = Size(width, len(drawn))
+        set_virtual_size(self, Size(width, len(drawn)))
 
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
@@ -155,7 +163,9 @@ class Inspector(ScrollView, can_focus=True):
             label = fit(label, _LABEL_MAX) if cells(label) > _LABEL_MAX else label
             gap = " " * (cells(line.label) if again else 0)
             pieces = [
-                Piece("  " * line.depth + sign[2 if line.open is None else 0 :], self._style("label")),
+                Piece(
+                    "  " * line.depth + sign[2 if line.open is None else 0 :], self._style("label")
+                ),
                 Piece(f"{label or gap} " if label or gap else "", self._style("label")),
                 Piece(text, self._style(line.role.value)),
             ]
@@ -168,9 +178,16 @@ class Inspector(ScrollView, can_focus=True):
             return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
         return strip
 
-    def refresh_line_of(self, row: int) -> None:
-        """Draw one line again."""
-        self.refresh(Region(0, row - round(self.scroll_y), self.size.width, 1))
+    def _refresh_changes(self, before: list[tuple[Line, str]], cursor: int) -> None:
+        """Draw what changed: over a slow line every row counts."""
+        left = self.gutter.left
+        top = round(self.scroll_y)
+        for y in range(self.scrollable_content_region.height):
+            row = top + y
+            old = before[row] if row < len(before) else None
+            new = self._drawn[row] if row < len(self._drawn) else None
+            if old != new or (row in (cursor, self.cursor) and self.has_focus):
+                self.refresh(Region(left, y + self.gutter.top, self.size.width, 1))
 
 
 def _indent(line: Line) -> int:

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from rich.segment import Segment as Piece
 from rich.style import Style
 from textual import events
+from textual.binding import Binding, BindingType
+from textual.geometry import Region
 from textual.message import Message
 from textual.strip import Strip
 from textual.widget import Widget
@@ -21,10 +25,14 @@ _LABEL_MAX = 18
 class LanesView(Widget, can_focus=True):
     """Draws ``Lanes``. Left and right move by a column when it has the focus."""
 
-    COMPONENT_CLASSES = {
+    COMPONENT_CLASSES: ClassVar[set[str]] = {
         f"lanes--{name}"
         for name in ("axis", "label", "own", "bar", "cursor", "raised", "divergence", "empty")
     }
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("left,h", "move(-1)", "a column back", show=False),
+        Binding("right", "move(1)", "a column on", show=False),
+    ]
     DEFAULT_CSS = """
     LanesView { background: $surface; height: 6; }
     LanesView > .lanes--axis { color: $text-muted; }
@@ -49,7 +57,7 @@ class LanesView(Widget, can_focus=True):
     class Resized(Message):
         """There is another number of columns."""
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self.lanes: Lanes | None = None
         self.cursor: int = 0
@@ -69,13 +77,13 @@ class LanesView(Widget, can_focus=True):
         longest = max((cells(printable(label)) for label in labels), default=4)
         self._label_width = max(4, min(longest, _LABEL_MAX, width // 6))
 
-    def show(
-        self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None
-    ) -> None:
+    def show(self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None) -> None:
         """Show lanes with the cursor at a time (or index), in the lane named ``own``.
 
         ``divergence`` is the time (or index) where two runs part.
         """
+        before = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
+        axis = self._position
         self.lanes = lanes
         self._position = position
         self._own = own
@@ -83,7 +91,22 @@ class LanesView(Widget, can_focus=True):
         self._divergence = (
             None if divergence is None else lanes.window.column(divergence, lanes.columns)
         )
-        self.refresh()
+        now = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
+        width, last = self.size.width, self.size.height - 1
+        if now[0] is before[0] and now[2:] == before[2:] and now[1] in self._labels(lanes):
+            # Only the name of the lane one is in, and the time, can be different.
+            if now[1] != before[1]:
+                for name in {now[1], before[1]} & set(self._labels(lanes)):
+                    y = self._labels(lanes).index(name) - now[4]
+                    self.refresh(Region(0, y, width, 1))
+            if axis != position:
+                self.refresh(Region(0, last, width, 1))
+        else:
+            self.refresh()
+
+    @staticmethod
+    def _labels(lanes: Lanes) -> list[str]:
+        return [lane.label for lane in lanes.lanes]
 
     def notify_style_update(self) -> None:
         """Forget the styles of the old theme."""
@@ -105,6 +128,20 @@ class LanesView(Widget, can_focus=True):
         window = self.lanes.window
         position = window.at(column, self.lanes.columns)
         self.post_message(self.Picked(position, order=window.order, label=label))
+
+    def action_move(self, step: int) -> None:
+        """Go to the next (or previous) column with something in it."""
+        lanes = self.lanes
+        if lanes is None:
+            return
+        column = self.cursor + step
+        while 0 <= column < lanes.columns:
+            if any(_has(lane, column) for lane in lanes.lanes):
+                position = lanes.window.at(column, lanes.columns)
+                order = lanes.window.order
+                self.post_message(self.Picked(position, order=order, label=""))
+                return
+            column += step
 
     def _style(self, name: str) -> Style:
         style = self._styles.get(name)
@@ -137,7 +174,9 @@ class LanesView(Widget, can_focus=True):
     def _lane(self, lane: Lane, width: int) -> Strip:
         own = lane.label == self._own
         label = fit(printable(lane.label), self._label_width)
-        pieces = [Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))]
+        pieces = [
+            Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))
+        ]
         text = lane.letters or "".join(_BLOCKS[level] for level in lane.levels)
         bar = self._style("bar")
         for column, character in enumerate(text):
@@ -181,6 +220,10 @@ class LanesView(Widget, can_focus=True):
             _put(line, max(start, 0), text, gap=True)
         text = " " * (self._label_width + 2) + "".join(line)
         return Strip([Piece(fit(text, width), self._style("axis"))], width)
+
+
+def _has(lane: Lane, column: int) -> bool:
+    return lane.letters[column] != " " if lane.letters else lane.levels[column] > 0
 
 
 def _put(line: list[str], start: int, text: str, *, gap: bool = False) -> None:

@@ -62,7 +62,7 @@ class Prompt(Vertical):
             self.kind = kind
             self.text = text
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self._question: Question | None = None
 

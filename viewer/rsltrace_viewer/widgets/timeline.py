@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 from rich.segment import Segment as Piece
 from rich.style import Style
@@ -15,10 +16,11 @@ from textual.strip import Strip
 
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.timeline import Columns, EventText, Sign
-from rsltrace_viewer.widgets.styles import background_of
+from rsltrace_viewer.widgets.styles import background_of, set_virtual_size
 
 _MARGIN = 3
 """Rows kept in sight above and below the cursor."""
+_DRAWN_MAX = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +52,26 @@ _STYLED = {
 }
 
 
-class Timeline(ScrollView, can_focus=True):
+class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     """Rows that somebody else provides (``source``), a header, and a cursor."""
 
-    COMPONENT_CLASSES = {
+    COMPONENT_CLASSES: ClassVar[set[str]] = {
         f"timeline--{name}"
         for name in (
-            "header", "muted", "time", "node", "plain", "cursor", "related", "mark", "error",
-            "warning", "differs", "only-a", "only-b", "moved",
+            "header",
+            "muted",
+            "time",
+            "node",
+            "plain",
+            "cursor",
+            "related",
+            "mark",
+            "error",
+            "warning",
+            "differs",
+            "only-a",
+            "only-b",
+            "moved",
         )
     }
     DEFAULT_CSS = """
@@ -89,7 +103,7 @@ class Timeline(ScrollView, can_focus=True):
     class Resized(Message):
         """There is another number of cells to lay columns out in."""
 
-    def __init__(self, *, id: str) -> None:  # noqa: A002  # Textual's name for it
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self.cursor = 0
         self.empty = "no events"
@@ -97,6 +111,8 @@ class Timeline(ScrollView, can_focus=True):
         self._count = 0
         self._columns = Columns(0)
         self._styles: dict[str, Style] = {}
+        self._drawn: dict[int, tuple[Row, bool]] = {}
+        """What each row looked like when it was drawn last."""
 
     @property
     def page(self) -> int:
@@ -114,7 +130,7 @@ class Timeline(ScrollView, can_focus=True):
         self._columns = columns
         if count != self._count:
             self._count = count
-            self.virtual_size = Size(max(self.row_width, 1), count + 1)
+            set_virtual_size(self, Size(max(self.row_width, 1), count + 1))
         self.cursor = max(min(self.cursor, count - 1), 0)
         self.refresh()
 
@@ -148,8 +164,15 @@ class Timeline(ScrollView, can_focus=True):
         self.refresh()
 
     def redraw(self) -> None:
-        """Draw all rows again."""
-        self.refresh()
+        """Draw the rows again whose look has changed."""
+        top = round(self.scroll_y)
+        for y in range(1, self.size.height):
+            row = top + y - 1
+            if row < self._count and self._drawn.get(row) != self._look(row):
+                self._refresh_row(row)
+
+    def _look(self, row: int) -> tuple[Row, bool] | None:
+        return (self._source(row), row == self.cursor) if self._source is not None else None
 
     def notify_style_update(self) -> None:
         """Forget the styles of the old theme."""
@@ -158,7 +181,7 @@ class Timeline(ScrollView, can_focus=True):
 
     def on_resize(self, event: events.Resize) -> None:
         """Lay out again."""
-        self.virtual_size = Size(max(self.row_width, 1), self._count + 1)
+        set_virtual_size(self, Size(max(self.row_width, 1), self._count + 1))
         self.post_message(self.Resized())
 
     def on_click(self, event: events.Click) -> None:
@@ -190,7 +213,11 @@ class Timeline(ScrollView, can_focus=True):
         if self._source is None or not 0 <= row < self._count:
             text = f"  {self.empty}" if y == 2 and not self._count else ""
             return Strip([Piece(fit(text, width), self._style("muted"))], width)
-        return self._row(row, self._source(row), width)
+        shown = self._source(row)
+        if len(self._drawn) > _DRAWN_MAX:
+            self._drawn.clear()
+        self._drawn[row] = shown, row == self.cursor
+        return self._row(row, shown, width)
 
     def _row(self, row: int, shown: Row, width: int) -> Strip:
         selected = row == self.cursor

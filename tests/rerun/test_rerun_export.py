@@ -1,0 +1,325 @@
+"""A recording, loaded back: what is in it, on which timelines, how often, and with what values."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rerun_gallery as gallery
+import trace_maker
+
+from rsltrace.errors import OutputError, TraceError
+from rsltrace.model.event import NO_EVENT, OutputKind
+
+pytest.importorskip("rerun")
+
+from rerun.chunk import RrdReader
+from rsltrace_viewer.rerun_export.export import export
+
+STEPS = 30
+
+
+class Recording:
+    """A recording as one list of rows (dicts) per entity; static rows apart."""
+
+    def __init__(self, path: Path) -> None:
+        self.rows: dict[str, list[dict[str, Any]]] = {}
+        self.static: dict[str, dict[str, Any]] = {}
+        self.timelines: set[str] = set()
+        reader = RrdReader(str(path))
+        self.blueprints = reader.blueprints()
+        self.recordings = reader.recordings()
+        self.views = set()
+        for chunk in reader.stream():
+            place = str(chunk.entity_path)
+            rows = chunk.to_record_batch().to_pylist()
+            self.timelines |= set(chunk.timeline_names)
+            if chunk.is_static:
+                for row in rows:
+                    self.static.setdefault(place, {}).update(row)
+            else:
+                self.rows.setdefault(place, []).extend(rows)
+        for store in self.blueprints:
+            for chunk in reader.stream(store=store):
+                for row in chunk.to_record_batch().to_pylist():
+                    self.views.update(row.get("ViewBlueprint:class_identifier") or [])
+
+    def values(self, place: str, component: str) -> list[Any]:
+        """Return a component of an entity, row by row, in the order of events."""
+        rows = [r for r in self.rows[place] if r.get(component) is not None]
+        rows.sort(key=lambda row: (row.get("event") or 0, row["rerun.controls.RowId"]))
+        return [row[component] for row in rows]
+
+    def events(self, place: str, component: str) -> list[int]:
+        """Return the events at which a component of an entity was set, in order."""
+        return sorted(r["event"] for r in self.rows[place] if r.get(component) is not None)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[trace_maker.Feeder, Recording]:
+    folder = tmp_path_factory.mktemp("gallery")
+    feeder = gallery.write_gallery(folder / "run.mcap", STEPS)
+    done = export([folder / "run.mcap"], folder / "run.rrd")
+    assert done.events == len(feeder.events)
+    assert done.bytes == (folder / "run.rrd").stat().st_size
+    return feeder, Recording(folder / "run.rrd")
+
+
+@pytest.fixture(scope="module")
+def recording(written: tuple[trace_maker.Feeder, Recording]) -> Recording:
+    return written[1]
+
+
+def sent_at() -> list[int]:
+    """The events that publish: every other one, after the construction."""
+    return [gallery.FIRST_EVENT + 2 * step for step in range(STEPS)]
+
+
+def test_there_are_two_timelines_and_no_wall_clock(recording: Recording) -> None:
+    assert recording.timelines == {"sim_time", "event"}
+    assert "RecordingInfo:start_time" not in recording.static.get("/__properties", {})
+
+
+def test_every_event_is_in_the_table(written: tuple[trace_maker.Feeder, Recording]) -> None:
+    feeder, recording = written
+    rows = sorted(recording.rows["/events"], key=lambda row: row["event"])
+    assert [row["event"] for row in rows] == list(range(len(feeder.events)))
+    for row, event in zip(rows, feeder.events, strict=True):
+        assert row["input_hash"] == [f"{event.input_hash:016x}"]
+        assert row["output_hash"] == [f"{event.output_hash:016x}"]
+        assert row["kind"] == [event.kind.label]
+        cause = row["cause"][0] if row["cause"] else None
+        assert cause == (None if event.cause_event == NO_EVENT else event.cause_event)
+        assert row["sim_time"].total_seconds() * 1e9 == pytest.approx(event.stamp_ns)
+    assert rows[1]["node"] == ["/robot"]
+    assert rows[1]["callback"] == ["Robot.on_timer"]
+    assert rows[1]["outputs"][0].startswith("/tf, /odom, /scan, ")
+    assert rows[2]["outputs"] == [""]
+    assert rows[-1]["flags"] == ["raised"]
+
+
+def test_every_entity_has_its_events(recording: Recording) -> None:
+    timer = recording.events("/nodes/robot/timer/Robot.on_timer", "TextLog:text")
+    assert timer == [*sent_at(), 2 * STEPS + 1]
+    assert recording.values("/nodes/robot/timer/Robot.on_timer", "TextLog:level")[-1] == ["ERROR"]
+    subscription = recording.events("/nodes/watcher/subscription/odom", "TextLog:text")
+    assert subscription == [event + 1 for event in sent_at()]
+
+
+def test_a_lane_is_filled_where_its_node_runs(recording: Recording) -> None:
+    rows = [row for row in recording.rows["/nodes/robot"] if row.get("event") is not None]
+    filled = [row["event"] for row in rows if row["StateChange:state"] == ["Robot.on_timer"]]
+    ended = [row["event"] for row in rows if row["StateChange:state"] == [""]]
+    assert sorted(filled) == [*sent_at(), 2 * STEPS + 1]
+    assert sorted(ended) == [event + 1 for event in sorted(filled)]
+    by_time = [row for row in recording.rows["/nodes/robot"] if row.get("sim_time") is not None]
+    assert len(by_time) == STEPS + 1
+
+
+def test_logs_have_their_levels_and_exceptions_their_traceback(recording: Recording) -> None:
+    texts = [text for (text,) in recording.values("/nodes/robot/log", "TextLog:text")]
+    assert texts[:2] == ["[robot] step 0", "[robot] step 1"]
+    assert "ValueError: too far" in texts[-1]
+    levels = [level for (level,) in recording.values("/nodes/robot/log", "TextLog:level")]
+    assert levels[:5] == ["DEBUG", "INFO", "WARN", "ERROR", "CRITICAL"]
+    assert levels[-1] == "CRITICAL"
+    assert recording.events("/nodes/robot/log", "TextLog:text")[:-1] == sent_at()
+
+
+def test_rates_are_those_of_the_run(recording: Recording) -> None:
+    (name,) = recording.static["/nodes/robot/rate"]["SeriesLines:names"]
+    assert name == "/robot [1/s]"
+    rates = [rate for (rate,) in recording.values("/nodes/robot/rate", "Scalars:scalars")]
+    assert max(rates) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("place", "component"),
+    [
+        ("topics/tf", "Transform3D:translation"),
+        ("topics/odom", "nav_msgs.msg.Odometry:message"),
+        ("topics/odom/pose", "Arrows3D:vectors"),
+        ("topics/odom/pose.pose.position", "Scalars:scalars"),
+        ("topics/scan/points", "Points3D:positions"),
+        ("topics/cloud", "Points3D:positions"),
+        ("topics/camera/image", "Image:buffer"),
+        ("topics/plan/path", "LineStrips3D:strips"),
+        ("topics/particles/poses", "Arrows3D:origins"),
+        ("topics/goal/pose", "Arrows3D:origins"),
+        ("topics/goal", "InstancePoses3D:translations"),
+        ("topics/cmd_vel/linear", "Scalars:scalars"),
+        ("topics/imu", "Scalars:scalars"),
+        ("topics/fix", "GeoPoints:positions"),
+        ("topics/fix/altitude", "Scalars:scalars"),
+        ("topics/joints/position", "Scalars:scalars"),
+        ("topics/map", "GridMap:data"),
+        ("topics/voltage", "Scalars:scalars"),
+        ("topics/wheels/data", "Scalars:scalars"),
+        ("topics/status", "TextDocument:text"),
+        ("topics/markers/lines/0", "LineStrips3D:strips"),
+        ("topics/marker/lines/0", "LineStrips3D:strips"),
+    ],
+)
+def test_each_message_is_at_the_event_that_sent_it(
+    recording: Recording, place: str, component: str
+) -> None:
+    assert recording.events(f"/{place}", component) == sent_at()
+
+
+def test_what_is_drawn_is_where_it_was(recording: Recording) -> None:
+    for step, ((origin,), scan) in enumerate(
+        zip(
+            recording.values("/topics/odom/pose", "Arrows3D:origins"),
+            recording.values("/topics/scan/points", "Points3D:positions"),
+            strict=True,
+        )
+    ):
+        message = gallery.messages(step, 0)["/odom"][1]
+        position = message.pose.pose.position
+        assert origin == pytest.approx([position.x, position.y, position.z], abs=1e-6)
+        assert len(scan) == 3, "rays without a hit (infinite, NaN) are no points"
+        assert scan[1] == pytest.approx([2 * 0.8775826, 2 * -0.4794255, 0], abs=1e-5)
+    assert recording.values("/topics/voltage", "Scalars:scalars")[3] == [pytest.approx(11.97)]
+    assert recording.static["/topics/voltage"]["SeriesLines:names"] == ["data"]
+    track = recording.static["/topics/odom/track"]["LineStrips3D:strips"]
+    assert len(track[0]) == STEPS
+
+
+def test_markers_go_when_they_are_deleted(recording: Recording) -> None:
+    deleted = [event for step, event in enumerate(sent_at()) if step % 7]
+    boxes = [f"/topics/markers/boxes/{number}" for number in range(3)]
+    cleared = [e for box in boxes for e in recording.events(box, "Clear:is_recursive")]
+    assert sorted(cleared) == deleted
+    drawn = [e for box in boxes for e in recording.events(box, "Boxes3D:half_sizes")]
+    assert sorted(drawn) == [event for step, event in enumerate(sent_at()) if not step % 7]
+
+
+def test_the_layout_is_in_the_file(recording: Recording) -> None:
+    assert len(recording.recordings) == 1
+    assert len(recording.blueprints) == 1
+    assert recording.views >= {
+        *("3D", "2D", "TimeSeries", "StateTimeline", "TextLog", "Dataframe", "Map")
+    }
+
+
+def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "a.mcap", STEPS)
+    gallery.write_gallery(tmp_path / "b.mcap", STEPS, differs_from=20)
+    export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
+    both = Recording(tmp_path / "ab.rrd")
+    assert both.events("/run_a/topics/map", "GridMap:data") == sent_at()
+    assert both.events("/run_b/topics/map", "GridMap:data") == sent_at()
+    assert both.values("/run_b/topics/map", "CoordinateFrame:frame")[0] == ["b/odom"]
+    assert both.static["/frames/odom/b"]["Transform3D:child_frame"] == ["b/odom"]
+    assert both.static["/frames/odom/b"]["Transform3D:parent_frame"] == ["odom"]
+    assert both.static["/run_b/topics/voltage"]["SeriesLines:names"] == ["b data"]
+
+    parted = sent_at()[20]
+    agreement = sorted(
+        (row["event"], *row["StateChange:state"]) for row in both.rows["/divergence/agreement"]
+    )
+    assert agreement == [(0, "the runs agree"), (parted, "the runs differ")]
+    (text,) = both.static["/divergence"]["TextDocument:text"]
+    assert f"The first **{parted}** events are the same." in text
+    assert "pose.pose.position.x" in text
+    a, b = (gallery.messages(20, 0, shift)["/odom"][1] for shift in (0.0, 0.5))
+    assert str(a.pose.pose.position.x)[:8] in text
+    assert str(b.pose.pose.position.x)[:8] in text
+    chain = [row["StateChange:state"][0] for row in both.rows["/divergence/chain"]]
+    assert any(f"#{parted} " in step for step in chain)
+
+
+def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        gallery.write_gallery(tmp_path / f"{name}.mcap", 3)
+    export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
+    both = Recording(tmp_path / "ab.rrd")
+    (text,) = both.static["/divergence"]["TextDocument:text"]
+    assert text.startswith("# Identical")
+    assert [r["StateChange:state"] for r in both.rows["/divergence/agreement"]] == [
+        ["the runs agree"]
+    ]
+
+
+def test_an_interrupted_run_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "run.mcap", 5000)
+    data = (tmp_path / "run.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    done = export([tmp_path / "cut.mcap"], tmp_path / "cut.rrd")
+    cut = Recording(tmp_path / "cut.rrd")
+    assert 4096 <= done.events < 10_000
+    assert len(cut.rows["/events"]) == done.events
+    assert len(cut.events("/topics/voltage", "Scalars:scalars")) >= (done.events - 1) // 2
+
+
+def test_a_run_without_events_can_be_shown(tmp_path: Path) -> None:
+    with trace_maker.Opened(tmp_path / "run.mcap") as feeder:
+        feeder.writer.close(result={"stop_reason": "duration", "exit_code": "0"})
+    assert export([tmp_path / "run.mcap"], tmp_path / "run.rrd").events == 0
+    assert Recording(tmp_path / "run.rrd").blueprints
+
+
+def test_a_service_call_is_below_services(tmp_path: Path) -> None:
+    feeder = trace_maker.write_run(tmp_path / "run.mcap", 40)
+    export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
+    recording = Recording(tmp_path / "run.rrd")
+    calls = [
+        event
+        for event, outputs in enumerate(feeder.outputs)
+        if any(output.kind is OutputKind.REQUEST for output in outputs)
+    ]
+    requests = recording.rows["/services/check/request"]
+    assert sorted(row["event"] for row in requests) == calls
+    replies = recording.rows["/services/check/response"]
+    assert sorted(row["event"] for row in replies) == [event + 1 for event in calls]
+
+
+def fails_as_folder(folder: Path) -> None:
+    export([folder / "run.mcap"], folder)
+
+
+def fails_as_trace(folder: Path) -> None:
+    export([folder / "run.mcap"], folder / "run.mcap", force=True)
+
+
+def fails_as_existing(folder: Path) -> None:
+    (folder / "run.rrd").write_bytes(b"precious")
+    export([folder / "run.mcap"], folder / "run.rrd")
+
+
+def fails_without_folder(folder: Path) -> None:
+    export([folder / "run.mcap"], folder / "nowhere" / "run.rrd")
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (fails_as_folder, "is a folder"),
+        (fails_as_trace, "is the trace itself"),
+        (fails_as_existing, "use --force"),
+        (fails_without_folder, "does not exist"),
+    ],
+)
+def test_output_that_cannot_be_is_refused(
+    tmp_path: Path, action: Callable[[Path], None], message: str
+) -> None:
+    trace_maker.write_run(tmp_path / "run.mcap", 10)
+    before = (tmp_path / "run.mcap").read_bytes()
+    with pytest.raises(OutputError, match=message):
+        action(tmp_path)
+    assert (tmp_path / "run.mcap").read_bytes() == before
+    if (tmp_path / "run.rrd").exists():
+        assert (tmp_path / "run.rrd").read_bytes() == b"precious"
+
+
+def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "run.mcap", 3000)
+    data = bytearray((tmp_path / "run.mcap").read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 64] = os.urandom(64)
+    (tmp_path / "run.mcap").write_bytes(data)
+    with pytest.raises(TraceError, match="run.mcap"):
+        export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
+    assert not (tmp_path / "run.rrd").exists()

@@ -1,0 +1,51 @@
+"""What a person sees: the viewer draws the recordings, and no view has anything to complain of."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from pathlib import Path
+
+import pytest
+import rerun_gallery as gallery
+
+pytest.importorskip("rerun")
+
+from rsltrace_viewer.rerun_export import picture
+from rsltrace_viewer.rerun_export.export import export
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        picture.software_driver() is None,
+        reason="needs a Vulkan driver (Debian: mesa-vulkan-drivers)",
+    ),
+]
+
+
+def colours(png: Path) -> int:
+    """Return how many different bytes and filters an 8-bit PNG has: a blank one has few."""
+    data = png.read_bytes()
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    packed, offset = b"", 8
+    while offset < len(data):
+        (length,) = struct.unpack_from(">I", data, offset)
+        if data[offset + 4 : offset + 8] == b"IDAT":
+            packed += data[offset + 8 : offset + 8 + length]
+        offset += length + 12
+    return len(set(zlib.decompress(packed)))
+
+
+def test_one_run(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "run.mcap", 40)
+    export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
+    assert picture.take(tmp_path / "run.rrd", tmp_path / "run.png", "sim_time", 7.5) == []
+    assert colours(tmp_path / "run.png") > 50
+
+
+def test_two_runs(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "a.mcap", 40)
+    gallery.write_gallery(tmp_path / "b.mcap", 40, differs_from=20)
+    export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
+    assert picture.take(tmp_path / "ab.rrd", tmp_path / "ab.png", "event", 60) == []
+    assert colours(tmp_path / "ab.png") > 50

@@ -1,0 +1,198 @@
+"""What a team's tests get: running jobs, golden traces, the pytest plugin."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsltrace.errors import TraceError
+from rsltrace.testing import GoldenMismatch, assert_matches_golden
+
+SAMPLE = Path(__file__).parent.parent.parent / "sample_traces" / "nondeterministic_callback"
+A, B = SAMPLE / "a.mcap", SAMPLE / "b.mcap"
+
+NODES = """
+import os
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+class Counter(Node):
+    def __init__(self):
+        super().__init__('counter')
+        self.publisher = self.create_publisher(UInt64, 'count', 10)
+        self.count = 0
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.count += 1
+        step = int(os.environ.get('STEP', '1')) if self.count > 5 else 1
+        self.publisher.publish(UInt64(data=self.count * step))
+"""
+JOB = """
+nodes:
+  - node: counting:Counter
+stop: {duration: 1s}
+"""
+
+
+def test_a_trace_matches_itself() -> None:
+    assert not assert_matches_golden(A, A)
+    assert not assert_matches_golden(str(A), str(A))
+
+
+def test_the_report_is_the_message(tmp_path: Path) -> None:
+    golden = tmp_path / "golden.mcap"
+    shutil.copy(A, golden)
+    with pytest.raises(GoldenMismatch) as caught:
+        assert_matches_golden(B, golden)
+    text = str(caught.value)
+    assert text.startswith("Subscription /scan of /obstacle_filter at 2.1 s got the same input")
+    assert "-0.19956212899502734" in text
+    assert text.endswith("pytest --rsltrace-update accepts what it does now")
+    assert isinstance(caught.value, AssertionError)
+
+
+def test_update_writes_only_what_is_another_run(tmp_path: Path) -> None:
+    golden = tmp_path / "new" / "golden.mcap"
+    with pytest.raises(TraceError, match="there is no golden trace"):
+        assert_matches_golden(A, golden)
+    assert assert_matches_golden(A, golden, update=True)
+    assert golden.read_bytes() == A.read_bytes()
+    before = golden.stat().st_mtime_ns
+    assert not assert_matches_golden(A, golden, update=True)
+    assert golden.stat().st_mtime_ns == before
+    assert assert_matches_golden(B, golden, update=True)
+    golden.write_bytes(b"rubbish")
+    assert assert_matches_golden(A, golden, update=True)
+    assert [path.name for path in golden.parent.iterdir()] == ["golden.mcap"]
+
+
+def test_a_run_that_was_not_recorded_cannot_be_compared() -> None:
+    pytest.importorskip("rclpy")
+    from rsltrace.run import RunResult
+
+    result = RunResult(None, "0" * 16, 0, 0, 0, "", 0)
+    with pytest.raises(TraceError, match="was not recorded"):
+        assert_matches_golden(result, A)
+
+
+def test_loading_the_plugin_loads_nothing_heavy() -> None:
+    heavy = ("rclpy", "numpy", "pydantic", "ruamel", "rosbags", "mcap", "rich", "click")
+    probe = (
+        "import rsltrace.testing.plugin, rsltrace.testing, sys\n"
+        f"print(*[m for m in {heavy!r} if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", probe], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def team(tmp_path: Path) -> Run:
+    """A team's repository with a robot and a test, and a way to run its pytest."""
+    (tmp_path / "counting.py").write_text(NODES)
+    (tmp_path / "job.yaml").write_text(JOB)
+
+    def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+        plugin = [] if _is_registered() else ["-p", "rsltrace.testing.plugin"]
+        return subprocess.run(
+            [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],
+            cwd=tmp_path,
+            env={**os.environ, **environment, "PYTEST_ADDOPTS": ""},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=120,
+        )
+
+    return run
+
+
+def _is_registered() -> bool:
+    """Whether this environment's rsltrace was installed with the plugin's entry point."""
+    from importlib.metadata import entry_points
+
+    return any(entry.value == "rsltrace.testing.plugin" for entry in entry_points(group="pytest11"))
+
+
+@pytest.mark.ros
+def test_the_fixture_makes_compares_and_updates_golden_traces(team: Run, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "test_robot.py").write_text(
+        "def test_counts(rsltrace_golden):\n"
+        "    result = rsltrace_golden('job.yaml')\n"
+        "    assert result.events > 10\n"
+    )
+    golden = tmp_path / "golden" / "test_counts.mcap"
+
+    missing = team()
+    assert missing.returncode == 1
+    assert "there is no golden trace" in missing.stdout
+    assert "--rsltrace-update" in missing.stdout
+    assert not golden.exists()
+
+    made = team("--rsltrace-update")
+    assert made.returncode == 0, made.stdout
+    assert "golden traces written by --rsltrace-update" in made.stdout
+    assert made.stdout.count(str(golden)) == 1
+
+    same = team()
+    assert same.returncode == 0, same.stdout
+    again = team("--rsltrace-update")
+    assert again.returncode == 0
+    assert "golden traces written" not in again.stdout
+
+    changed = team(STEP="2")
+    assert changed.returncode == 1
+    assert "same-input-different-output" in changed.stdout
+    assert "6  |  12" in changed.stdout
+    assert "in _report" not in changed.stdout
+
+    assert team("--rsltrace-update", STEP="2").returncode == 0
+    assert team(STEP="2").returncode == 0
+    assert team().returncode == 1
+
+
+@pytest.mark.ros
+def test_jobs_and_results_in_one_test(team: Run, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "test_more.py").write_text(
+        "from rsltrace.testing import run_job\n"
+        "def test_all(rsltrace_golden, tmp_path):\n"
+        "    result = run_job('job.yaml', tmp_path, name='mine.mcap')\n"
+        "    assert result.path.name == 'mine.mcap'\n"
+        "    assert rsltrace_golden(result, 'g/one.mcap') is None\n"
+        "    again = rsltrace_golden('job.yaml', 'g/one.mcap')\n"
+        "    assert again.digest == result.digest\n"
+        "    rsltrace_golden(again)\n"
+    )
+    made = team("--rsltrace-update")
+    assert made.returncode == 0, made.stdout
+    assert sorted(path.name for path in (tmp_path / "g").iterdir()) == ["one.mcap"]
+    assert (tmp_path / "golden" / "test_all_3.mcap").exists()
+    assert team().returncode == 0
+
+
+@pytest.mark.ros
+def test_assert_matches_golden_runs_a_job(team: Run, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "test_job.py").write_text(
+        "import pytest\n"
+        "from rsltrace.errors import JobError\n"
+        "from rsltrace.testing import assert_matches_golden\n"
+        "def test_job():\n"
+        "    assert assert_matches_golden('job.yaml', 'golden.mcap', update=True)\n"
+        "    assert not assert_matches_golden('job.yaml', 'golden.mcap')\n"
+        "    with pytest.raises(JobError):\n"
+        "        assert_matches_golden('nothing.yaml', 'golden.mcap')\n"
+    )
+    done = team()
+    assert done.returncode == 0, done.stdout
