@@ -3,10 +3,10 @@
     python benchmarks/diff.py            1e4, 1e5 and 1e6 events, about two minutes
     python benchmarks/diff.py --large    1e7 events, too (3.5 GB of files, some minutes more)
 
-Each size is compared with runs that part from it at 10, 50 and 99 %, and with itself. "diff" is what a user
-waits for: a new process, from start to exit. "linear" is the mcap package's reader going through
-the events of both files until they differ, without the start of a process. Both read files that
-are in the page cache. Traces are kept in the temporary folder, for the next time.
+Each run is compared with itself and with runs that part from it at 10, 50 and 99 %. "diff" is
+what a user waits for: a new process, from start to exit. "linear" is the mcap package's reader
+going through the events of both files until they differ, without the start of a process. Both
+read files that are in the page cache. Traces are kept in the temporary folder for the next time.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import zip_longest
 from pathlib import Path
 
@@ -88,20 +88,19 @@ def write_trace(path: Path, count: int, parts_at: int | None, *, payloads: bool)
         for node in range(NODES):
             first = 1 + node * _ENTITIES_PER_NODE
             name, topic = f"/node{node}", f"/topic{node}"
-            last = f"/topic{(node - 1) % NODES}"
+            last, type_ = f"/topic{(node - 1) % NODES}", "std_msgs/msg/UInt64"
             for entity in (
                 Entity(first, first, EntityKind.NODE, name, "bench:Node", 0, {}),
                 Entity(first + 1, first, EntityKind.TIMER, "tick", "", 0, {}),
-                Entity(first + 2, first, EntityKind.SUBSCRIPTION, last, "std_msgs/msg/UInt64", 0, {}),
-                Entity(first + 3, first, EntityKind.PUBLISHER, topic, "std_msgs/msg/UInt64", 0, {}),
+                Entity(first + 2, first, EntityKind.SUBSCRIPTION, last, type_, 0, {}),
+                Entity(first + 3, first, EntityKind.PUBLISHER, topic, type_, 0, {}),
             ):
                 writer.add_entity(entity)
             if payloads:
-                channels.append(writer.add_channel(topic, "std_msgs/msg/UInt64", "uint64 data\n"))
+                channels.append(writer.add_channel(topic, type_, "uint64 data\n"))
         sequences = np.zeros(NODES, dtype=np.int64)
         values = _values(count, parts_at)
-        chain = 0
-        last_value = 0
+        chain = last_value = 0
         for first in range(0, count, _SEGMENT):
             size = min(_SEGMENT, count - first)
             chain, last_value = _write_segment(
@@ -189,31 +188,20 @@ def traces(count: int) -> list[tuple[str, Path, Path]]:
     return [(name, paths["same"], path) for name, path in paths.items()]
 
 
-def time_diff(a: Path, b: Path) -> float:
-    """Return the seconds of ``rsltrace diff`` as a process: the best of some."""
+def run_diff(a: Path, b: Path) -> tuple[float, float]:
+    """Return the seconds of ``rsltrace diff`` as a process (the best of some), its peak in MB."""
     command = [sys.executable, "-m", "rsltrace", "diff", str(a), str(b)]
-
-    def run() -> None:
-        done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
-        if done.returncode not in (0, 1):
+    best, peak = float("inf"), 0.0
+    for _ in range(5):
+        start = time.perf_counter()
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+        _, status, usage = os.wait4(process.pid, 0)
+        best = min(best, time.perf_counter() - start)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        peak = max(peak, usage.ru_maxrss / 1024)
+        if process.returncode not in (0, 1):
             raise SystemExit(f"{' '.join(command)} failed")
-
-    return best_of(run, 5)
-
-
-def peak_mb(a: Path, b: Path) -> float:
-    """Return the most memory that ``rsltrace diff`` takes, in MB."""
-    code = (
-        "import resource, sys\n"
-        "from rsltrace.cli.main import cli\n"
-        f"cli.main(['diff', {str(a)!r}, {str(b)!r}], standalone_mode=False)\n"
-    )
-    probe = code + "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
-    wrapped = f"import sys\ntry:\n    exec({code!r})\nexcept SystemExit:\n    pass\n"
-    wrapped += "import resource\nprint(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, file=sys.stderr)"
-    del probe
-    done = subprocess.run([sys.executable, "-c", wrapped], capture_output=True, text=True, check=True)
-    return int(done.stderr.split()[-1]) / 1024
+    return best, peak
 
 
 def read_linearly(a: Path, b: Path) -> int:
@@ -229,23 +217,12 @@ def read_linearly(a: Path, b: Path) -> int:
     return -1
 
 
-def best_of(function: Callable[[], object], repeat: int) -> float:
-    """Return the shortest of some runs, in seconds: the least disturbed by others."""
-    times = []
-    for _ in range(repeat):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
     parser.add_argument("--large", action="store_true", help=f"{LARGE} events, too")
     arguments = parser.parse_args()
-    print(f"{'events':>9}  {'part at':>7}  {'diff s':>7}  {'peak MB':>7}  {'read kB':>8}  "
-          f"{'of kB':>8}  {'linear s':>8}  {'ratio':>6}")
+    print("   events  part at   diff s  peak MB   read kB     of kB  linear s   ratio")
     linear_at: dict[str, float] = {}
     for count in (*SIZES, *((LARGE,) if arguments.large else ())):
         for name, a, b in traces(count):
@@ -256,14 +233,16 @@ def main() -> None:
             assert found.agreeing == parts_at, (found.agreeing, parts_at)
             scaled = ""
             if count <= LINEAR_MAX:
-                linear = best_of(lambda a=a, b=b: read_linearly(a, b), 1)
-                linear_at[name] = linear
+                start = time.perf_counter()
+                read_linearly(a, b)
+                linear = linear_at[name] = time.perf_counter() - start
             else:
                 linear, scaled = linear_at[name] * count / LINEAR_MAX, "~"
-            taken = time_diff(a, b)
+            taken, peak = run_diff(a, b)
+            by_hand = scaled + format(linear, ".2f")
             print(
-                f"{count:>9}  {name:>7}  {taken:>7.3f}  {peak_mb(a, b):>7.0f}  "
-                f"{found.bytes_read / 1e3:>8.0f}  {whole / 1e3:>8.0f}  {scaled}{linear:>8.2f}  "
+                f"{count:>9}  {name:>7}  {taken:>7.3f}  {peak:>7.0f}  "
+                f"{found.bytes_read / 1e3:>8.0f}  {whole / 1e3:>8.0f}  {by_hand:>8}  "
                 f"{linear / taken:>6.0f}",
                 flush=True,
             )

@@ -13,6 +13,7 @@ from array import array
 from dataclasses import dataclass, field
 
 import numpy as np
+import numpy.typing as npt
 import xxhash
 
 from rsltrace.diff.bag_messages import Fetched, TopicPair, compare_topic
@@ -29,7 +30,7 @@ from rsltrace.diff.bag_source import Source, SourceTopic, open_source
 from rsltrace.diff.content import ContentKeys
 from rsltrace.diff.globs import FieldRules
 from rsltrace.diff.options import BY_STAMP, DiffOptions
-from rsltrace.diff.sequences import Keys, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
 from rsltrace.errors import TraceError
 from rsltrace.model.stamp import format_seconds
 
@@ -72,18 +73,18 @@ class _Comparison:
         starts = (recording_a.start_ns, recording_b.start_ns)
         if self._options.by == BY_STAMP:
             starts = (min(starts), min(starts))
-        keys_a = {i: np.array(scans_a[i].hashes, dtype=np.uint64) for i, _ in self._pairs}
-        keys_b = {j: np.array(scans_b[j].hashes, dtype=np.uint64) for _, j in self._pairs}
-        self._make_canonical(keys_a, keys_b)
         pairs = []
         for i, j in self._pairs:
+            keys = (_keys(scans_a[i]), _keys(scans_b[j]))
             stamps = (_times(scans_a[i]), _times(scans_b[j]))
-            if self._options.by == BY_STAMP:
-                gaps = gaps_by_stamp(keys_a[i], keys_b[j], *stamps)
-            else:
-                gaps = gaps_by_order(keys_a[i], keys_b[j])
-            topic_a, topic_b = self._a.topics[i], self._b.topics[j]
-            pairs.append(TopicPair(i, j, topic_a, topic_b, keys_a[i], keys_b[j], *stamps, gaps))
+            gaps = self._gaps(keys, stamps)
+            pairs.append(
+                TopicPair(i, j, self._a.topics[i], self._b.topics[j], *keys, *stamps, gaps)
+            )
+        self._make_canonical(pairs)
+        for pair in pairs:
+            keys = (pair.keys_a, pair.keys_b)
+            pair.gaps[:] = self._gaps(keys, (pair.stamps_a, pair.stamps_b), list(pair.gaps))
         topics = tuple(self._compare(pairs, starts))
         lone_a = tuple(_lone(self._a.topics[i], scans_a[i]) for i in self._lone_a)
         lone_b = tuple(_lone(self._b.topics[j], scans_b[j]) for j in self._lone_b)
@@ -100,27 +101,43 @@ class _Comparison:
             scan.stamps.append(stamp_ns)
         return scans
 
-    def _make_canonical(self, keys_a: dict[int, Keys], keys_b: dict[int, Keys]) -> None:
-        """Replace the keys of topics whose bytes differ by keys of what their messages say."""
-        parted = [(i, j) for i, j in self._pairs if not np.array_equal(keys_a[i], keys_b[j])]
-        for source, keys, side in ((self._a, keys_a, 0), (self._b, keys_b, 1)):
-            wanted = {pair[side] for pair in parted}
+    def _gaps(
+        self, keys: tuple[Keys, Keys], stamps: tuple[Keys, Keys], within: list[Gap] | None = None
+    ) -> list[Gap]:
+        if self._options.by == BY_STAMP:
+            return gaps_by_stamp(*keys, *stamps)
+        return gaps_by_order(*keys, within)
+
+    def _make_canonical(self, pairs: list[TopicPair]) -> None:
+        """Where bytes differ, replace the keys by keys of what the messages say."""
+        for side, source in ((0, self._a), (1, self._b)):
+            wanted: dict[int, tuple[Keys, npt.NDArray[np.bool_], ContentKeys]] = {}
+            for pair in pairs:
+                number, keys, name = (
+                    (pair.number_a, pair.keys_a, pair.a.name)
+                    if side == 0
+                    else (pair.number_b, pair.keys_b, pair.b.name)
+                )
+                in_gap = np.zeros(len(keys), dtype=bool)
+                for gap in pair.gaps:
+                    start, end = gap[:2] if side == 0 else gap[2:]
+                    in_gap[start:end] = True
+                if in_gap.any():
+                    rules = FieldRules(self._options.for_topic(name))
+                    wanted[number] = (keys, in_gap, ContentKeys(rules))
             if not wanted:
                 continue
-            makers = {
-                number: ContentKeys(FieldRules(self._options.for_topic(source.topics[number].name)))
-                for number in wanted
-            }
             seen = dict.fromkeys(wanted, 0)
-            for _, number, data in source.read(wanted):
+            for _, number, data in source.read(set(wanted)):
                 place = seen[number]
                 seen[number] = place + 1
+                keys, in_gap, maker = wanted[number]
+                if not in_gap[place]:
+                    continue
                 try:
-                    key = makers[number].key(source.decode(number, data))
+                    keys[place] = maker.key(source.decode(number, data))
                 except TraceError as error:
                     self._note(f"{error}; compared byte by byte, padding included")
-                    continue
-                keys[number][place] = key
 
     def _compare(self, pairs: list[TopicPair], starts: tuple[int, int]) -> list[TopicDiff]:
         fetched = Fetched(self._a, self._b, pairs, self._options)
@@ -192,6 +209,10 @@ def _paired(
                     in_b.remove(j)
                     break
     return sorted(pairs), in_a, in_b
+
+
+def _keys(scan: _Scan) -> Keys:
+    return np.array(scan.hashes, dtype=np.uint64)
 
 
 def _times(scan: _Scan) -> Keys:

@@ -33,13 +33,15 @@ class Gap(NamedTuple):
         return (self.a_end - self.a_start) - (self.b_end - self.b_start)
 
 
-def gaps_by_order(a: Keys, b: Keys) -> list[Gap]:
+def gaps_by_order(a: Keys, b: Keys, within: list[Gap] | None = None) -> list[Gap]:
     """Return the gaps between two sequences in their order; no gap if they are equal.
 
     Keys that occur once in both, in the same order, are anchors (as in a patience diff), so one
-    message that is missing does not make those after it different.
+    message that is missing does not make those after it different. ``within`` are gaps found with
+    finer keys: what is between them is known to be equal, whatever its keys.
     """
-    return list(_gaps(a, b, Gap(0, len(a), 0, len(b))))
+    outer = [Gap(0, len(a), 0, len(b))] if within is None else within
+    return [inner for gap in outer for inner in _gaps(a, b, gap)]
 
 
 def gaps_by_stamp(a: Keys, b: Keys, stamps_a: Keys, stamps_b: Keys) -> list[Gap]:

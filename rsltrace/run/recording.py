@@ -117,6 +117,7 @@ def run(
                 }
             )
         recorder = world.core.recorder
+        world.core.recorder = None  # what finalizers say from now on comes too late
         return RunResult(
             path=None if output is None else Path(output),
             digest=recorder.digest if recorder is not None else "",

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from simulate import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
+from diff_simulator import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
 
 from rsltrace.diff.model import Diff, Divergence, Root, Verdict
 from rsltrace.model.event import EventKind

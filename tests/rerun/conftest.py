@@ -1,4 +1,4 @@
-"""Makes ``tests/trace/make.py`` and ``gallery.py`` importable, and keeps Rerun from phoning home."""
+"""Makes ``tests/trace/make.py`` and ``gallery.py`` importable; Rerun shall not phone home."""
 
 from __future__ import annotations
 

@@ -10,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -350,3 +351,50 @@ def test_a_closed_terminal_changes_nothing(tmp_path: Path, monkeypatch: pytest.M
     for stream in (Gone(), None):
         monkeypatch.setattr(sys, "stderr", stream)
         assert record(job, tmp_path / "run.mcap", force=True, echo=True).digest == quiet.digest
+
+
+class Rude:
+    """A callback that refuses to be looked at."""
+
+    def __call__(self, message: Any) -> None:
+        pass
+
+    def __getattr__(self, name: str) -> Any:
+        if name in ("func", "__qualname__"):
+            raise RuntimeError(name)
+        raise AttributeError(name)
+
+
+@pytest.mark.parametrize("callback", [MagicMock(), Rude()])
+def test_a_callback_may_be_any_callable(simulate: Any, callback: Any) -> None:
+    class Odd(Ticker):
+        def setup(self) -> None:
+            self.create_subscription(UInt64, "ticks", callback, 1)
+
+    recorded = simulate(Odd, duration=1)
+    with recorded.trace() as trace:
+        details = [str(entity.detail) for entity in trace.entities.values()]
+    assert any(type(callback).__qualname__ in detail for detail in details)
+
+
+def test_a_finalizer_may_log_after_the_run(simulate: Any) -> None:
+    heard: list[object] = []
+
+    class Late(Ticker):
+        def destroy_node(self) -> None:
+            pass
+
+        def __del__(self) -> None:
+            try:
+                self.get_logger().info("too late")
+                self.publisher.publish(UInt64())
+            except BaseException as error:
+                heard.append(error)
+            else:
+                heard.append("fine")
+
+    recorded = simulate(Late, duration=1)
+    gc.collect()
+    assert len(heard) == 1
+    assert not any("cannot go on writing" in str(item) for item in heard)
+    assert recorded.logs() == []

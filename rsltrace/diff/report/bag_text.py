@@ -93,7 +93,7 @@ def _message(found: MessageDivergence, width: int) -> Section:
             rows.append(line(f"    {shortened(printable(only.preview), width - 4)}"))
     if found.reason:
         rows += wrapped(f"    {printable(found.reason)}", width, style=FAINT, indent="    ")
-    return Section(line((title, TITLE)), rows, 14, "lines of differences", least=6)
+    return Section(line((title, TITLE)), rows, 14, "lines", least=6)
 
 
 def _before(found: MessageDivergence, width: int) -> Section:

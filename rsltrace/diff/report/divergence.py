@@ -36,6 +36,7 @@ from rsltrace.model.stamp import format_duration, format_seconds
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
 _DEPTH_MAX = 6
+_REACHES_LINES = 2
 
 
 def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> list[Section]:
@@ -63,15 +64,13 @@ def _event(found: Divergence, width: int) -> Section:
         if not title.startswith("event ") or a.flags != b.flags or not found.messages:
             rows += _did([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
     elif some is not None:
-        title = "what happened instead" if a and b else "the event"
+        title = "where they part" if a and b else "the event"
         rows += _events_of([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
     else:
         title = ""
     for message in found.messages:
         rows += _message(message, width)
-    return Section(
-        cut(line((title, TITLE)), width) if title else (), rows, 12, "lines of differences", least=4
-    )
+    return Section(cut(line((title, TITLE)), width) if title else (), rows, 12, "lines", least=3)
 
 
 def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
@@ -205,8 +204,9 @@ def _reaches(found: Divergence, width: int) -> Section:
     for reach in found.reaches:
         when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "at once"
         parts.append(f"{printable(reach.topic)} {when}")
-    rows = wrapped(f"reaches {', '.join(parts)}", width, indent="  ")
-    rows = (
-        rows[:2] if len(rows) <= 2 else [*rows[:1], line("  ", (f"… {len(parts)} topics", FAINT))]
-    )
-    return Section((), rows, 2, "topics")
+    for shown in range(len(parts), 0, -1):
+        more = [f"and {len(parts) - shown} more"] if shown < len(parts) else []
+        rows = wrapped(f"reaches {', '.join(parts[:shown] + more)}", width, indent="  ")
+        if len(rows) <= _REACHES_LINES:
+            break
+    return Section((), rows, len(rows), "", len(rows))

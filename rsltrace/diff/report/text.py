@@ -86,8 +86,8 @@ def _head(diff: Diff, width: int) -> list[Line]:
     sides = [("a", SIDE_A, diff.a), ("b", SIDE_B, diff.b)]
     lines += in_columns([_side_cells(*side) for side in sides], widest=60)
     if not diff.identical:
-        word = "event agrees" if diff.agreeing == 1 else "events agree"
-        verdict = f"  verdict: {diff.verdict.value}; {diff.agreeing} {word} before"
+        word = "event before agrees" if diff.agreeing == 1 else "events before agree"
+        verdict = f"  verdict: {diff.verdict.value}; {diff.agreeing} {word}"
         lines += wrapped(verdict, width, indent="  ")
         if within_tolerance(diff):
             lines.append(

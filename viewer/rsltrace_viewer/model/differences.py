@@ -33,11 +33,12 @@ def pair_lines(comparison: Comparison, place: int, openness: Openness) -> list[L
     a, b = comparison.a(place), comparison.b(place)
     sign = comparison.sign(place)
     lines = list(_title(comparison, place, a, b, sign))
-    if place == comparison.first_place:
-        lines += _why(comparison, openness)
     try:
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _difference_lines(comparison, a, b, openness)
+        if place == comparison.first_place:
+            lines += _why(comparison)
+        if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _cause_lines(comparison, a, b)
     except TraceError as error:
         lines.append(Line(0, "", printable(str(error)), Role.ERROR, "diff.error"))
@@ -94,7 +95,7 @@ def _view(comparison: Comparison, a: int | None, b: int | None) -> EventView:
     return Viewer(comparison.diff_run_b).view(b)
 
 
-def _why(comparison: Comparison, openness: Openness) -> Iterator[Line]:
+def _why(comparison: Comparison) -> Iterator[Line]:
     """Yield the first divergence as the diff explains it, with its cause chain as links."""
     if comparison.diff is None:
         yield Line(0, "why", "looking for the cause …", Role.SECTION, "why")
@@ -103,9 +104,8 @@ def _why(comparison: Comparison, openness: Openness) -> Iterator[Line]:
         return
     divergence = comparison.diff.divergences[0]
     yield Line(0, "why", comparison.diff.verdict.value, Role.SECTION, "why")
-    yield Line(1, "", printable(divergence.sentence), Role.DIFFERENCE, "why.sentence")
-    if divergence.root_sentence and divergence.root_sentence != divergence.sentence:
-        yield Line(1, "", printable(divergence.root_sentence), Role.NOTE, "why.root")
+    sentence = divergence.root_sentence or divergence.sentence
+    yield Line(1, "", printable(sentence), Role.NOTE, "why.sentence")
     yield from chain_lines(comparison, divergence)
 
 

@@ -98,7 +98,7 @@ class LaneMaker:
         self._pieces = max(4, min(_PIECES_MAX, 2048 // rows))
         count = len(run.segments)
         self._counts = np.zeros((count, rows, self._pieces), dtype=np.uint16)
-        self._raised = np.zeros((count, rows), dtype=np.bool_)
+        self._raised = np.zeros((count, rows, self._pieces), dtype=np.bool_)
         self._known = np.zeros(count, dtype=np.bool_)
         self.summaries = 0
         """How many segments have their summary: lanes of the same window may differ by it."""
@@ -141,7 +141,7 @@ class LaneMaker:
         window = Window(start, end + 1)
         counts, raised = self._bin(segment, window, self._pieces)
         self._counts[number] = np.minimum(counts, 65535)
-        self._raised[number] = raised.any(axis=1)
+        self._raised[number] = raised
         self._done(number)
 
     def _done(self, number: int) -> None:
@@ -259,9 +259,7 @@ class LaneMaker:
             counts[row] = np.bincount(
                 places[inside], weights=self._counts[numbers, row][inside], minlength=columns
             )[:columns]
-            for place in places[self._raised[numbers, row], self._pieces // 2].tolist():
-                if 0 <= place < columns:
-                    raised[row, place] = True
+            raised[row, places[inside & self._raised[numbers, row]]] = True
         return counts, raised
 
     def _lanes(

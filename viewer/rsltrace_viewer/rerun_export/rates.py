@@ -13,8 +13,10 @@ import numpy.typing as npt
 
 from rsltrace.model.stamp import NS_PER_S
 
-_STEPS = 120
-"""About so many points per curve: enough to see a rate change, few enough to be one glance."""
+_STEPS, _STEPS_OF_SHORT = 120, 20
+"""About so many points per curve: enough to see a rate change, few enough to be one glance. A step
+much shorter than a period would alternate between none and one."""
+_SHORT_NS = 10 * NS_PER_S
 
 _SHORTEST_NS = 1_000_000
 
@@ -22,12 +24,12 @@ _SHORTEST_NS = 1_000_000
 def step_for(duration_ns: int) -> int:
     """Return a round length (1, 2 or 5 times a power of ten, in ns) of which a run has some 120.
 
-    Runs of more than ten seconds get no step below a second, in which a 1 Hz timer would alternate
-    between 0 and 1.
+    Runs of up to ten seconds have some 20; longer ones get no step below a second.
     """
-    wanted = max(duration_ns // _STEPS, _SHORTEST_NS)
-    if duration_ns > 10 * NS_PER_S:
-        wanted = max(wanted, NS_PER_S)
+    if duration_ns <= _SHORT_NS:
+        wanted = max(duration_ns // _STEPS_OF_SHORT, _SHORTEST_NS)
+    else:
+        wanted = max(duration_ns // _STEPS, NS_PER_S)
     step = _SHORTEST_NS
     while True:
         for factor in (1, 2, 5):

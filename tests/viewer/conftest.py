@@ -1,0 +1,174 @@
+"""Traces to look at: made ones, the samples, broken ones; and ways to drive the app."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import os
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("textual", reason="needs textual: pip install 'rsltrace[view]'")
+
+if "trace_maker" not in sys.modules:
+    _spec = importlib.util.spec_from_file_location(
+        "trace_maker", Path(__file__).parent.parent / "trace" / "make.py"
+    )
+    assert _spec is not None
+    assert _spec.loader is not None
+    _module = importlib.util.module_from_spec(_spec)
+    sys.modules["trace_maker"] = _module
+    _spec.loader.exec_module(_module)
+
+from rsltrace_viewer.model.run import Run
+
+SAMPLES = Path(__file__).parents[2] / "sample_traces"
+GOLDEN = Path(__file__).parent / "golden"
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two nodes: 600 events with services, logs, and an exception at the end."""
+    from trace_maker import write_run
+
+    path = tmp_path_factory.mktemp("viewer") / "made.mcap"
+    write_run(path, 600)
+    return path
+
+
+@pytest.fixture(scope="session")
+def long(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of several segments."""
+    from trace_maker import write_run
+
+    path = tmp_path_factory.mktemp("viewer") / "long.mcap"
+    write_run(path, 30_000)
+    return path
+
+
+@pytest.fixture(scope="session")
+def run(made: Path) -> Iterator[Run]:
+    """The made run, opened."""
+    opened = Run.open(made)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture(scope="session")
+def long_run(long: Path) -> Iterator[Run]:
+    """The run of several segments, opened."""
+    opened = Run.open(long)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def pair() -> tuple[Path, Path]:
+    """Two runs of one job that part, from the samples."""
+    folder = SAMPLES / "nondeterministic_callback"
+    return folder / "a.mcap", folder / "b.mcap"
+
+
+def check_golden(name: str, text: str) -> None:
+    """Compare with a golden file. ``UPDATE_GOLDEN=1`` writes it; look at its diff."""
+    path = GOLDEN / name
+    if os.environ.get("UPDATE_GOLDEN"):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    assert path.exists(), f"{path} is missing; UPDATE_GOLDEN=1 writes it"
+    assert text == path.read_text(encoding="utf-8")
+
+
+@pytest.fixture
+def golden() -> object:
+    """``golden(name, text)`` compares with a golden file."""
+    return check_golden
+
+
+class Driver:
+    """An app that runs without a terminal, for the duration of a ``with``-block of asyncio."""
+
+    def __init__(self, app: ViewerApp, pilot: Pilot[None]) -> None:
+        self.app = app
+        self._pilot = pilot
+
+    async def settle(self) -> None:
+        """Wait until nothing is under way."""
+        await settle(self.app, self._pilot.pause)
+
+    async def press(self, *keys: str) -> None:
+        """Press keys, each after the one before has had its effect."""
+        for key in keys:
+            await self._pilot.press(key)
+            await self.settle()
+
+    async def type(self, text: str) -> None:
+        """Type a text and Enter."""
+        await self._pilot.press(*[_NAMES.get(c, c) for c in text], "enter")
+        await self.settle()
+
+    async def click(self, selector: str, x: int, y: int) -> None:
+        """Click into a widget."""
+        await self._pilot.click(selector, offset=(x, y))
+        await self.settle()
+
+    async def resize(self, width: int, height: int) -> None:
+        """Change the size of the terminal."""
+        await self._pilot.resize_terminal(width, height)
+        await self.settle()
+
+    @property
+    def place(self) -> int:
+        """The selected row."""
+        return self.app.session.place
+
+    @property
+    def text(self) -> str:
+        """The screen."""
+        return text_of(self.app)
+
+
+_NAMES = {
+    " ": "space",
+    ":": "colon",
+    "/": "slash",
+    "-": "minus",
+    ".": "full_stop",
+    '"': "quotation_mark",
+    "(": "left_parenthesis",
+    ")": "right_parenthesis",
+    ">": "greater_than_sign",
+}
+
+
+def drive(
+    paths: Path | tuple[Path, ...],
+    steps: Callable[[Driver], Awaitable[None]],
+    size: tuple[int, int] = (120, 36),
+    **options: Any,
+) -> None:
+    """Open one or two traces in the app and run ``steps`` with it."""
+    names = paths if isinstance(paths, tuple) else (paths,)
+
+    async def run_app() -> None:
+        session = open_session(*names)
+        app = ViewerApp(session, **options)
+        try:
+            async with app.run_test(size=size, notifications=True) as pilot:
+                driver = Driver(app, pilot)
+                await driver.settle()
+                await steps(driver)
+        finally:
+            session.close()
+
+    asyncio.run(run_app())
+
+
+@pytest.fixture(name="drive")
+def drive_fixture() -> object:
+    """``drive(paths, steps, size, ...)`` runs the app and ``async def steps(driver)``."""
+    return drive

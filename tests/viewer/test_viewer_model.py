@@ -1,0 +1,228 @@
+"""What the viewer computes, without a terminal."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from rsltrace_viewer.model import match
+from rsltrace_viewer.model.cells import cells, fit, wrap
+from rsltrace_viewer.model.effects import effects_of
+from rsltrace_viewer.model.history import History, Marks
+from rsltrace_viewer.model.inspector import inspect
+from rsltrace_viewer.model.lanes import LaneMaker, Window
+from rsltrace_viewer.model.lines import Openness, Role
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.shown import FilteredRows
+from rsltrace_viewer.model.timeline import EventTexts, layout
+from rsltrace_viewer.model.times import parse_time
+from rsltrace_viewer.model.view import SingleView
+
+from rsltrace.model.event import NO_EVENT
+
+
+def test_the_model_loads_no_terminal_library() -> None:
+    code = (
+        "import rsltrace_viewer.session, rsltrace_viewer.model.differences, "
+        "rsltrace_viewer.model.series, rsltrace_viewer.model.braille, sys\n"
+        "print(*[m for m in ('textual', 'rerun', 'rclpy', 'pydantic') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == []
+
+
+@pytest.mark.parametrize("width", range(1, 12))
+@pytest.mark.parametrize("text", ["", "abc", "日本語テキスト", "a日b本c", "x" * 30])
+def test_fit_always_has_the_width(text: str, width: int) -> None:
+    assert cells(fit(text, width)) == width
+    assert cells(fit(text, width, right=True)) == width
+
+
+def test_wrap_keeps_every_word_and_no_line_is_too_wide() -> None:
+    text = "the quick brown fox 日本語テキスト jumpsoverthelazydogwithoutspaces\nagain"
+    lines = wrap(text, 10)
+    assert all(cells(line) <= 10 for line in lines)
+    assert "".join("".join(lines).split()) == "".join(text.split())
+
+
+@pytest.mark.parametrize("width", [20, 40, 60, 80, 100, 120, 200])
+@pytest.mark.parametrize("signs", [False, True])
+def test_columns_never_exceed_the_width(run: Run, width: int, signs: bool) -> None:
+    texts = EventTexts(run)
+    columns = layout(width, index_width=5, time_width=12, node_width=12, signs=signs)
+    row = columns.cells(texts.of(7))
+    assert sum(cells(text) + 1 for _, text in row) <= width
+    assert {"index", "mark"} <= {name for name, _ in row}
+
+
+def test_rows_say_what_happened(run: Run) -> None:
+    texts = EventTexts(run)
+    timer, received = texts.of(2), texts.of(3)
+    assert (timer.node, timer.kind, timer.entity, timer.outputs) == (
+        "/talker",
+        "timer",
+        "tick",
+        "/count",
+    )
+    assert (received.node, received.kind, received.entity) == ("/listener", "sub", "/count")
+    last = texts.of(run.count - 1)
+    assert last.raised
+    assert last.outputs == "exception ValueError: too many"
+    assert any("log INFO received" in texts.of(i).outputs for i in range(40))
+
+
+def test_index_at_finds_the_first_event_at_a_time_or_later(long_run: Run) -> None:
+    run = long_run
+    stamps = np.concatenate([part["stamp"] for part in run.trace.events()])
+    for stamp in [0, int(stamps[0]), int(stamps[5000]), int(stamps[5000]) + 1, int(stamps[-1])]:
+        assert run.index_at(stamp) == int(np.searchsorted(stamps, np.uint64(stamp)))
+    assert run.index_at(2**63) == run.count - 1
+
+
+def test_effects_are_exactly_the_events_with_that_cause(long_run: Run) -> None:
+    run = long_run
+    causes = np.concatenate([part["cause_event"] for part in run.trace.events()])
+    # Around the borders of segments, where effects are in the next one.
+    first = int(run.segments["first_event"][1])
+    for index in [*range(10), *range(first - 8, first + 4), run.count - 1]:
+        *_, found = effects_of(run, index)
+        assert found.done
+        assert list(found.found) == np.flatnonzero(causes == np.uint64(index)).tolist()
+
+
+def test_find_goes_both_ways_and_leaves_out_where_it_starts(long_run: Run) -> None:
+    run = long_run
+    condition = match.OfEntities(match.ids([4]))
+    entities = np.concatenate([part["entity"] for part in run.trace.events()])
+    wanted = np.flatnonzero(entities == 4)
+    start = int(wanted[5000])
+    after = [i for i in match.find(run, condition, start, 1) if i is not None]
+    before = [i for i in match.find(run, condition, start, -1) if i is not None]
+    assert after == wanted[5001:].tolist()
+    assert before == wanted[:5000][::-1].tolist()
+
+
+def test_filtered_rows_map_both_ways(long_run: Run) -> None:
+    run = long_run
+    rows = FilteredRows(run, match.OfEntities(match.ids([4])), SingleView(run.count))
+    assert rows.count == 0
+    while not rows.done:
+        rows.advance()
+    entities = np.concatenate([part["entity"] for part in run.trace.events()])
+    wanted = np.flatnonzero(entities == 4).tolist()
+    assert [rows.at(row) for row in range(rows.count)] == wanted
+    for place in [0, wanted[0], wanted[700], wanted[700] + 1, wanted[-1], run.count - 1]:
+        expected = next((i for i, w in enumerate(wanted) if w >= place), len(wanted) - 1)
+        assert rows.near(place) == expected
+
+
+def test_lanes_count_every_event_whatever_the_window(long_run: Run) -> None:
+    run = long_run
+    maker = LaneMaker(run)
+    for number in maker.order():
+        maker.summarise(number)
+    assert sorted(maker.order()) == list(range(len(run.segments)))
+    lanes = maker.make(maker.whole, 60)
+    assert lanes.known == 1.0
+    assert [lane.label for lane in lanes.lanes] == ["/talker", "/listener", "(run)"]
+    assert all(any(lane.levels) for lane in lanes.lanes)
+    assert lanes.lanes[1].raised == {59}
+    # A narrow window is made of the events themselves.
+    stamp = run.stamp(1000)
+    exact = maker.make(Window(stamp, stamp + 1), 1)
+    assert exact.lanes[0].levels == (8,)
+
+
+def test_zooming_in_ends_at_single_events_and_out_at_the_whole_run(long_run: Run) -> None:
+    run = long_run
+    maker = LaneMaker(run)
+    window = maker.whole
+    for _ in range(60):
+        window = maker.zoomed(window, 1, 15_000, 80)
+    assert window.order
+    lanes = maker.make(window, 80, 15_000)
+    column = window.column(15_000, 80)
+    assert sum(lane.letters[column] != " " for lane in lanes.lanes) == 1
+    for _ in range(60):
+        window = maker.zoomed(window, -1, 15_000, 80)
+    assert window == maker.whole
+
+
+@pytest.mark.parametrize("columns", [1, 7, 80])
+@pytest.mark.parametrize("length", [80, 81, 1234567])
+def test_columns_and_positions_of_a_window_agree(columns: int, length: int) -> None:
+    window = Window(1000, 1000 + length)
+    for column in range(columns):
+        assert window.column(window.at(column, columns), columns) == column
+
+
+def test_history_goes_back_and_forward() -> None:
+    history = History()
+    history.leave(1)
+    history.leave(5)
+    assert history.back(9) == 5
+    assert history.back(5) == 1
+    assert history.back(1) is None
+    assert history.forward(1) == 5
+    history.leave(5)
+    assert history.forward(7) is None
+
+
+def test_marks_are_found_in_order() -> None:
+    marks = Marks()
+    for place in (30, 10, 20):
+        assert marks.toggle(place)
+    assert (marks.next(10, 1), marks.next(10, -1), marks.next(15, -1)) == (20, None, 10)
+    assert not marks.toggle(20)
+    assert marks.next(10, 1) == 30
+
+
+def test_the_inspector_decodes_input_and_outputs(run: Run) -> None:
+    *_, effects = effects_of(run, 2)
+    lines = inspect(run, 2, Openness(), effects)
+    assert any(line.label == "data" for line in lines)
+    links = [line.link for line in lines if line.link is not None]
+    assert links == [3]
+    received = inspect(run, 3, Openness())
+    assert [line.link for line in received if line.link is not None] == [2]
+    assert next(line for line in received if line.label == "input").value.startswith("/count")
+
+
+def test_what_is_open_stays_open_from_event_to_event(run: Run) -> None:
+    openness = Openness()
+    assert not any(line.label == "chain hash" for line in inspect(run, 2, openness))
+    openness.toggle("details")
+    for index in (2, 4):
+        assert any(line.label == "chain hash" for line in inspect(run, index, openness))
+
+
+def test_every_event_can_be_inspected(run: Run) -> None:
+    openness = Openness({"details", "parameters"})
+    for index in range(run.count):
+        lines = inspect(run, index, openness)
+        assert lines
+        assert not [line for line in lines if line.path.startswith("error")]
+        paths = [line.path for line in lines]
+        assert len(set(paths)) == len(paths)
+
+
+def test_an_exception_shows_its_traceback(run: Run) -> None:
+    lines = inspect(run, run.count - 1, Openness())
+    assert any("ValueError: too many" in line.value and line.role is Role.FIELD for line in lines)
+    assert int(run.row(run.count - 1)["cause_event"]) == NO_EVENT
+
+
+@pytest.mark.parametrize(
+    ("text", "ns"),
+    [("1.5", 1_500_000_000), ("20ms", 20_000_000), ("3us", 3000), ("7 ns", 7), (".5s", 5 * 10**8)],
+)
+def test_times(text: str, ns: int) -> None:
+    assert parse_time(text) == ns
+
+
+@pytest.mark.parametrize("text", ["", "abc", "1.5x", "-3", "1e9", "--", "9" * 400])
+def test_what_is_no_time(text: str) -> None:
+    with pytest.raises(ValueError, match="no time"):
+        parse_time(text)
