@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -139,6 +140,19 @@ def diff(
         relative=relative,
         by=by,
     )
+    try:
+        return _diff(golden, others, form, options, output)
+    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
+        raise
+    except Exception:
+        # Python's own exit status for a bug would be 1, which here says that the runs part.
+        traceback.print_exc()
+        return EXIT_USAGE
+
+
+def _diff(
+    golden: str, others: Sequence[str], form: str, options: DiffOptions, output: Path | None
+) -> int:
     done: list[Diff | BagDiff] = []
     trouble = False
     for other in others:

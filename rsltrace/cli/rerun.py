@@ -44,7 +44,7 @@ def rerun(
     from rsltrace_viewer.rerun_export import sdk
 
     sdk.require()
-    from rsltrace_viewer.rerun_export import show
+    import rsltrace_viewer.rerun_export.show as show
     from rsltrace_viewer.rerun_export.export import export
 
     how = show.choose(spawn=spawn, web=web, output=output)

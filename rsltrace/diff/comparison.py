@@ -14,7 +14,7 @@ from rsltrace.diff.model import Diff, Divergence, Setting
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.rows import Run
 from rsltrace.diff.settings import entity_settings, environment_settings, job_settings
-from rsltrace.diff.stretches import Item, Stretch, Stretches
+from rsltrace.diff.stretches import EqualRun, Item, Stretch, Stretches
 from rsltrace.diff.tally import Tally
 from rsltrace.trace.reader import Trace
 
@@ -88,14 +88,19 @@ class _Comparison:
         per_stretch = options.window
         if options.everything:
             per_stretch = max(options.window, _EVENTS_PER_STRETCH)
-        stretches = Stretches(self._run_a, self._run_b, self._start, per_stretch)
+        stretches = Stretches(
+            self._run_a, self._run_b, self._start, per_stretch, skip_equal=options.everything
+        )
         wanted: list[Found] = []
         for stretch in islice(stretches, None if options.everything else 1):
+            self._aligned_to = (stretch.end_a, stretch.end_b)
+            if isinstance(stretch, EqualRun):
+                self._tally.take_equal(stretch)
+                continue
             known = len(cone.found)
             first = first_item(stretch, self._start) if not known else None
             cone.take(stretch, first)
             self._tally.take(stretch)
-            self._aligned_to = (stretch.end_a, stretch.end_b)
             new = cone.found[known:]
             wanted += [f for f in new if watch is None or watch(f.mark.item, stretch)]
         return self._divergences(cone, wanted)

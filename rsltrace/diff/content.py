@@ -6,7 +6,6 @@ not compared would count. So the key is made of the decoded fields, bit for bit.
 
 from __future__ import annotations
 
-import dataclasses
 import struct
 from typing import Any
 
@@ -16,8 +15,9 @@ import xxhash
 from rsltrace.diff.fields import fields_of
 from rsltrace.diff.globs import FieldRules
 
-_LENGTH = struct.Struct("<Q")
-_FLOAT = struct.Struct("<d")
+_LENGTH = struct.Struct("<Q").pack
+_FLOAT = struct.Struct("<d").pack
+_PLAIN = frozenset((float, int, bool, str, np.ndarray))
 
 
 class ContentKeys:
@@ -31,32 +31,29 @@ class ContentKeys:
     def key(self, message: object) -> int:
         """Return the 64-bit key of a decoded message."""
         parts: list[bytes] = []
-        self._add(parts, "", message)
+        if self._rules.empty:
+            _add_all(parts, message)
+        else:
+            self._add(parts, "", message)
         return xxhash.xxh3_64_intdigest(b"".join(parts))
 
     def _add(self, parts: list[bytes], path: str, value: Any) -> None:
-        if isinstance(value, float):
-            parts.append(_FLOAT.pack(value))
-        elif isinstance(value, int):
-            parts.append(value.to_bytes(9, "little", signed=True))
-        elif isinstance(value, str):
-            encoded = value.encode("utf-8", "surrogatepass")
-            parts += (_LENGTH.pack(len(encoded)), encoded)
-        elif isinstance(value, np.ndarray):
-            parts.append(_LENGTH.pack(len(value)))
-            parts.append(self._without_ignored(path, value).tobytes())
-        elif isinstance(value, list):
-            parts.append(_LENGTH.pack(len(value)))
+        """Add what is compared of a value."""
+        kind = type(value)
+        if kind is np.ndarray:
+            _add_all(parts, self._without_ignored(path, value))
+        elif kind in _PLAIN:
+            _add_all(parts, value)
+        elif kind is list:
+            parts.append(_LENGTH(len(value)))
             for place, item in enumerate(value):
                 self._add(parts, f"{path}[{place}]", item)
-        elif dataclasses.is_dataclass(value):
+        else:
             prefix = f"{path}." if path else ""
             for name, attribute, _ in fields_of(value):
                 inner = prefix + name
-                if self._rules.empty or not self._is_ignored(inner):
+                if not self._is_ignored(inner):
                     self._add(parts, inner, getattr(value, attribute))
-        else:
-            raise TypeError(f"a message does not hold a {type(value).__name__}")
 
     def _is_ignored(self, path: str) -> bool:
         known = self._ignored.get(path)
@@ -78,3 +75,24 @@ class ContentKeys:
         values = values.copy()
         values[mask] = 0
         return values
+
+
+def _add_all(parts: list[bytes], value: Any) -> None:
+    """Add a value with all that is in it, without building the paths of its fields."""
+    kind = type(value)
+    if kind is float:
+        parts.append(_FLOAT(value))
+    elif kind is int or kind is bool:
+        parts.append(value.to_bytes(9, "little", signed=True))
+    elif kind is str:
+        encoded = value.encode("utf-8", "surrogatepass")
+        parts += (_LENGTH(len(encoded)), encoded)
+    elif kind is np.ndarray:
+        parts += (_LENGTH(len(value)), value.tobytes())
+    elif kind is list:
+        parts.append(_LENGTH(len(value)))
+        for item in value:
+            _add_all(parts, item)
+    else:
+        for _, attribute, _ in fields_of(value):
+            _add_all(parts, getattr(value, attribute))

@@ -9,12 +9,19 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_left
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
-from rsltrace.diff.align import Pairs, align
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.diff.align import Pairs, Past, align
 from rsltrace.diff.rows import CONSTRUCT, SHUTDOWN, Rows, Run, load_rows
 
 NOTHING = -1
+
+_COMPARED = "stamp entity kind flags input_hash output_hash state_hash outputs".split()
+_COMPARED_AT_ONCE = 4096
+_EQUAL_MIN = 512
 
 _MARGIN_MIN = 1024
 """Events looked at beyond the cut: an event that came later by more than that is called missing."""
@@ -69,55 +76,106 @@ class Stretch:
 
 
 @dataclass
+class EqualRun:
+    """Events that are the same in both runs, in a row: nothing to match. ``counts`` has their
+    numbers by entity number, shape (entities,); they end at ``end_a`` and ``end_b``."""
+
+    first_a: int
+    first_b: int
+    counts: npt.NDArray[np.int64]
+    end_a: int
+    end_b: int
+
+
+@dataclass
 class Stretches:
-    """Iterates over the stretches from index ``start`` on, which is the same event in both runs."""
+    """Iterates over the runs from index ``start`` on, which is the same event in both.
+
+    ``events`` is how many of each run make a stretch. With ``skip_equal``, long runs of equal
+    events between stretches come as an EqualRun, which takes a fraction of the time.
+    """
 
     run_a: Run
     run_b: Run
     start: int
     events: int
-    partners: dict[int, int] = field(default_factory=dict)
-    """By index in b the index in a, of the present stretch and what reaches into the next one."""
+    skip_equal: bool = False
 
-    def __iter__(self) -> Iterator[Stretch]:
+    def __iter__(self) -> Iterator[Stretch | EqualRun]:
         first_a = first_b = self.start
         taken_a: set[int] = set()
         taken_b: set[int] = set()
+        past = Past(self.start)
         while True:
-            stretch, pairs = self._next(first_a, first_b, taken_a, taken_b)
-            rows_a, rows_b = stretch.rows_a, stretch.rows_b
-            self.partners.update(
-                (rows_b.first + place, rows_a.first + partner)
-                for place, partner in enumerate(pairs.b)
-                if partner >= 0
-            )
+            stretch, pairs = self._next(first_a, first_b, past, taken_a, taken_b)
             yield stretch
             if stretch.at_end:
                 return
+            rows_a, rows_b = stretch.rows_a, stretch.rows_b
+            recent = {
+                rows_b.first + place: rows_a.first + partner
+                for place, partner in enumerate(pairs.b)
+                if partner >= 0
+            }
+            # Causes are mostly recent; what is older than two stretches is forgotten.
+            kept = {b: a for b, a in past.recent.items() if b >= rows_b.first - self.events}
+            past = Past(self.start, {**kept, **recent}, past.equal_run)
             first_a, first_b = stretch.end_a, stretch.end_b
             taken_a = {i.a for i in stretch.items if i.a >= first_a}
             taken_b = {i.b for i in stretch.items if i.b >= first_b}
-            # Causes are mostly recent; what is older than a stretch is forgotten.
-            self.partners = {b: a for b, a in self.partners.items() if b >= rows_b.first}
+            if self.skip_equal and not taken_a and not taken_b:
+                run = equal_run(self.run_a, self.run_b, first_a, first_b)
+                if run is not None:
+                    yield run
+                    past = Past(self.start, past.recent, (first_a, first_b, run.end_a - first_a))
+                    first_a, first_b = run.end_a, run.end_b
 
     def _next(
-        self, first_a: int, first_b: int, taken_a: set[int], taken_b: set[int]
+        self, first_a: int, first_b: int, past: Past, taken_a: set[int], taken_b: set[int]
     ) -> tuple[Stretch, Pairs]:
         events, margin = self.events, max(_MARGIN_MIN, self.events // 4)
         while True:
             rows_a = load_rows(self.run_a, first_a, first_a + events + margin)
             rows_b = load_rows(self.run_b, first_b, first_b + events + margin)
             end_a, end_b = _cuts(rows_a, rows_b, events)
-            if end_a > 0 or end_b > 0:
+            if end_a > 0 or end_b > 0 or not (len(rows_a) or len(rows_b)):
                 break
             events *= 4  # everything at one time: look further, or there would be no progress
-        pairs = align(rows_a, rows_b, self.start, self.partners, taken_a, taken_b)
+        pairs = align(rows_a, rows_b, past, taken_a, taken_b)
         items = _items(rows_a, rows_b, pairs, end_a, end_b, taken_a, taken_b)
         stretch = Stretch(rows_a, rows_b, items, first_a + end_a, first_b + end_b)
         _mark_inversions(stretch)
-        if stretch.at_end or rows_a.at_end or rows_b.at_end:
+        if rows_a.at_end or rows_b.at_end:
             _mark_beyond(stretch)
         return stretch, pairs
+
+
+def equal_run(run_a: Run, run_b: Run, first_a: int, first_b: int) -> EqualRun | None:
+    """Return the events from here on that are equal in a row, if there are many of them."""
+    if not run_a.identity.same_ids:
+        return None  # the trace's own output hashes say nothing then
+    counts = np.zeros(len(run_a.identity.keys), dtype=np.int64)
+    done = 0
+    while True:
+        last_a, last_b = first_a + done + _COMPARED_AT_ONCE, first_b + done + _COMPARED_AT_ONCE
+        parts_a = list(run_a.trace.events(first_a + done, last_a))
+        parts_b = list(run_b.trace.events(first_b + done, last_b))
+        if not parts_a or not parts_b:
+            break
+        a, b = np.concatenate(parts_a), np.concatenate(parts_b)
+        size = min(len(a), len(b))
+        equal = a["kind"][:size] != CONSTRUCT
+        for name in _COMPARED:
+            equal &= a[name][:size] == b[name][:size]
+        agreeing = size if equal.all() else int(np.argmin(equal))
+        numbers = run_a.identity.numbers(run_a.trace, a["entity"][:agreeing], of_b=False)
+        counts += np.bincount(numbers, minlength=len(counts))
+        done += agreeing
+        if agreeing < _COMPARED_AT_ONCE:
+            break
+    if done < _EQUAL_MIN:
+        return None
+    return EqualRun(first_a, first_b, counts, first_a + done, first_b + done)
 
 
 def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:

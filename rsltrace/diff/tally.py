@@ -5,7 +5,7 @@ from __future__ import annotations
 from rsltrace.diff.identity import Identity
 from rsltrace.diff.model import EntityCount
 from rsltrace.diff.rows import SHUTDOWN
-from rsltrace.diff.stretches import Item, Stretch
+from rsltrace.diff.stretches import EqualRun, Item, Stretch
 
 AGREEING_MIN = 32
 """So many events in a row have to agree before it is called agreement …"""
@@ -35,6 +35,13 @@ class Tally:
                 self._agreeing += 1
                 self._resync = self._resync or (item.a, item.b)
         self._ended = stretch.at_end
+
+    def take_equal(self, run: EqualRun) -> None:
+        """Count a run of equal events."""
+        for number in run.counts.nonzero()[0].tolist():
+            self._counts.setdefault(number, [0, 0, 0, 0])[0] += int(run.counts[number])
+        self._agreeing += int(run.counts.sum())
+        self._resync = self._resync or (run.first_a, run.first_b)
 
     def counts(self, identity: Identity) -> tuple[EntityCount, ...]:
         """Return the counts of each entity that had events, those that differ most first."""

@@ -326,3 +326,20 @@ def test_nothing_is_written_beside_the_traces(diff: Callable[..., Done], tmp_pat
     before = sorted(tmp_path.iterdir())
     diff("a.mcap", "b.mcap", "--all")
     assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_bug_is_trouble_and_not_a_divergence(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from click.testing import CliRunner
+
+    import rsltrace.diff.engine
+    from rsltrace.cli.main import cli
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(rsltrace.diff.engine, "diff_traces", broken)
+    result = CliRunner().invoke(cli, ["diff", str(A), str(B)])
+    assert result.exit_code == 2
+    assert "ZeroDivisionError: a bug" in result.output + capsys.readouterr().err

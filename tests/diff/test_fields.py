@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsltrace.diff.content import ContentKeys
 from rsltrace.diff.fields import diff_messages, preview
+from rsltrace.diff.globs import FieldRules
 from rsltrace.diff.model import FieldDifference
 from rsltrace.diff.numbers import ulp_distance
 from rsltrace.diff.options import DiffOptions
@@ -410,3 +412,21 @@ def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
     assert [(d.path, d.b, d.a, d.absolute) for d in swapped] == [
         (d.path, d.a, d.b, d.absolute) for d in found
     ]
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    arrays,
+    arrays,
+    st.sampled_from([0.0, -0.0, 1.0, math.nan]),
+    st.sampled_from([0.0, -0.0, 1.0, math.nan]),
+    st.sampled_from([(), ("double",), ("ranges",), ("ranges[0]",), ("points",), ("*",)]),
+)
+def test_content_keys_are_equal_exactly_when_nothing_compared_differs(
+    ranges_a: list[float], ranges_b: list[float], x: float, y: float, ignore: tuple[str, ...]
+) -> None:
+    a = message(ranges=np.array(ranges_a, dtype=np.float32), double=x)
+    b = message(ranges=np.array(ranges_b, dtype=np.float32), double=y)
+    options = DiffOptions(ignore=ignore)
+    keys = [ContentKeys(FieldRules(options)).key(one) for one in (a, b)]
+    assert (keys[0] == keys[1]) == (diff_messages(a, b, options) == ((), 0))

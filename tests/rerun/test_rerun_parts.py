@@ -137,6 +137,7 @@ def test_every_type_of_marker_can_be_drawn(type_number: int, count: int) -> None
         patch.setenv("RERUN_STRICT", "1")
         (change,) = MarkerBoard().changes(marker(type=type_number, points=points), 5)
     assert change.parts == ("n", "1")
+    assert change.what is not None
     assert change.what.as_component_batches()
 
 
@@ -152,6 +153,25 @@ def test_deleting_all_markers_clears_those_that_are_there() -> None:
 def test_a_marker_says_when_its_life_is_over() -> None:
     (change,) = MarkerBoard().changes(marker(lifetime={"sec": 1, "nanosec": 5}), 10)
     assert change.expires_ns == 10 + S + 5
+
+
+def test_a_marker_that_is_there_already_is_not_drawn_again() -> None:
+    board = MarkerBoard()
+
+    def drawn(stamp_ns: int, **fields: Any) -> bool:
+        fields.setdefault("color", {"r": 1.0, "g": 0.0, "b": 0.0, "a": 1.0})
+        (change,) = board.changes(marker(**fields), stamp_ns)
+        return change.what is not None
+
+    brief = {"sec": 0, "nanosec": 10}
+    assert drawn(0)
+    assert not drawn(5)
+    assert drawn(6, text="another")
+    list(board.changes(marker(action=2), 7))
+    assert drawn(8, text="another")
+    assert drawn(20, lifetime=brief)
+    assert not drawn(30, lifetime=brief)
+    assert drawn(50, lifetime=brief), "it was gone at 40"
 
 
 def test_an_empty_path_and_an_empty_polygon_are_no_error() -> None:

@@ -14,6 +14,11 @@ import pytest
 
 pytest.importorskip("textual", reason="needs textual: pip install 'rsltrace[view]'")
 
+from rsltrace_viewer.app import ViewerApp, open_session
+from rsltrace_viewer.export import settle, text_of
+from rsltrace_viewer.model.run import Run
+from textual.pilot import Pilot
+
 if "trace_maker" not in sys.modules:
     _spec = importlib.util.spec_from_file_location(
         "trace_maker", Path(__file__).parent.parent / "trace" / "make.py"
@@ -23,8 +28,6 @@ if "trace_maker" not in sys.modules:
     _module = importlib.util.module_from_spec(_spec)
     sys.modules["trace_maker"] = _module
     _spec.loader.exec_module(_module)
-
-from rsltrace_viewer.model.run import Run
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 GOLDEN = Path(__file__).parent / "golden"
@@ -138,6 +141,7 @@ _NAMES = {
     "/": "slash",
     "-": "minus",
     ".": "full_stop",
+    ",": "comma",
     '"': "quotation_mark",
     "(": "left_parenthesis",
     ")": "right_parenthesis",

@@ -203,7 +203,11 @@ class ViewerApp(App[None]):
         if session.comparison is not None:
             verdict, bad = session.comparison.verdict(), not session.comparison.identical
         self.screen_stack[0].query_one(HeaderBar).show(
-            session.title(), session.facts(), verdict, bad=bad
+            session.title(),
+            session.facts(),
+            verdict,
+            bad=bad,
+            lines=2 if self.size.height >= 20 else 1 if self.size.height >= 10 else 0,
         )
 
     def _show_rows(self, *, centre: bool = False) -> None:
@@ -286,6 +290,7 @@ class ViewerApp(App[None]):
     def on_resize(self, event: events.Resize) -> None:
         """Use the new size."""
         self._fit(event.size.width, event.size.height)
+        self._show_header()
         self.call_after_refresh(self._redraw)
 
     def on_timeline_resized(self) -> None:
@@ -608,7 +613,13 @@ class ViewerApp(App[None]):
             self.go(session.place_at_time(event.position), centre=True)
 
     def action_pane(self, step: int) -> None:
-        """Go to the next part of the screen."""
+        """Go to the next part of the screen; while something is asked, complete the answer."""
+        if self.prompt.asking:
+            self.prompt.complete()
+            return
+        if len(self.screen_stack) > 1:
+            self.screen.focus_next()
+            return
         panes = [self.timeline, self.inspector, self.lanes]
         shown = [pane for pane in panes if pane.display and pane.size.height]
         place = shown.index(self.focused) if self.focused in shown else -step

@@ -11,7 +11,7 @@ from rsltrace_viewer.app import ViewerApp
 _FONT_FACE = re.compile(r"@font-face\s*\{[^}]*\}\s*")
 _FONTS = 'font-family: "Fira Code", "DejaVu Sans Mono", Menlo, Consolas, monospace;'
 _SETTLE_S = 30.0
-_PAUSE_S = 0.05
+_PAUSE_S = 0.03
 
 
 def screen_of(app: ViewerApp, size: tuple[int, int], keys: Sequence[str] = (), *, svg: bool) -> str:
@@ -51,7 +51,7 @@ async def settle(app: ViewerApp, pause: object) -> None:
     loop = asyncio.get_running_loop()
     end = loop.time() + _SETTLE_S
     quiet = 0
-    while quiet < 3 and loop.time() < end:
+    while quiet < 2 and loop.time() < end:
         await pause(_PAUSE_S)
         busy = app.busy or any(worker.is_running for worker in app.workers)
         quiet = 0 if busy else quiet + 1

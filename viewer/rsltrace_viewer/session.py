@@ -236,8 +236,7 @@ class Session:
         if entity is None:
             return None
         if what == "node":
-            ids = run.ids_where(node=entity.node)
-            return match.OfEntities(match.ids(ids)), run.node_name(entity.id)
+            return match.of_nodes(run, frozenset((entity.node,))), run.node_name(entity.id)
         if what == "entity":
             return match.OfEntities(match.ids([entity.id])), run.entity_name(entity.id)
         topic = entity.name if entity.kind in WITH_TOPIC else ""
@@ -246,7 +245,7 @@ class Session:
             topic = run.entities[sent.entity].name if sent is not None else ""
         if not topic:
             return None
-        return match.OfEntities(match.ids(run.ids_where(name=topic)), outputs=True), topic
+        return match.OfEntities(match.ids(run.ids_on(topic)), outputs=True), topic
 
     def seek(self, condition: Condition, step: int, *, wrap: bool = False) -> Iterator[int | None]:
         """Yield None while looking and the places of matches from the selected one on."""

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.event import EventFlag, Output, OutputKind
+from rsltrace.model.event import EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.segments import output_of
 from rsltrace_viewer.model.run import Run, Segment
 from rsltrace_viewer.model.text import log_of, output_text
@@ -227,6 +227,19 @@ class Any:
     def can_be_in(self, run: Run, number: int) -> bool:
         """Return whether one part can be in it."""
         return any(part.can_be_in(run, number) for part in self.parts)
+
+
+def of_nodes(run: Run, owners: frozenset[int]) -> Condition:
+    """Return the condition of belonging to nodes (by their ids), their constructors included."""
+    own = ids(e.id for e in run.entities.values() if e.node in owners)
+
+    def made(run: Run, output: Output) -> bool:
+        entity = run.entities.get(output.entity)
+        return entity is not None and entity.node in owners
+
+    constructors = OfKinds(np.array([EventKind.CONSTRUCT], dtype=np.uint8))
+    making = WithOutput(frozenset((OutputKind.ENTITY,)), made)
+    return Any((OfEntities(own), All((constructors, making))))
 
 
 def log_at_least(level: int) -> WithOutput:

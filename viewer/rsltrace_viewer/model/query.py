@@ -34,7 +34,7 @@ class QueryError(ValueError):
     def __init__(self, message: str, start: int, end: int) -> None:
         super().__init__(message)
         self.start = start
-        self.end = end
+        self.end = max(end, start + 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,11 +204,7 @@ def _read_node(run: Run, token: _Token) -> Condition:
             names = ", ".join(node.name for node in run.nodes[:8])
             raise QueryError(f"no node matches; there are {names}", part.start, part.end)
         owners |= matching
-    ids = match.ids({e.id for e in run.entities.values() if e.node in owners})
-    made = frozenset((OutputKind.ENTITY,))
-    constructors = match.WithOutput(made, lambda run, o: run.entities[o.entity].node in owners)
-    kinds = np.array([EventKind.CONSTRUCT], dtype=np.uint8)
-    return match.Any((match.OfEntities(ids), match.All((match.OfKinds(kinds), constructors))))
+    return match.of_nodes(run, frozenset(owners))
 
 
 def _read_entity(run: Run, token: _Token) -> Condition:

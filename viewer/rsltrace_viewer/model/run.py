@@ -138,14 +138,9 @@ class Run:
             table[entity.id] = places.get(entity.node, -1)
         return table
 
-    def ids_where(self, name: str | None = None, node: int | None = None) -> list[int]:
-        """Return the ids of entities of that name, or of that node (by its id)."""
-        return [
-            e.id
-            for e in self.entities.values()
-            if (name is None or (e.name == name and e.kind in WITH_TOPIC))
-            and (node is None or e.node == node)
-        ]
+    def ids_on(self, topic: str) -> list[int]:
+        """Return the ids of the publishers, subscriptions, clients and services of a name."""
+        return [e.id for e in self.entities.values() if e.name == topic and e.kind in WITH_TOPIC]
 
     # Events.
 

@@ -30,27 +30,25 @@ _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
 _VALUE_WIDTH = 18
 _FIELDS_MAX = 20
-_BEFORE_NS, _AFTER_NS = 500_000_000, 2_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """What of a diff the layout shows. ``fields`` are (topic, curves) that differ, worst first."""
+    """What of a diff the layout shows. ``fields`` are (topic, curves) that differ."""
 
     document: str
     lanes: tuple[str, ...]
     fields: tuple[tuple[str, str], ...]
-    around_ns: tuple[int, int] | None
-    """The time around the first divergence."""
+    topics: tuple[str, ...]
+    """Topics that the divergence reaches."""
+    stamp_ns: int | None
+    """When the runs part."""
 
 
 def marks_of(diff: Diff) -> Marks:
     """Return what the layout needs to know."""
     first = diff.divergences[0] if diff.divergences else None
     here = _either(first.a, first.b) if first is not None else None
-    around_ns = None
-    if here is not None:
-        around_ns = (max(here.stamp_ns - _BEFORE_NS, 0), here.stamp_ns + _AFTER_NS)
     fields: dict[tuple[str, str], None] = {}
     for divergence in diff.divergences:
         for message in divergence.messages:
@@ -59,7 +57,9 @@ def marks_of(diff: Diff) -> Marks:
                 inside = path.rpartition(".")[0] if path == field.path else path
                 fields[message.topic, join(inside).strip("/") if inside else ""] = None
     lanes = (AGREEMENT, CHAIN) if diff.divergences else (AGREEMENT,)
-    return Marks(DOCUMENT, lanes, tuple(fields), around_ns)
+    topics = dict.fromkeys(reach.topic for each in diff.divergences for reach in each.reaches)
+    stamp_ns = here.stamp_ns if here is not None else None
+    return Marks(DOCUMENT, lanes, tuple(fields), tuple(topics), stamp_ns)
 
 
 def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk]:

@@ -31,6 +31,8 @@ _LAST_TOPICS = ("/parameter_events", "/rosout", "/clock", "/rsltrace/")
 _LAST_FIELDS = ("latitude", "altitude", "orientation")
 _EVENTS_IN_SIGHT = 120
 """Lanes show so many events around the cursor: callbacks, not a grey bar."""
+_LOOP_NS = 5_000_000_000
+"""How long it takes to play what is around a divergence."""
 _TABLE = ("node", "callback", "kind", "outputs", "cause", "flags", "input_hash", "output_hash")
 
 Part: TypeAlias = Container | View
@@ -53,22 +55,26 @@ def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Bluepri
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        _time_panel(marks),
+        _time_panel(shown, marks),
         auto_views=False,
         auto_layout=False,
     )
 
 
-def _time_panel(marks: Marks | None) -> rrb.TimePanel:
-    """Of two runs, the viewer opens on the divergence and plays what is around it."""
-    if marks is None or marks.around_ns is None:
+def _time_panel(shown: Sequence[Shown], marks: Marks | None) -> rrb.TimePanel:
+    """Of two runs, the viewer opens on the divergence and plays what is around it, slowly enough
+    to be watched, over and over."""
+    if marks is None or marks.stamp_ns is None:
         return rrb.TimePanel(state="collapsed", timeline=SIM_TIME)
+    around_ns = _in_sight_ns(shown)
+    start_ns = max(marks.stamp_ns - around_ns, 0)
     return rrb.TimePanel(
         state="collapsed",
         timeline=SIM_TIME,
         play_state="playing",
         loop_mode="selection",
-        time_selection=rr.encodings.AbsoluteTimeRange(*marks.around_ns),
+        time_selection=rr.encodings.AbsoluteTimeRange(start_ns, marks.stamp_ns + around_ns),
+        playback_speed=min(2 * around_ns / _LOOP_NS, 1.0),
     )
 
 
@@ -129,7 +135,16 @@ def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
         key: " ".join((key[1], *(n for run in shown for n in run.seen.curves.get(paths[0], ()))))
         for key, paths in fields.items()
     }
-    ranked = sorted(fields, key=lambda key: (_place(key, first), _rank(key[0], names[key]), key))
+    reached = marks.topics if marks is not None else ()
+    ranked = sorted(
+        fields,
+        key=lambda key: (
+            _place(key, first),
+            key[0] not in reached,
+            _rank(key[0], names[key]),
+            key,
+        ),
+    )
     chosen: list[tuple[str, str]] = []
     rest: list[tuple[str, str]] = []
     topics: set[str] = set()
@@ -180,9 +195,8 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
         lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX] if name != NO_NODE]
         rates += [f"{run.paths.node(name)}/rate" for name in nodes]
         logs += [f"{run.paths.node(name)}/log" for name in nodes]
-    nanoseconds = max(_EVENTS_IN_SIGHT * run.mean_gap_ns // 2 for run in shown)
     parts: list[Part] = [
-        _lanes(lanes, "Callbacks by time", nanoseconds),
+        _lanes(lanes, "Callbacks by time", _in_sight_ns(shown)),
         _lanes(lanes, "Callbacks by event", _EVENTS_IN_SIGHT // 2),
     ]
     if any(run.log_records for run in shown):
@@ -203,6 +217,11 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
     parts.append(tables[0] if len(tables) == 1 else rrb.Horizontal(*tables, name="Events"))
     parts.append(rrb.TimeSeriesView(origin="/", contents=_only(rates), name="Callbacks per second"))
     return parts
+
+
+def _in_sight_ns(shown: Sequence[Shown]) -> int:
+    """Return how much simulated time lanes show before the cursor, and as much behind it."""
+    return max(_EVENTS_IN_SIGHT * run.mean_gap_ns // 2 for run in shown)
 
 
 def _lanes(paths: list[str], name: str, around: int) -> rrb.StateTimelineView:

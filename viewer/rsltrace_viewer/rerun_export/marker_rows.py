@@ -40,12 +40,13 @@ class MarkerRows:
         for change in board.changes(message, stamp_ns):
             at = path + join(*change.parts)
             self._expire(at, stamp_ns)
-            if change.frame:
-                self._note_frame(at, change.frame)
-            self._set_time(stamp_ns)
-            self._recording.set_time(EVENT, sequence=event)
-            self._recording.log(at, change.what)
-            self._log_frame(at)
+            if change.what is not None:
+                if change.frame:
+                    self._note_frame(at, change.frame)
+                self._set_time(stamp_ns)
+                self._recording.set_time(EVENT, sequence=event)
+                self._recording.log(at, change.what)
+                self._log_frame(at)
             if change.expires_ns is not None:
                 self._expiring[at] = change.expires_ns
         self._recording.reset_time()

@@ -25,7 +25,7 @@ Points = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """What happens at a marker's place: ``what`` is an archetype, an empty one to clear it.
+    """What happens at a marker's place: ``what`` is drawn there, None if it is there already.
 
     ``parts`` is (namespace, id), ``frame`` empty for a deletion, ``expires_ns`` the simulated time
     at which it goes by itself, or None.
@@ -33,7 +33,7 @@ class Change:
 
     parts: tuple[str, str]
     frame: str
-    what: rr.AsComponents
+    what: rr.AsComponents | None
     expires_ns: int | None = None
 
 
@@ -41,7 +41,8 @@ class MarkerBoard:
     """What is on display on one topic, which deletions need to know."""
 
     def __init__(self) -> None:
-        self._shown: set[tuple[str, str]] = set()
+        self._shown: dict[tuple[str, str], tuple[dict[str, Any], int | None]] = {}
+        """What is there, and until when."""
 
     def changes(self, message: dict[str, Any], stamp_ns: int) -> Iterator[Change]:
         """Yield what a Marker or MarkerArray, as Python values, does to the board."""
@@ -53,14 +54,18 @@ class MarkerBoard:
                     yield Change(shown, "", rr.Clear(recursive=False))
                 self._shown.clear()
             elif action == _DELETE:
-                self._shown.discard(parts)
+                self._shown.pop(parts, None)
                 yield Change(parts, "", rr.Clear(recursive=False))
             else:
-                self._shown.add(parts)
                 lifetime_ns = _duration_ns(marker["lifetime"])
                 frame = str(marker["header"]["frame_id"])
                 expires = stamp_ns + lifetime_ns if lifetime_ns > 0 else None
-                yield Change(parts, frame, _shape(marker), expires)
+                # Nodes publish the same markers over and over; only the time in them differs.
+                content = {**marker, "header": frame}
+                before, until_ns = self._shown.get(parts, (None, None))
+                same = before == content and (until_ns is None or until_ns >= stamp_ns)
+                self._shown[parts] = content, expires
+                yield Change(parts, frame, None if same else _shape(marker), expires)
 
 
 def _duration_ns(value: dict[str, int]) -> int:
@@ -97,7 +102,8 @@ def _scale(marker: dict[str, Any]) -> Points:
 
 
 def _rgba(colour: dict[str, float]) -> list[int]:
-    return [int(np.clip(np.nan_to_num(colour[name]), 0, 1) * 255) for name in "rgba"]
+    values = (colour[name] for name in "rgba")
+    return [int(min(max(value, 0.0), 1.0) * 255) if value == value else 0 for value in values]
 
 
 def _colours(marker: dict[str, Any], count: int) -> list[list[int]]:

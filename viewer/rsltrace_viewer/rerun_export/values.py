@@ -62,6 +62,8 @@ def rotated_x(quaternions: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 
 def rotated(quaternion: Any, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Return points, shape (n, 3), turned by one rotation (x, y, z, w)."""
+    if not any(quaternion[:3]):
+        return points
     axis = np.asarray(quaternion[:3], dtype=np.float64)
     twice = 2.0 * np.cross(axis, points)
     return np.asarray(points + float(quaternion[3]) * twice + np.cross(axis, twice))

@@ -7,23 +7,34 @@ from textual.content import Content
 from textual.widgets import Static
 
 from rsltrace_viewer.keys import footer_keys
-from rsltrace_viewer.model.cells import cells
+from rsltrace_viewer.model.cells import cells, fit, wrap
 
 
 class HeaderBar(Static):
-    """What is open, in one line or two."""
+    """What is open, in a line; with two traces how they compare, in one or two more."""
 
     DEFAULT_CSS = """
-    HeaderBar { height: auto; max-height: 3; background: $panel; color: $text; padding: 0 1; }
+    HeaderBar { height: auto; background: $panel; color: $text; padding: 0 1; }
     """
 
-    def show(self, title: str, facts: str, verdict: str = "", *, bad: bool = False) -> None:
-        """Show a title, facts about it, and the verdict on two runs on a line of its own."""
-        text = Content.assemble((title, "bold"), "  ", (facts, "$text-muted"))
-        if verdict:
+    def show(
+        self, title: str, facts: str, verdict: str = "", *, bad: bool = False, lines: int = 2
+    ) -> None:
+        """Show a title, facts about it, and the verdict on two runs in at most ``lines``."""
+        width = max(self.app.size.width - 2, 1)
+        title = fit(title, min(width, cells(title)))
+        rest = f"  {facts}"
+        room = width - cells(title)
+        rest = rest if cells(rest) <= room else fit(rest, room)
+        parts: list[tuple[str, str] | str] = [(title, "bold"), (rest, "$text-muted")]
+        if verdict and lines:
             style = "bold $text-error" if bad else "bold $text-success"
-            text = Content.assemble(text, "\n", (verdict, style))
-        self.update(text, layout=bool(verdict))
+            wrapped = wrap(verdict, width)
+            shown = wrapped[:lines]
+            if len(wrapped) > lines:
+                shown[-1] = fit(f"{shown[-1]} {wrapped[lines]}", width)
+            parts += [("\n" + line, style) for line in shown]
+        self.update(Content.assemble(*parts))
 
 
 class FooterBar(Static):

@@ -117,18 +117,13 @@ class Prompt(Vertical):
         self.post_message(self.Answered(question.kind, event.value))
 
     def on_key(self, event: events.Key) -> None:
-        """Tab completes; Escape puts the question aside."""
-        if self._question is None:
-            return
-        if event.key == "tab":
-            event.stop()
-            event.prevent_default()
-            self._complete()
-        elif event.key == "escape":
+        """Escape puts the question aside."""
+        if self._question is not None and event.key == "escape":
             event.stop()
             self.put_aside()
 
-    def _complete(self) -> None:
+    def complete(self) -> None:
+        """Finish the last word as far as there is one way to."""
         question, field = self._question, self.query_one(Input)
         if question is None or question.complete is None:
             return
