@@ -24,7 +24,13 @@ _WIDTH = 100
 _ASCII = {ord("└"): "`-", ord("…"): "..."}
 
 
-class _Tolerance(click.ParamType[tuple[str, float]]):
+if TYPE_CHECKING:
+    _Type = click.ParamType[tuple[str, float]]
+else:
+    _Type = click.ParamType  # older versions of click know no types here
+
+
+class _Tolerance(_Type):
     """``FIELD=TOL``: a glob of fields and a number."""
 
     name = "tolerance"

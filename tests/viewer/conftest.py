@@ -176,3 +176,56 @@ def drive(
 def drive_fixture() -> object:
     """``drive(paths, steps, size, ...)`` runs the app and ``async def steps(driver)``."""
     return drive
+
+
+@pytest.fixture(scope="session")
+def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A trace with all that is odd: fan-out, a 50 MB message, types that cannot be decoded, names
+    with wide characters and with what steers terminals, a payload that was not kept, a warning."""
+    from trace_maker import CDR, LOG_SCHEMA, Opened, cdr_string, log_message
+
+    from rsltrace.model.entity import EntityKind
+    from rsltrace.model.event import EventFlag, EventKind, OutputKind
+
+    path = tmp_path_factory.mktemp("viewer") / "odd.mcap"
+    with Opened(path) as feeder:
+        writer = feeder.writer
+        node = feeder.entity(EntityKind.NODE, "/ロボット_手_とても長い名前のノード")
+        evil = feeder.entity(EntityKind.NODE, "/evil\x1b[2J\u202enode[bold]")
+        timer = feeder.entity(EntityKind.TIMER, "tick", node=node)
+        big = feeder.entity(EntityKind.PUBLISHER, "/big", node=node, type_="x_msgs/msg/Big")
+        bad = feeder.entity(EntityKind.PUBLISHER, "/bad", node=node, type_="x_msgs/msg/Bad")
+        rosout = feeder.entity(
+            EntityKind.PUBLISHER, "/rosout", node=evil, type_="rcl_interfaces/msg/Log"
+        )
+        words = feeder.entity(EntityKind.PUBLISHER, "/[red]", node=evil, type_="x_msgs/msg/Text")
+        subs = [
+            feeder.entity(EntityKind.SUBSCRIPTION, "/big", node=evil, type_="x_msgs/msg/Big")
+            for _ in range(3)
+        ]
+        channels = {
+            "big": writer.add_channel("/big", "x_msgs/msg/Big", "uint8[] data\n"),
+            "bad": writer.add_channel("/bad", "x_msgs/msg/Bad", "nonsense is no schema {{{\n"),
+            "log": writer.add_channel("/rosout", "rcl_interfaces/msg/Log", LOG_SCHEMA),
+            "text": writer.add_channel("/[red]", "x_msgs/msg/Text", "string text\n"),
+        }
+        for created in (node, evil):
+            feeder.output(OutputKind.ENTITY, created, b"identity")
+        feeder.event(EventKind.CONSTRUCT, 0, 0)
+        data = CDR + (50_000_000).to_bytes(4, "little") + bytes(50_000_000)
+        feeder.output(OutputKind.MESSAGE, big, data, feeder.payload(channels["big"], 5, data))
+        cause = feeder.event(EventKind.TIMER, timer, 5)
+        for subscription in subs:
+            feeder.event(EventKind.SUBSCRIPTION, subscription, 5, input_hash=1, cause=(cause, 0))
+        feeder.output(
+            OutputKind.MESSAGE, bad, b"junk", feeder.payload(channels["bad"], 6, b"junk" * 100)
+        )
+        feeder.output(OutputKind.MESSAGE, bad, b"not kept")
+        feeder.event(EventKind.TIMER, timer, 6, flags=EventFlag.SUSPENDED)
+        text = cdr_string(CDR, "日本語\x1b]0;title\x07[bold]text[/bold]\n\u202e")
+        feeder.output(OutputKind.MESSAGE, words, text, feeder.payload(channels["text"], 7, text))
+        log = log_message(7, 30, "evil", "too \x1b[31m far [link=x]")
+        feeder.output(OutputKind.LOG, rosout, log, feeder.payload(channels["log"], 7, log))
+        feeder.event(EventKind.TIMER, 99, 7)  # an entity that the trace does not describe
+        writer.close(result={"stop_reason": "done", "exit_code": "0"})
+    return path

@@ -11,7 +11,6 @@ from rsltrace_viewer.keys import KEYS
 from rsltrace_viewer.model.match import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.screens.help import HelpScreen
-from rsltrace_viewer.screens.pick import PickScreen
 from rsltrace_viewer.screens.plot import PlotScreen, PlotView
 from rsltrace_viewer.screens.report import ReportScreen
 from rsltrace_viewer.widgets.bars import FooterBar
@@ -101,28 +100,6 @@ def test_cause_effects_and_the_way_back(made: Path, drive: Drive) -> None:
         assert viewer.place == 3
 
     drive(made, steps)
-
-
-def test_several_effects_are_a_choice(drive: Drive) -> None:
-    folder = Path(__file__).parents[2] / "sample_traces" / "missing_event"
-
-    async def steps(viewer: Any) -> None:
-        session = viewer.app.session
-        run = session.a
-        causes = [int(run.row(i)["cause_event"]) for i in range(run.count)]
-        several = [c for c in set(causes) if causes.count(c) > 1 and c < run.count]
-        if not several:
-            pytest.skip("no event of this sample has several effects")
-        await viewer.press("i")
-        await viewer.type(str(several[0]))
-        await viewer.press("e")
-        assert isinstance(viewer.app.screen, PickScreen)
-        await viewer.press("j", "enter")
-        assert causes[viewer.place] == several[0]
-        await viewer.press("b", "e", "escape")
-        assert viewer.place == several[0]
-
-    drive(folder / "a.mcap", steps)
 
 
 def test_exceptions_logs_warnings_and_findings(made: Path, run: Run, drive: Drive) -> None:

@@ -56,9 +56,8 @@ class Comparison:
         self.diff_run_a = DiffRun(a.trace, identity, False)
         self.diff_run_b = DiffRun(b.trace, identity, True)
         if first is not None:
-            self._stretches = iter(
-                Stretches(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_STRETCH)
-            )
+            stretches = Stretches(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_STRETCH)
+            self._stretches = (part for part in stretches if isinstance(part, Stretch))
             self.advance()
             self._first_place = self._blocks[0] if self._blocks else first
 

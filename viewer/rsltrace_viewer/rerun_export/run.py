@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import rerun as rr
+from rerun.chunk import Chunk
 
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import Clock
@@ -12,6 +15,8 @@ from rsltrace_viewer.rerun_export.events import EventRows
 from rsltrace_viewer.rerun_export.logs import LogRows
 from rsltrace_viewer.rerun_export.messages import MessageRows, Seen
 from rsltrace_viewer.rerun_export.paths import Paths
+
+_CHUNKS_AHEAD = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,10 +35,17 @@ def export_run(trace: Trace, label: str, clock: Clock, recording: rr.RecordingSt
     """Send a run as ``label`` (empty, ``a`` or ``b``). Raises TraceError for damage in it."""
     paths = Paths(label, trace)
     events = EventRows(trace, paths, clock)
-    recording.send_chunks(events.chunks())
+    _send(recording, events.chunks())
     logs = LogRows(trace, paths, clock)
-    recording.send_chunks(logs.chunks())
+    _send(recording, logs.chunks())
     messages = MessageRows(trace, paths, clock, recording)
-    recording.send_chunks(messages.chunks())
+    _send(recording, messages.chunks())
     gap_ns = max(trace.end_ns - trace.start_ns, 1) // max(trace.event_count, 1)
     return Shown(paths, messages.seen, tuple(events.active_nodes), logs.count, max(gap_ns, 1))
+
+
+def _send(recording: rr.RecordingStream, chunks: Iterator[Chunk]) -> None:
+    """Send chunks, never far ahead of what is written: Rerun's queue to the file has no end."""
+    while batch := list(islice(chunks, _CHUNKS_AHEAD)):
+        recording.send_chunks(batch)
+        recording.flush()

@@ -1,0 +1,191 @@
+"""``rsltrace view``: exports, errors, choosing a trace, a real terminal, a browser."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib.util
+import shutil
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner, Result
+from rsltrace_viewer.choose import ChooseApp, traces_in
+
+from rsltrace.cli.main import cli
+
+
+def view(*arguments: object) -> Result:
+    """Run the command in this process."""
+    return CliRunner().invoke(cli, ["view", *map(str, arguments)])
+
+
+def test_a_screen_as_text_and_as_a_picture(made: Path, tmp_path: Path) -> None:
+    text, picture = tmp_path / "screen.txt", tmp_path / "screen.svg"
+    assert view(made, "--export", text, "--size", "100x30", "--at", 3).exit_code == 0
+    lines = text.read_text().splitlines()
+    assert len(lines) == 30
+    assert any(line.startswith(">") and "/listener" in line for line in lines)
+    assert view(made, "--export", picture, "--keys", "end d").exit_code == 0
+    svg = picture.read_text()
+    assert svg.startswith("<svg")
+    assert "too&#160;many" in svg
+    assert "@font-face" not in svg
+    assert "http" not in svg.replace("http://www.w3.org/2000/svg", "").replace(
+        "https://www.textualize.io/", ""
+    )
+
+
+def test_pictures_are_reproducible(made: Path, tmp_path: Path) -> None:
+    one, other = tmp_path / "one.svg", tmp_path / "other.svg"
+    assert view(made, "--export", one).exit_code == 0
+    assert view(made, "--export", other).exit_code == 0
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_starting_somewhere(made: Path, tmp_path: Path) -> None:
+    text = tmp_path / "screen.txt"
+    assert view(made, "--export", text, "--at", "11s", "--filter", "kind:timer").exit_code == 0
+    selected = next(line for line in text.read_text().splitlines() if line.startswith(">  "))
+    assert " 11.0" in selected
+    assert "timer" in selected
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--export", "x.png"], "should end in .svg or .txt"),
+        (["--export", "x.txt", "--size", "big"], "no size"),
+        (["--export", "x.txt", "--at", "soon"], "no time"),
+        (["--export", "x.txt", "--filter", "kin:3"], "^^^"),
+        (["--export", "no/such/folder/x.txt"], "cannot be written"),
+        ([], "needs a terminal"),
+    ],
+)
+def test_what_is_wrong_is_said(
+    made: Path, arguments: list[str], message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = view(made, *arguments)
+    assert result.exit_code == 2
+    assert message in result.output
+
+
+def test_files_that_cannot_be_opened(made: Path, tmp_path: Path) -> None:
+    for path, message in ((tmp_path / "no.mcap", "does not exist"), (tmp_path, "is a folder")):
+        result = view(path, "--export", tmp_path / "x.txt")
+        assert result.exit_code == 2
+        assert message in result.output
+    assert "takes more" in view(made, made, made).output
+    assert "one trace" in view(made, made, "--follow").output
+
+
+def test_without_textual_it_says_what_to_install(
+    made: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "textual" else find(name)
+    )
+    result = view(made)
+    assert result.exit_code == 2
+    assert "pip install 'rsltrace[view]'" in result.output
+
+
+def test_the_traces_of_a_folder(
+    made: Path, long: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "there is no trace in this folder" in view().output
+    shutil.copy(made, tmp_path / "made.mcap")
+    (tmp_path / "sub").mkdir()
+    shutil.copy(long, tmp_path / "sub" / "long.mcap")
+    (tmp_path / "junk.mcap").write_bytes(b"junk")
+    assert "this folder has" in view().output
+    found = traces_in(Path())
+    assert {str(entry.path) for entry in found} == {"made.mcap", "sub/long.mcap"}
+
+    async def choose(*keys: str) -> Any:
+        app = ChooseApp(found)
+        async with app.run_test() as pilot:
+            await pilot.press(*keys)
+        return app.return_value
+
+    assert asyncio.run(choose("enter")) == [found[0].path]
+    assert asyncio.run(choose("j", "k", "down", "enter")) == [found[1].path]
+    assert asyncio.run(choose("space", "j", "enter")) == [found[0].path, found[1].path]
+    assert asyncio.run(choose("space", "space", "enter")) == [found[0].path]
+    assert asyncio.run(choose("q")) is None
+
+
+@pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux")
+def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
+    server = f"rsltrace-test-{tmp_path.name}"
+
+    def tmux(*arguments: str) -> str:
+        command = ["tmux", "-L", server, "-f", "/dev/null", *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    def wait_for(*wanted: str) -> str:
+        end = time.monotonic() + 30
+        screen = ""
+        while time.monotonic() < end:
+            screen = tmux("capture-pane", "-p")
+            if all(part in screen for part in wanted):
+                return screen
+            time.sleep(0.1)
+        raise AssertionError(f"{wanted} did not come up:\n{screen}")
+
+    command = f"{sys.executable} -m rsltrace view {made}; echo left with $?; cat"
+    tmux("new-session", "-d", "-x", "80", "-y", "24", command)
+    try:
+        wait_for("made.mcap", "1/600", "/talker")
+        tmux("send-keys", "j", "Down")
+        wait_for("3/600")
+        tmux("send-keys", "PPage", "End")
+        wait_for("600/600", "ValueError: too many")
+        tmux("send-keys", "/", "kind:srv", "Enter")
+        wait_for("srv", "/check")
+        tmux("resize-window", "-x", "150", "-y", "40")
+        wait_for("what it did", "digest")
+        tmux("send-keys", "q")
+        screen = wait_for("left with 0")
+        assert "Traceback" not in screen
+        assert "/talker" not in screen  # the terminal is as it was before
+    finally:
+        tmux("kill-server")
+
+
+def test_in_a_browser_on_this_machine_only(made: Path) -> None:
+    pytest.importorskip("textual_serve")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "rsltrace", "view", str(made), "--serve", "--port", str(port)]
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        page = ""
+        for _ in range(200):
+            try:
+                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=2) as answer:
+                    page = answer.read().decode()
+                break
+            except OSError:
+                time.sleep(0.1)
+        assert "rsltrace view" in page
+        bound = [line for line in _listening() if f":{port:04X}" in line]
+        assert bound
+        assert all("0100007F" in line for line in bound)
+    finally:
+        server.terminate()
+        server.wait(10)
+
+
+def _listening() -> list[str]:
+    lines = Path("/proc/net/tcp").read_text().splitlines()[1:]
+    return [line.split()[1] for line in lines if line.split()[3] == "0A"]
