@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 from binascii import crc32
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -42,6 +42,7 @@ _INDEX_ENTRY_BYTES = 16
 _CHUNK_INDEX = int(Opcode.CHUNK_INDEX)
 _CHUNK_INDEX_HEAD = struct.Struct("<QQQQI")
 _OFFSET_ENTRY = struct.Struct("<HQ")
+_U32 = struct.Struct("<I")
 _U64 = struct.Struct("<Q")
 
 
@@ -79,8 +80,9 @@ class ChunkEntry(NamedTuple):
 class TraceIndex:
     """Everything needed to find things in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
 
-    ``summary_start`` is where the data section is over (0: nobody knows). ``chunks`` reads the
-    list of chunks, which only payloads need and opening does not.
+    ``summary_start`` is where the data section is over (0: nobody knows). ``chunks_with`` returns,
+    in file order, the chunks that hold messages of some channels: a long run has thousands, which
+    only payloads need and opening does not. It may raise Damaged.
     """
 
     complete: bool
@@ -91,7 +93,7 @@ class TraceIndex:
     attachments: dict[str, Span] = field(default_factory=dict)
     summary_start: int = 0
     segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
-    chunks: Callable[[], Sequence[ChunkEntry]] = tuple
+    chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
 
 
 Schemas = dict[int, tuple[str, str, str]]
@@ -189,7 +191,11 @@ def _parse_summary(index: TraceIndex, summary: bytes) -> None:
                 index.attachments[entry.text()] = span
             else:
                 index.metadata[entry.text()] = span
-    index.chunks = lambda: [_chunk_entry(summary, begin) for begin in chunks]
+    index.chunks_with = lambda channels: [
+        _chunk_entry(summary, begin)
+        for begin in chunks
+        if not channels.isdisjoint(_channels_of_chunk(summary, begin))
+    ]
 
 
 def add_schema(schemas: Schemas, body: bytes) -> None:
@@ -214,31 +220,35 @@ def _message_counts(statistics: bytes) -> dict[int, int]:
     return {row[0]: row[1] for row in cursor.integers("<HQ")}
 
 
-def _chunk_entry(summary: bytes, begin: int) -> ChunkEntry:
-    """Read the ChunkIndex whose body begins at ``begin`` (and is whole). Raises Damaged.
+def _channels_of_chunk(summary: bytes, begin: int) -> Iterable[int]:
+    """Return the channels of the ChunkIndex whose body begins at ``begin`` (and is whole)."""
+    map_at, map_end = _map_of_chunk(summary, begin)
+    if map_end - map_at == _OFFSET_ENTRY.size:  # events or outputs: most chunks
+        return (_OFFSET_ENTRY.unpack_from(summary, map_at)[0],)
+    return [channel_id for channel_id, _ in _OFFSET_ENTRY.iter_unpack(summary[map_at:map_end])]
 
-    A run of ten million events has several thousand, so this is written for speed.
-    """
-    body_bytes = RECORD_HEAD.unpack_from(summary, begin - RECORD_HEAD.size)[1]
-    end = begin + body_bytes
-    if body_bytes < _CHUNK_INDEX_HEAD.size:
-        raise Damaged("an entry of the list of chunks is cut off")
-    _, _, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(summary, begin)
+
+def _map_of_chunk(summary: bytes, begin: int) -> tuple[int, int]:
+    """Return where the map of message indexes in a ChunkIndex begins and ends. Raises Damaged."""
+    (body_bytes,) = _U64.unpack_from(summary, begin - _U64.size)
     map_at = begin + _CHUNK_INDEX_HEAD.size
-    map_end = map_at + map_bytes
-    if map_bytes % _OFFSET_ENTRY.size or map_end + _U64.size > end:
-        raise Damaged("an entry of the list of chunks is cut off")
+    if body_bytes >= _CHUNK_INDEX_HEAD.size:
+        (map_bytes,) = _U32.unpack_from(summary, map_at - _U32.size)
+        map_end: int = map_at + map_bytes
+        if map_bytes % _OFFSET_ENTRY.size == 0 and map_end + _U64.size <= begin + body_bytes:
+            return map_at, map_end
+    raise Damaged("an entry of the list of chunks is cut off")
+
+
+def _chunk_entry(summary: bytes, begin: int) -> ChunkEntry:
+    """Read the ChunkIndex whose body begins at ``begin`` (and is whole). Raises Damaged."""
+    map_at, map_end = _map_of_chunk(summary, begin)
+    _, _, offset, length, _ = _CHUNK_INDEX_HEAD.unpack_from(summary, begin)
     span = Span(offset, length)
     # Each index reaches to the next one: that gives its length, and so the number of messages.
     entries = _OFFSET_ENTRY.iter_unpack(summary[map_at:map_end])
     starts = [(index_at, channel_id) for channel_id, index_at in entries]
     behind = offset + length + _U64.unpack_from(summary, map_end)[0]
-    if len(starts) == 1:  # events or outputs: most chunks
-        index_at, channel_id = starts[0]
-        count = (behind - index_at - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
-        return ChunkEntry(
-            span, {channel_id: count}, {channel_id: Span(index_at, behind - index_at)}
-        )
     starts.sort()
     indexes: dict[int, Span] = {}
     counts: dict[int, int] = {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Iterator
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,7 @@ class PayloadReader:
         self._source = source
         self._index = index
         self._records = lru_cache(maxsize=_CHUNKS_CACHED)(self._read_records)
+        self._by_channel: dict[int, tuple[list[int], list[ChunkEntry]]] = {}
         self._offsets = lru_cache(maxsize=4 * _CHUNKS_CACHED)(self._read_offsets)
 
     def message(self, channel_id: int, sequence: int) -> tuple[int, bytes]:
@@ -49,12 +50,12 @@ class PayloadReader:
 
         Raises TraceError if the trace has no such message or is damaged where it is.
         """
-        firsts, entries = self._by_channel.get(channel_id, ([], []))
+        firsts, entries = self._of_channel(channel_id)
         position = bisect_right(firsts, sequence) - 1
         if position < 0:
             raise self._missing(channel_id, sequence)
         entry = entries[position]
-        offsets = self._offsets(entry.span, channel_id)
+        offsets = self._offsets(entry.span, entry.indexes.get(channel_id), channel_id)
         place = sequence - firsts[position]
         if place >= len(offsets):
             raise self._missing(channel_id, sequence)
@@ -66,46 +67,42 @@ class PayloadReader:
 
     def messages(self, channel_ids: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
         """Yield (stamp in ns, sequence, data) of all messages of some channels, in file order."""
-        for entry in self._chunks:
+        for entry in self._chunks_with(channel_ids):
             wanted = [c for c in entry.counts if c in channel_ids]
-            if not wanted:
-                continue
             records = self._read_records(entry.span)
-            places = [(offset, c) for c in wanted for offset in self._read_offsets(entry.span, c)]
+            places = [
+                (offset, c)
+                for c in wanted
+                for offset in self._read_offsets(entry.span, entry.indexes.get(c), c)
+            ]
             for offset, channel_id in sorted(places):
                 message = self._message_at(entry, records, offset, channel_id)
                 yield message.log_time, message.sequence, records[message.start : message.end]
 
-    @cached_property
-    def _chunks(self) -> list[ChunkEntry]:
+    def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
         try:
-            return list(self._index.chunks())
+            return self._index.chunks_with(channel_ids)
         except Damaged as error:
             raise TraceError(f"{self._source.name}: the index is damaged ({error})") from error
 
-    @cached_property
-    def _by_span(self) -> dict[Span, ChunkEntry]:
-        return {entry.span: entry for entry in self._chunks}
-
-    @cached_property
-    def _by_channel(self) -> dict[int, tuple[list[int], list[ChunkEntry]]]:
-        """By channel id: the first sequence in each chunk with messages of it, and the chunks."""
-        result: dict[int, tuple[list[int], list[ChunkEntry]]] = {}
-        counts: dict[int, int] = {}
-        for entry in self._chunks:
-            for channel_id, count in entry.counts.items():
-                firsts, entries = result.setdefault(channel_id, ([], []))
-                firsts.append(counts.get(channel_id, 0))
-                entries.append(entry)
-                counts[channel_id] = firsts[-1] + count
-        return result
+    def _of_channel(self, channel_id: int) -> tuple[list[int], list[ChunkEntry]]:
+        """Return the chunks with messages of a channel, and the first sequence in each."""
+        found = self._by_channel.get(channel_id)
+        if found is None:
+            firsts: list[int] = []
+            count = 0
+            entries = self._chunks_with(frozenset((channel_id,)))
+            for entry in entries:
+                firsts.append(count)
+                count += entry.counts[channel_id]
+            found = self._by_channel[channel_id] = (firsts, entries)
+        return found
 
     def _read_records(self, span: Span) -> bytes:
         return read_chunk(self._source, span)
 
-    def _read_offsets(self, span: Span, channel_id: int) -> list[int]:
+    def _read_offsets(self, span: Span, index_span: Span | None, channel_id: int) -> list[int]:
         """Return where in the records of a chunk the messages of a channel are."""
-        index_span = self._by_span[span].indexes.get(channel_id)
         if index_span is None:
             try:
                 walked = walk_messages(self._records(span))

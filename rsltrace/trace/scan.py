@@ -68,7 +68,9 @@ class _Scanner:
             for channel_id, count in entry.counts.items():
                 total = index.message_counts.get(channel_id, 0) + count
                 index.message_counts[channel_id] = total
-        index.chunks = lambda: self._chunks
+        index.chunks_with = lambda channels: [
+            entry for entry in self._chunks if not channels.isdisjoint(entry.counts)
+        ]
         return index
 
     def _take(self) -> int | None:

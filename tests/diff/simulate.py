@@ -187,7 +187,7 @@ class Simulation:
                 writer._write_segment() if writer._rests else None
         return self
 
-    # -- construction --------------------------------------------------------------------------
+    # -- construction ----------------------------------------------------------------------------
 
     def _write_job(self, writer: TraceWriter) -> None:
         # What a node is made of is in the job, as parameters would be.
@@ -350,7 +350,7 @@ class Simulation:
                 sender = node.publishers[publication.topic]
                 self._send(OutputKind.MESSAGE, sender, publication.topic, message(hops, data))
 
-    # -- outputs -----------------------------------------------------------------------------------
+    # -- outputs ---------------------------------------------------------------------------------
 
     def _send(self, kind: OutputKind, sender: int, topic: str, data: bytes) -> None:
         data = self._bent(data)

@@ -166,6 +166,9 @@ def test_the_earliest_divergence_of_all_topics_leads(compare: Any) -> None:
     assert diff.first is not None
     assert diff.first.topic == "/p"
     assert [topic.first is not None for topic in diff.topics] == [True, True]
+    diff = compare(late + early, points(20, "/p", x6=9.0) + changed)
+    assert diff.first is not None
+    assert diff.first.topic == "/q"
     # Counted from the start of each recording, whenever that was.
     shifted = [(stamp + 1000 * SECOND, topic, data) for stamp, topic, data in changed]
     diff = compare(early, shifted)
@@ -238,6 +241,12 @@ def test_by_stamp(compare: Any) -> None:
     late = [(stamp + (5 if stamp == 8 * SECOND else 0), *rest) for stamp, *rest in a]
     assert compare(a, late).identical
     assert any("log times are not compared" in note for note in compare(a, late).notes)
+    headless = compare(a, a[3:], DiffOptions(by="stamp"))
+    assert counts(headless) == (17, 0, 0, 3, 0)
+    # Both count from the earliest message of the two, here one of /q.
+    longer = points(20, "/q") + points(20, x9=0.0)[3:]
+    changed = compare(a[3:], longer, DiffOptions(by="stamp"))
+    assert [topic.first.after_ns for topic in changed.topics if topic.first] == [9 * SECOND]
     diff = compare(a, late, DiffOptions(by="stamp"))
     assert counts(diff) == (19, 0, 0, 1, 1)
     assert diff.first is not None

@@ -414,10 +414,10 @@ def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
     ]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(
-    arrays,
-    arrays,
+    st.lists(st.sampled_from([0.0, -0.0, 1.0, math.nan]), min_size=1, max_size=3),
+    st.lists(st.sampled_from([0.0, -0.0, 1.0, math.nan]), min_size=1, max_size=3),
     st.sampled_from([0.0, -0.0, 1.0, math.nan]),
     st.sampled_from([0.0, -0.0, 1.0, math.nan]),
     st.sampled_from([(), ("double",), ("ranges",), ("ranges[0]",), ("points",), ("*",)]),
@@ -430,3 +430,44 @@ def test_content_keys_are_equal_exactly_when_nothing_compared_differs(
     options = DiffOptions(ignore=ignore)
     keys = [ContentKeys(FieldRules(options)).key(one) for one in (a, b)]
     assert (keys[0] == keys[1]) == (diff_messages(a, b, options) == ((), 0))
+
+
+def test_content_keys_see_every_kind_of_field() -> None:
+    changes: list[dict[str, Any]] = [
+        {"single": 1.0},
+        {"big": 1},
+        {"small": -1},
+        {"flag": True},
+        {"text": "x"},
+        {"ranges": np.array([0, 0, 0, 1], dtype=np.float32)},
+        {"covariance": np.full(9, -0.0)},
+        {"counts": np.array([7])},
+        {"bits": np.array([False, True, False])},
+        {"data": np.array([1], dtype=np.uint8)},
+        {"names": ["", ""]},
+        {"points": []},
+    ]
+    keys = ContentKeys(FieldRules(ONLY))
+    seen = {keys.key(message(**change)) for change in ({}, *changes)}
+    assert len(seen) == 1 + len(changes)
+    ignoring = ContentKeys(FieldRules(DiffOptions(ignore=("ranges[2]",))))
+    one, other, third = (
+        message(ranges=np.array(values, dtype=np.float32))
+        for values in ([1, 2, 3], [1, 2, 9], [1, 3, 3])
+    )
+    assert ignoring.key(one) == ignoring.key(other) != ignoring.key(third)
+
+
+def test_tolerances_in_arrays_do_not_cover_what_has_no_distance() -> None:
+    everything = DiffOptions(absolute=(("*", 1e300),), relative=(("*", 1e300),))
+
+    def tolerated(a: list[float], b: list[float]) -> bool:
+        left, right = (message(covariance=np.array(side + [0.0] * 7)) for side in (a, b))
+        return only(left, right, everything).within_tolerance
+
+    assert tolerated([1.0, 2.0], [3.0, 4.0])
+    assert not tolerated([1.0, math.inf], [3.0, -math.inf])
+    assert not tolerated([1.0, math.nan], [3.0, 4.0])
+    assert not tolerated([1.0, math.inf], [3.0, 4.0])
+    odd = nan_of(0x7FF8000000000001)
+    assert tolerated([1.0, math.nan], [3.0, odd])

@@ -487,6 +487,11 @@ def test_tolerance_is_said_but_does_not_change_the_exit_status() -> None:
     assert "equal within tolerance, not identical" in text
     assert tolerated().exit_code == 1
     assert "equal within tolerance" not in render(nondeterministic(), "text")
+    found = tolerated().divergences[0]
+    coarse = dataclasses.replace(found.messages[0], fields=ALL_FIELDS[:1])
+    both = dataclasses.replace(found, messages=(*found.messages, coarse))
+    partly = dataclasses.replace(tolerated(), divergences=(both,))
+    assert "equal within tolerance" not in render(partly, "text")
     assert json.loads(render(tolerated(), "json"))["within_tolerance"] is True
     assert "::notice" in render(equal_within_tolerance(), "github")
 

@@ -35,7 +35,7 @@ GOLDEN = Path(__file__).parent / "golden"
 
 @pytest.fixture(scope="session")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of two nodes: 600 events with services, logs, and an exception at the end."""
+    """A run of two nodes: 603 events with services, logs, and an exception at the end."""
     from trace_maker import write_run
 
     path = tmp_path_factory.mktemp("viewer") / "made.mcap"

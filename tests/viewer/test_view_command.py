@@ -37,7 +37,7 @@ def test_a_screen_as_text_and_as_a_picture(made: Path, tmp_path: Path) -> None:
     assert "too&#160;many" in svg
     assert "@font-face" not in svg
     assert "http" not in svg.replace("http://www.w3.org/2000/svg", "").replace(
-        "https://www.textualize.io/", ""
+        "https://www.textualize.io", ""
     )
 
 
@@ -144,11 +144,11 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
     command = f"{sys.executable} -m rsltrace view {made}; echo left with $?; cat"
     tmux("new-session", "-d", "-x", "80", "-y", "24", command)
     try:
-        wait_for("made.mcap", "1/600", "/talker")
+        wait_for("made.mcap", "1/603", "/talker")
         tmux("send-keys", "j", "Down")
-        wait_for("3/600")
+        wait_for("3/603")
         tmux("send-keys", "PPage", "End")
-        wait_for("600/600", "ValueError: too many")
+        wait_for("603/603", "ValueError: too many")
         tmux("send-keys", "/", "kind:srv", "Enter")
         wait_for("srv", "/check")
         tmux("resize-window", "-x", "150", "-y", "40")

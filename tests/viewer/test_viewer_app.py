@@ -451,7 +451,7 @@ def test_every_sample_can_be_walked_through(drive: Drive, name: str) -> None:
 
 def test_identical_traces_say_so(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
-        assert "identical: all 600 events" in viewer.text or "= identical" in viewer.text
+        assert "identical: all 603 events" in viewer.text or "= identical" in viewer.text
         await viewer.press("n")
         assert "no later divergence" in viewer.text
         await viewer.press("v")

@@ -17,8 +17,9 @@ Drive = Callable[..., None]
 
 EVERY_KEY = (
     "down up pagedown pageup home end right_square_bracket left_square_bracket right_curly_bracket "
-    "left_curly_bracket right_parenthesis left_parenthesis c e b f m apostrophe quotation_mark x X l L "
-    "w W u U n N escape enter escape tab shift+tab plus minus 0 z z p q R d d v o question_mark q"
+    "left_curly_bracket right_parenthesis left_parenthesis c e b f m apostrophe quotation_mark x X "
+    "l L w W u U n N escape enter escape tab shift+tab plus minus 0 z z p q R d d v o "
+    "question_mark q"
 ).split()
 
 

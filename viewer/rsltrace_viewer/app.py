@@ -111,7 +111,7 @@ class ViewerApp(App[None]):
         self.timeline.focus()
         if self._start is not None:
             session.go(self._start, remember=False)
-        self.timeline.empty = "no events in this trace"
+        self.timeline.empty = _NO_EVENTS
         self._show_header()
         self.call_after_refresh(self._after_first)
 
@@ -253,7 +253,8 @@ class ViewerApp(App[None]):
         if not status and session.filter_text:
             status = f"filter: {session.rows.count:,} of {session.view.count:,}"
         if not status and not session.empty:
-            status = f"{session.place + 1:,}/{session.view.count:,}"
+            following = "following  " if self._follow is not None else ""
+            status = f"{following}{session.place + 1:,}/{session.view.count:,}"
         searching = "match" if session.search is not None else "divergence" if session.b else ""
         self.screen_stack[0].query_one(FooterBar).show(
             two=session.b is not None, searching=searching, status=status
@@ -528,6 +529,7 @@ class ViewerApp(App[None]):
         rows = self.session.set_filter(text)
         self.workers.cancel_group(self, "filter")
         if rows is None:
+            self.timeline.empty = _NO_EVENTS
             self._say("")
             self._show_rows(centre=True)
             return
@@ -722,6 +724,7 @@ class ViewerApp(App[None]):
         self.exit()
 
 
+_NO_EVENTS = "no events in this trace"
 _ONLY = ("only-timeline", "only-inspector", "only-lanes")
 
 

@@ -228,10 +228,13 @@ class Session:
         if here is None:
             return None
         run, index = here
-        event = run.event(index)
+        try:
+            event, outputs = run.event(index), run.outputs(index)
+        except TraceError:
+            return None
         entity = run.entities.get(event.entity)
         if event.kind is EventKind.CONSTRUCT:
-            made = next((o for o in run.outputs(index) if o.kind is OutputKind.ENTITY), None)
+            made = next((o for o in outputs if o.kind is OutputKind.ENTITY), None)
             entity = run.entities.get(made.entity) if made is not None else entity
         if entity is None:
             return None
@@ -241,8 +244,8 @@ class Session:
             return match.OfEntities(match.ids([entity.id])), run.entity_name(entity.id)
         topic = entity.name if entity.kind in WITH_TOPIC else ""
         if not topic:
-            sent = next((o for o in run.outputs(index) if o.kind is OutputKind.MESSAGE), None)
-            topic = run.entities[sent.entity].name if sent is not None else ""
+            sent = next((o for o in outputs if o.kind is OutputKind.MESSAGE), None)
+            topic = run.entity_name(sent.entity) if sent is not None else ""
         if not topic:
             return None
         return match.OfEntities(match.ids(run.ids_on(topic)), outputs=True), topic

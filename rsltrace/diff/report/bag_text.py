@@ -46,7 +46,7 @@ def bag_report(diff: BagDiff, options: DiffOptions, width: int = 100) -> list[Li
         cut(row, width) for row in in_columns([_side_cells(*side) for side in sides], widest=60)
     ]
     head.append(line(f"  verdict: {diff.verdict.value}; messages matched by {diff.by}"))
-    sections = []
+    sections = [_notes(diff, width)]
     if diff.first is not None:
         sections.append(_message(diff.first, width))
         sections.append(_before(diff.first, width))
@@ -55,7 +55,6 @@ def bag_report(diff: BagDiff, options: DiffOptions, width: int = 100) -> list[Li
         for topic in diff.topics:
             if topic.first is not None and topic.first is not diff.first:
                 sections.append(_message(topic.first, width))
-    sections.append(_notes(diff, width))
     if diff.next_step:
         row = line(("next: ", TITLE), (printable(diff.next_step), COMMAND))
         sections.append(Section((), [row], 1, ""))

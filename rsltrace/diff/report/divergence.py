@@ -101,7 +101,7 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
         rows.append(line(f"    {shortened(printable(message.preview), width - 4)}"))
     if message.reason:
         rows += wrapped(f"    {printable(message.reason)}", width, style=FAINT, indent="    ")
-    if not message.preview:
+    if not message.preview and (message.presence == "both" or message.reason):
         rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
     return rows
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from rsltrace.diff.model import Diff, Divergence, Side
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
@@ -38,23 +36,23 @@ _ALL_HINT = "--all shows them"
 def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Line]:
     """Return the report of two traces, at most ``HEIGHT`` lines unless ``options.everything``."""
     head = _head(diff, width)
+    hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
+    # First what else to know of the comparison: that the jobs are different ones, or a file cut.
+    before = _notes([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
     if not diff.divergences:
-        sections = [_settings(diff, width), _notes(diff, width)]
-        return fitted(head, sections, None)
+        return fitted(head, [before, _settings(diff, width)], None)
     first, *others = diff.divergences
-    sections = divergence_sections(first, width, options)
-    sections.append(_afterwards(diff, width))
-    sections.append(_settings(diff, width))
+    sections = [
+        before,
+        *divergence_sections(first, width, options),
+        _afterwards(diff, width),
+        _settings(diff, width),
+    ]
     if not options.everything:
-        hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
-        notes = tuple(note for note in diff.notes if not note.endswith(_ALL_HINT))
-        sections.append(_notes(dataclasses.replace(diff, notes=notes), width))
-        sections.append(_next(first, len(others), hidden=hidden))
         # Whoever asks for a longer context wants to see it.
-        return fitted(head, sections, HEIGHT + 2 * max(options.context - CONTEXT, 0))
-    sections.append(_notes(diff, width))
-    sections.append(_next(first, 0))
-    lines = fitted(head, sections, None)
+        height = HEIGHT + 2 * max(options.context - CONTEXT, 0)
+        return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
+    lines = fitted(head, [*sections, _next(first, 0)], None)
     for number, other in enumerate(others, start=2):
         lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
         lines += wrapped(sentence_text(other.sentence), width, style=BAD)
@@ -86,8 +84,10 @@ def _head(diff: Diff, width: int) -> list[Line]:
     sides = [("a", SIDE_A, diff.a), ("b", SIDE_B, diff.b)]
     lines += in_columns([_side_cells(*side) for side in sides], widest=60)
     if not diff.identical:
-        word = "event before agrees" if diff.agreeing == 1 else "events before agree"
-        verdict = f"  verdict: {diff.verdict.value}; {diff.agreeing} {word}"
+        agree = f"the first {diff.agreeing} events agree"
+        if diff.agreeing < 2:
+            agree = "the first event agrees" if diff.agreeing else "no event before agrees"
+        verdict = f"  verdict: {diff.verdict.value}; {agree}"
         lines += wrapped(verdict, width, indent="  ")
         if within_tolerance(diff):
             lines.append(
@@ -157,8 +157,12 @@ def _value(text: str | None, room: int) -> str:
     return "-" if text is None else shortened(printable(text.strip()), room)
 
 
-def _notes(diff: Diff, width: int) -> Section:
-    rows = [row for note in diff.notes for row in wrapped(f"note: {printable(note)}", width)]
+def _notes(notes: list[str], width: int) -> Section:
+    rows = [
+        row
+        for note in notes
+        for row in wrapped(f"note: {printable(note)}", width, style=TITLE, indent="  ")
+    ]
     return Section((), rows, min(len(rows), 2), "notes")
 
 

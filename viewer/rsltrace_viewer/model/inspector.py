@@ -28,6 +28,7 @@ from rsltrace_viewer.model.text import LEVEL_WARN, log_of, output_text, outputs_
 from rsltrace_viewer.model.timeline import entity_of, node_of
 from rsltrace_viewer.model.tree import bytes_lines, message_lines, preview
 
+_MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _OUTPUTS_OPEN = 3
 """More outputs than this are listed closed: a constructor has dozens."""
 _EFFECTS_SHOWN = 12
@@ -51,7 +52,7 @@ def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = 
         outputs = run.outputs(index)
     except TraceError as error:
         return [Line(0, "", printable(str(error)), Role.ERROR, "error")]
-    lines = [*_title_lines(run, event), *_cause_lines(run, event, effects)]
+    lines = [*_title_lines(run, event, outputs), *_cause_lines(run, event, effects)]
     for make in (_input_lines, _output_lines):
         try:
             lines += make(run, event, outputs, openness)
@@ -62,15 +63,17 @@ def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = 
     return lines
 
 
-def _title_lines(run: Run, event: Event) -> Iterator[Line]:
+def _title_lines(run: Run, event: Event, outputs: list[Output]) -> Iterator[Line]:
     entity = entity_of(run, event) or event.kind.label
     title = f"{node_of(run, event)}  {event.kind.label} {entity}"
     yield Line(0, f"event {event.index}", title, Role.SECTION, "event")
     yield Line(1, "at", f"{format_seconds(event.stamp_ns)} s", Role.FIELD, "event.at")
-    for flag, text in ((EventFlag.RAISED, "raised an exception"), (EventFlag.SUSPENDED, "waits")):
-        if flag in event.flags:
-            role = Role.ERROR if flag is EventFlag.RAISED else Role.NOTE
-            yield Line(1, "!", text, role, f"event.{flag.name}")
+    if EventFlag.RAISED in event.flags:
+        raised = next((o for o in outputs if o.kind is OutputKind.EXCEPTION), None)
+        what = output_text(run, raised).partition(" ")[2] if raised is not None else ""
+        yield Line(1, "!", f"raised {what or 'an exception'}", Role.ERROR, "event.raised")
+    if EventFlag.SUSPENDED in event.flags:
+        yield Line(1, "…", "waits: it will be resumed", Role.NOTE, "event.suspended")
 
 
 def _input_lines(
@@ -108,7 +111,9 @@ def _output_lines(
     for place, output in enumerate(outputs):
         path = f"out.{place}"
         role = _output_role(run, output)
-        inside = output.sequence != NO_SEQUENCE and output.kind is not OutputKind.LOG
+        inside = output.kind in _MESSAGES or (
+            output.sequence != NO_SEQUENCE and output.kind is not OutputKind.LOG
+        )
         small = len(outputs) <= _OUTPUTS_OPEN
         opened = openness.is_open(path, small) if inside else None
         yield Line(1, str(place), _output_title(run, output), role, path, opened)
@@ -117,7 +122,7 @@ def _output_lines(
 
 
 def _output_title(run: Run, output: Output) -> str:
-    if output.kind in (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE):
+    if output.kind in _MESSAGES:
         return _channel_text(run, output)
     return output_text(run, output)
 

@@ -17,10 +17,11 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import Event, EventKind, Output
+from rsltrace.model.event import NO_EVENT, Event, EventKind, Output
 from rsltrace.model.printable import printable
+from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.segments import event_of
+from rsltrace.trace.segments import event_of, output_of
 
 RUN_LABEL = "(run)"
 """The node column of what belongs to no node."""
@@ -66,7 +67,7 @@ class Segment:
 
 
 class Run:
-    """A trace with the look-ups of a viewer. Reading methods may raise TraceError for damage.
+    """A trace with the look-ups of a viewer.
 
     Methods may be called from several threads.
     """
@@ -75,6 +76,8 @@ class Run:
         self.trace = trace
         self.count = trace.event_count
         self.segments = trace.segments
+        self._damaged: dict[int, TraceError] = {}
+        self._damaged_outputs: dict[int, TraceError] = {}
         self.segment = lru_cache(maxsize=_SEGMENTS_KEPT)(self._segment)
         self.segment_outputs = lru_cache(maxsize=_SEGMENTS_KEPT)(self._segment_outputs)
 
@@ -159,15 +162,21 @@ class Run:
 
     def event(self, index: int) -> Event:
         """Return event ``index``. Raises IndexError, TraceError."""
-        return event_of(self.row(index))
+        row = self.row(index)
+        damage = self._damaged.get(self.segment_of(index))
+        if damage is not None:
+            raise damage
+        return event_of(row)
 
     def outputs(self, index: int) -> list[Output]:
         """Return the outputs of event ``index``, in order. Raises IndexError, TraceError."""
-        from rsltrace.trace.segments import output_of
-
         if not 0 <= index < self.count:
             raise IndexError(f"{self.trace.name} has no event {index}")
-        outputs = self.segment_outputs(self.segment_of(index))
+        number = self.segment_of(index)
+        outputs = self.segment_outputs(number)
+        damage = self._damaged_outputs.get(number)
+        if damage is not None:
+            raise damage
         bounds = np.array([index, index + 1], dtype=np.uint64)
         low, high = np.searchsorted(outputs["event"], bounds).tolist()
         return [output_of(row) for row in outputs[low:high]]
@@ -214,12 +223,28 @@ class Run:
         return outputs[event.cause_output]
 
     def _segment(self, number: int) -> Segment:
+        """Read a segment. Events of a damaged one are stood in for: one can step over them, they
+        match nothing, and ``event`` says what is wrong."""
         row = self.segments[number]
         first = int(row["first_event"])
-        events = next(self.trace.events(first, first + int(row["events"])))
-        return Segment(number, first, np.ascontiguousarray(events))
+        count = int(row["events"])
+        try:
+            events = np.ascontiguousarray(next(self.trace.events(first, first + count)))
+        except TraceError as error:
+            self._damaged[number] = error
+            events = np.zeros(count, dtype=EVENT_DTYPE)
+            events["index"] = np.arange(first, first + count)
+            events["stamp"] = row["start_stamp"]
+            events["cause_event"] = NO_EVENT
+            events["outputs"] = 0
+        return Segment(number, first, events)
 
     def _segment_outputs(self, number: int) -> npt.NDArray[np.void]:
         row = self.segments[number]
         first = int(row["first_event"])
-        return np.ascontiguousarray(next(self.trace.outputs(first, first + int(row["events"]))))
+        try:
+            outputs = next(self.trace.outputs(first, first + int(row["events"])))
+        except TraceError as error:
+            self._damaged_outputs[number] = error
+            outputs = np.zeros(0, dtype=OUTPUT_DTYPE)
+        return np.ascontiguousarray(outputs)

@@ -180,14 +180,13 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
 
     def _refresh_changes(self, before: list[tuple[Line, str]], cursor: int) -> None:
         """Draw what changed: over a slow line every row counts."""
-        left = self.gutter.left
         top = round(self.scroll_y)
         for y in range(self.scrollable_content_region.height):
             row = top + y
             old = before[row] if row < len(before) else None
             new = self._drawn[row] if row < len(self._drawn) else None
             if old != new or (row in (cursor, self.cursor) and self.has_focus):
-                self.refresh(Region(left, y + self.gutter.top, self.size.width, 1))
+                self.refresh(Region(0, y, self.size.width, 1))
 
 
 def _indent(line: Line) -> int:

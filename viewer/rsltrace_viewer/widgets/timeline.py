@@ -66,6 +66,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
             "cursor",
             "related",
             "mark",
+            "lead",
             "error",
             "warning",
             "differs",
@@ -84,6 +85,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     Timeline > .timeline--plain { color: $text; }
     Timeline > .timeline--cursor { background: $primary 45%; text-style: bold; }
     Timeline > .timeline--related { background: $secondary 25%; }
+    Timeline > .timeline--lead { color: $text; text-style: bold; }
     Timeline > .timeline--mark { color: $text-accent; text-style: bold; }
     Timeline > .timeline--error { color: $text-error; text-style: bold; }
     Timeline > .timeline--warning { color: $text-warning; }
@@ -225,7 +227,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         mark = "!" if event.raised else "*" if shown.marked else "w" if event.warns else " "
         sign = shown.sign.value if shown.sign is not None else " "
         lead = ">" if selected else {"cause": "←", "effect": "→"}.get(shown.related, " ")
-        pieces = [Piece(lead, self._style("mark"))]
+        pieces = [Piece(lead, self._style("lead"))]
         for name, text in self._columns.cells(event, sign=sign, mark=mark):
             pieces.append(Piece(text + " ", self._style(self._style_of(name, shown, mark))))
         strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))

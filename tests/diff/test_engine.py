@@ -1,0 +1,405 @@
+"""What a diff says beyond index and verdict: roots, evidence, counts, settings, what was asked."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
+
+import rsltrace
+from rsltrace.diff.comparison import DIVERGENCES_MAX
+from rsltrace.diff.model import Diff, Root, Verdict
+from rsltrace.errors import TraceError
+from rsltrace.model.event import EventKind, OutputKind
+
+# /source ticks every 10 ms; /left and /right hear it, /sum hears both, /odd has nothing to do with
+# any of it. All remember everything they heard.
+SUM = (Publication("/s"),)
+PLAN = Plan(
+    (
+        NodePlan("/source", timers=((10 * MS, (Publication("/a"),)),)),
+        NodePlan("/left", subscriptions=(("/a", (Publication("/l"),)),)),
+        NodePlan("/right", subscriptions=(("/a", (Publication("/r"),)),)),
+        NodePlan(
+            "/sum", subscriptions=(("/l", (Publication("/s"),)), ("/r", (Publication("/s"),)))
+        ),
+        NodePlan("/odd", timers=((10 * MS, (Publication("/o"),)),)),
+    ),
+    end_ns=1000 * MS,
+)
+PLAIN = Storage()
+PER_STEP = 6  # source, left, right, sum twice, odd
+FIRST = len(PLAN.nodes)
+
+
+def step(n: int, event: int) -> int:
+    """Return the index of an event of step ``n`` (from 1): 0 source, 1 left, … 5 odd."""
+    return FIRST + (n - 1) * PER_STEP + event
+
+
+def compare(
+    folder: Path,
+    *faults: Fault,
+    a: Plan = PLAN,
+    b: Plan | None = None,
+    storage: Storage = PLAIN,
+    **options: object,
+) -> Diff:
+    Simulation(a, folder / "a.mcap", storage=storage).run()
+    Simulation(b or a, folder / "b.mcap", faults, storage).run()
+    return rsltrace.diff(folder / "a.mcap", folder / "b.mcap", **options)
+
+
+def test_identical_runs(tmp_path: Path) -> None:
+    diff = compare(tmp_path)
+    assert diff.identical
+    assert diff.exit_code == 0
+    assert diff.verdict is Verdict.IDENTICAL
+    assert diff.agreeing == diff.a.events == diff.b.events
+    assert diff.divergences == diff.settings == diff.notes == ()
+    assert 0 < diff.bytes_read < 20_000
+
+
+def test_a_changed_output(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)))
+    assert diff.agreeing == step(20, 1)
+    (first,) = diff.divergences
+    assert (first.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
+    assert "subscription /a of /left at 0.2 s" in first.sentence
+    assert "/l" in first.sentence
+    assert first.a is not None
+    assert first.b is not None
+    assert first.a.entity.name == first.b.entity.name == "/a"
+    assert first.a.position == 19
+    assert first.a.summary == "/l"
+    (message,) = first.messages
+    assert (message.kind, message.topic, message.presence) == (OutputKind.MESSAGE, "/l", "both")
+    assert [field.path for field in message.fields] == ["data"]
+    # The chain: what led to it agrees in both runs, then comes the event itself.
+    (cause, itself) = first.chain
+    assert cause.a is not None
+    assert (cause.a.entity.name, cause.relation) == ("tick", "published /a")
+    assert cause.a == cause.b
+    assert (itself.a, itself.b) == (first.a, first.b)
+    assert [view.index for view in first.before_a] == list(range(step(20, 1) - 5, step(20, 1)))
+    assert first.before_a == first.before_b
+    assert {view.entity.node for view in first.same_node_a} == {"/left"}
+    assert [view.index for view in first.same_node_a] == [step(n, 1) for n in range(15, 20)]
+    assert [(r.topic, r.after_ns) for r in first.reaches] == [("/l", 0), ("/s", 0)]
+    assert first.next_step.startswith("rsltrace record job.yaml --until 0.200000000 ")
+
+
+def test_counts_per_entity(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), everything=True)
+    counts = {(c.entity.node, c.entity.name): c for c in diff.counts}
+    assert counts["/sum", "/l"].differing == 81
+    assert counts["/sum", "/r"].differing == 81, "its node's state differs, so its outputs do"
+    # Its input is the same from the next step on, but what it remembers is not.
+    assert counts["/left", "/a"].differing == 1
+    assert counts["/left", "/a"].matching == 80
+    assert counts["/odd", "tick"].differing == counts["/right", "/a"].differing == 0
+    assert all(c.only_a == c.only_b == 0 for c in diff.counts)
+    assert diff.aligned_to == (diff.a.events, diff.b.events)
+    assert diff.resync_index is None
+
+
+def test_where_the_runs_agree_again(tmp_path: Path) -> None:
+    forgetful = tuple(replace(node, memory="none") for node in PLAN.nodes)
+    plan = replace(PLAN, nodes=forgetful)
+    for everything in (False, True):
+        diff = compare(tmp_path, Fault("drop", step(20, 1)), a=plan, everything=everything)
+        # /left's message and what /sum made of it are missing; then both go on as before.
+        assert diff.verdict is Verdict.MISSING
+        assert diff.resync_index == (step(20, 4), step(20, 4) - 2)
+        assert sum(c.only_a for c in diff.counts) == 2
+        assert sum(c.differing + c.only_b for c in diff.counts) == 0
+
+
+@pytest.mark.parametrize("window", [1, 10, 100, 5000])
+def test_the_window_limits_what_is_aligned(tmp_path: Path, window: int) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), window=window)
+    reached = diff.aligned_to[0] - diff.agreeing
+    assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
+    if window == 5000:
+        assert reached == diff.a.events - diff.agreeing
+    else:  # a stretch ends between two instants
+        assert 0 < reached <= max(window, 2 * PER_STEP) + PER_STEP
+
+
+def test_all_looks_at_everything_in_stretches(tmp_path: Path) -> None:
+    """A second divergence far behind the first, with equal events in between."""
+    long = replace(PLAN, end_ns=40_000 * MS)
+    far = Fault("bit", step(3000, 5))
+    diff = compare(tmp_path, Fault("drop", step(20, 5)), Fault("bit", far.at - 1), a=long)
+    assert len(diff.divergences) == 1, "the window ends long before"
+    diff = compare(
+        tmp_path, Fault("bit", step(20, 5)), Fault("bit", step(3000, 1)), a=long, everything=True
+    )
+    assert [d.a.index for d in diff.divergences if d.a] == [step(20, 5), step(3000, 1)]
+    assert sum(c.matching + c.differing for c in diff.counts) == diff.a.events - diff.agreeing
+    assert diff.aligned_to == (diff.a.events, diff.b.events)
+
+
+def test_independent_divergences_are_limited_unless_all_are_asked_for(tmp_path: Path) -> None:
+    apart = tuple(
+        NodePlan(f"/n{n}", "none", timers=((10 * MS, (Publication(f"/t{n}"),)),)) for n in range(20)
+    )
+    plan = Plan(apart, end_ns=100 * MS)
+    faults = [Fault("bit", 20 + 20 * 3 + n) for n in range(20)]
+    diff = compare(tmp_path, *faults, a=plan)
+    assert len(diff.divergences) == DIVERGENCES_MAX
+    assert any("10 more independent divergences" in note for note in diff.notes)
+    diff = compare(tmp_path, *faults, a=plan, everything=True)
+    assert [d.a.index for d in diff.divergences if d.a] == [fault.at for fault in faults]
+
+
+# -- asking for nodes and topics -----------------------------------------------------------------
+
+
+def test_a_consequence_that_was_asked_for_leads_back_to_its_root(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), nodes=("/sum",))
+    assert diff.agreeing == step(20, 1), "the runs part where they part"
+    (first,) = diff.divergences
+    assert diff.verdict is first.verdict is Verdict.DIFFERENT_INPUT
+    assert first.a is not None
+    assert (first.a.entity.node, first.a.entity.name, first.a.index) == ("/sum", "/l", step(20, 3))
+    assert first.root is Root.CALLBACK
+    assert "/left" in first.root_sentence
+    nodes = [step.a.entity.node for step in first.chain if step.a]
+    assert nodes == ["/source", "/left", "/sum"]
+    assert first.chain[-2].relation == "published /l"
+    assert first.messages[0].position == -1
+    assert [field.path for field in first.messages[0].fields] == ["data"]
+    assert any("shown is where /sum differs" in note for note in diff.notes)
+
+
+def test_state_is_a_way_to_the_root_too(tmp_path: Path) -> None:
+    """/sum's answer to /r differs only because it heard another /l before."""
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), nodes=("/sum",), topics=("/r",))
+    (first,) = diff.divergences
+    assert first.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
+    assert first.root is Root.CALLBACK
+    assert first.a is not None
+    assert first.a.entity.name == "/r"
+    assert first.chain[-2].relation == "may have changed the state of /sum"
+    assert "because its node had done something else before" in first.sentence
+
+
+def test_asking_for_what_does_not_differ(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), nodes=("/odd",))
+    assert not diff.identical
+    assert diff.divergences[0].a is not None
+    assert diff.divergences[0].a.entity.node == "/left"
+    assert any("nothing that was asked for (/odd) differs" in note for note in diff.notes)
+
+
+# -- what is outside of the events ---------------------------------------------------------------
+
+
+def test_settings_are_always_listed(tmp_path: Path) -> None:
+    other = replace(PLAN, seed=7, version="2")
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), b=other)
+    places = {setting.place: (setting.a, setting.b) for setting in diff.settings}
+    assert places == {"job.yaml:1": ("seed: 0", "seed: 7"), "environment: sim": ("1", "2")}
+    # They may be why; what is seen is a callback.
+    assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
+    assert "job.yaml:1, environment: sim" in diff.divergences[0].root_sentence
+
+
+def test_a_constructor_that_differs(tmp_path: Path) -> None:
+    drawing = replace(PLAN, nodes=(*PLAN.nodes[:2], replace(PLAN.nodes[2], draws_at_start=True)))
+    diff = compare(tmp_path, a=drawing, b=replace(drawing, seed=1))
+    assert (diff.verdict, diff.divergences[0].root) == (Verdict.ENVIRONMENT, Root.JOB)
+    assert diff.divergences[0].a is not None
+    assert diff.divergences[0].a.entity.name == "/right"
+    assert "job.yaml:1" in diff.divergences[0].root_sentence
+    diff = compare(tmp_path, Fault("bit", 0), a=drawing, b=drawing)
+    assert diff.identical, "a fault that cannot strike is none"
+
+
+def test_traces_of_different_jobs(tmp_path: Path) -> None:
+    other = Plan((NodePlan("/else", timers=((7 * MS, ()),)),), end_ns=100 * MS)
+    diff = compare(tmp_path, b=other)
+    assert diff.notes[0] == "these are traces of different jobs: no entity is in both"
+    assert diff.verdict is Verdict.GRAPH
+    assert diff.divergences[0].root is Root.JOB
+    assert {s.place for s in diff.settings} >= {"entity", "job.yaml:3"}
+    assert diff.agreeing == 0
+
+
+def test_a_node_more_shifts_all_ids_and_nothing_else(tmp_path: Path) -> None:
+    more = replace(PLAN, nodes=(NodePlan("/more", timers=((10 * MS, ()),)), *PLAN.nodes))
+    diff = compare(tmp_path, b=more, everything=True)
+    assert diff.verdict is Verdict.GRAPH
+    assert "/more is constructed in b and not in a" in diff.sentence
+    assert len(diff.divergences) == 1
+    by_node: dict[str, int] = {}
+    for count in diff.counts:
+        own = count.differing + count.only_a + count.only_b
+        by_node[count.entity.node] = by_node.get(count.entity.node, 0) + own
+    assert by_node.pop("/more") == 102  # constructed, 100 ticks, destroyed
+    assert set(by_node.values()) == {0}
+
+
+# -- how runs end --------------------------------------------------------------------------------
+
+
+def test_a_run_that_was_told_to_stop_earlier(tmp_path: Path) -> None:
+    short = replace(PLAN, end_ns=500 * MS)
+    diff = compare(tmp_path, b=short)
+    assert diff.verdict is Verdict.ENDED_EARLY
+    assert diff.agreeing == step(51, 0)
+    (first,) = diff.divergences
+    assert first.a is not None
+    assert first.a.index == diff.agreeing
+    assert first.b is None
+    assert "b ended at 0.5 s (time 500000000)" in first.sentence
+    assert first.next_step == f"rsltrace info {tmp_path / 'b.mcap'}"
+    assert compare(tmp_path, a=short, b=PLAN).verdict is Verdict.RAN_LONGER
+
+
+def test_an_interrupted_run(tmp_path: Path) -> None:
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    Simulation(PLAN, tmp_path / "b.mcap", storage=Storage(50, close=False)).run()
+    data = (tmp_path / "b.mcap").read_bytes()
+    (tmp_path / "b.mcap").write_bytes(data[: len(data) // 2])
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert diff.verdict is Verdict.ENDED_EARLY
+    assert not diff.b.complete
+    assert diff.b.stop_reason == "interrupted"
+    assert diff.agreeing == diff.b.events > 100
+    assert "the recording of b" in diff.notes[0]
+    assert "was killed" in diff.divergences[0].root_sentence
+
+
+def test_an_exception_in_one_run(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("raise", step(20, 3)))
+    assert (diff.verdict, diff.divergences[0].root) == (Verdict.EXCEPTION, Root.EXCEPTION)
+    assert "raised ValueError: planted in b and not in a" in diff.sentence
+    (first,) = diff.divergences
+    exception = [m for m in first.messages if m.kind is OutputKind.EXCEPTION]
+    assert exception[0].preview == "ValueError: planted"
+    # What a did after that is counted, and is no divergence of its own.
+    assert sum(count.only_a for count in diff.counts) > 100
+
+
+# -- evidence without payloads -------------------------------------------------------------------
+
+
+def test_without_payloads_it_says_which_output_and_how_to_record_it(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), storage=Storage(payloads=False))
+    (message,) = diff.divergences[0].messages
+    assert message.topic == "/l"
+    assert message.fields == ()
+    assert message.hash_a != message.hash_b
+    assert "payloads: true" in message.reason
+
+
+def test_a_dropped_message_names_where_it_came_from(tmp_path: Path) -> None:
+    diff = compare(tmp_path, Fault("drop", step(20, 3)))
+    (first,) = diff.divergences
+    assert (diff.verdict, first.b) == (Verdict.MISSING, None)
+    assert f"event {step(20, 1)}, subscription /a of /left" in first.root_sentence
+    (message, output) = first.messages
+    assert (message.position, message.presence) == (-1, "only a")
+    assert "data:" in message.preview
+    assert (output.topic, output.presence) == ("/s", "only a")
+
+
+def test_ignored_fields_leave_the_verdict(tmp_path: Path) -> None:
+    """Two digests are never made identical."""
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), ignore=("data",))
+    assert diff.exit_code == 1
+    (message,) = diff.divergences[0].messages
+    assert message.fields == ()
+    assert "ignored" in message.reason
+
+
+def test_equal_messages_from_other_senders(tmp_path: Path) -> None:
+    """Nothing tells the two deliveries apart but which event sent what."""
+    twin = NodePlan("/twin", "none", subscriptions=(("/in", (Publication("/out"),)),))
+    plan = Plan(
+        (twin, NodePlan("/ear", "all", subscriptions=(("/out", (Publication("/z"),)),))),
+        bag=((10 * MS, "/in", 5), (10 * MS, "/in", 5), (20 * MS, "/in", 6)),
+        end_ns=50 * MS,
+    )
+    clean = Simulation(plan, tmp_path / "a.mcap").run()
+    ear = next(e for e in clean.log if e.node == "/ear")
+    diff = compare(tmp_path, Fault("swap", ear.index, 1), a=plan)
+    assert (diff.verdict, diff.divergences[0].root) == (Verdict.SCHEDULE, Root.SCHEDULE)
+    assert diff.agreeing == ear.index
+    assert "took two inputs the other way round" in diff.sentence
+
+
+def test_the_same_swap_again_and_again_is_one_divergence(tmp_path: Path) -> None:
+    """Two timers that are due at once, decided in another way at every instant."""
+    pair = tuple(
+        NodePlan(f"/n{n}", "none", timers=((10 * MS, (Publication(f"/t{n}"),)),)) for n in range(2)
+    )
+    plan = Plan(pair, end_ns=200 * MS)
+    diff = compare(tmp_path, *(Fault("swap", 2 + 2 * n, 1) for n in range(20)), a=plan)
+    assert diff.verdict is Verdict.SCHEDULE
+    assert len(diff.divergences) == 1
+    first = diff.divergences[0]
+    assert first.a is not None
+    assert first.b is not None
+    assert {first.a.entity.node, first.b.entity.node} == {"/n0", "/n1"}
+    assert first.a.index == first.b.index == 2
+
+
+# -- the Python API ------------------------------------------------------------------------------
+
+
+def test_the_function_is_also_the_package(tmp_path: Path) -> None:
+    import rsltrace.diff
+    import rsltrace.diff.engine
+
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), context=2)
+    assert isinstance(diff, rsltrace.Diff)
+    assert len(diff.divergences[0].before_a) == 2
+    assert diff.verdict is rsltrace.Verdict.SAME_INPUT_DIFFERENT_OUTPUT
+    assert rsltrace.diff.engine.diff_traces is not None
+
+
+def test_options_that_make_no_sense(tmp_path: Path) -> None:
+    with pytest.raises(TypeError, match="contxt"):
+        compare(tmp_path, contxt=3)
+    with pytest.raises(TraceError, match="cannot be shown"):
+        compare(tmp_path, window=0)
+    with pytest.raises(TraceError, match="does not exist"):
+        rsltrace.diff(tmp_path / "none.mcap", tmp_path / "a.mcap")
+
+
+def test_a_resolved_job_that_differs_is_a_setting(tmp_path: Path) -> None:
+    """An override on the command line is in no job file."""
+    from rsltrace.diff.settings import job_settings
+    from rsltrace.trace.reader import Trace
+
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    with Trace.open(tmp_path / "a.mcap") as a, Trace.open(tmp_path / "a.mcap") as b:
+        resolved = {"seed": 0, "nodes": [{"parameters": {"x": 1.0}}], "stop": {"events": None}}
+        a.job["resolved"] = json.dumps(resolved)
+        resolved["seed"] = 5
+        resolved["nodes"] = [{"parameters": {"x": 2.0, "y": True}}]
+        b.job["resolved"] = json.dumps(resolved)
+        found = {s.place: (s.a, s.b) for s in job_settings(a, b)}
+    assert found == {
+        "job: seed": ("0", "5"),
+        "job: nodes[0].parameters.x": ("1.0", "2.0"),
+        "job: nodes[0].parameters.y": (None, "true"),
+    }
+
+
+def test_kinds_are_named_in_words(tmp_path: Path) -> None:
+    from rsltrace.diff.views import at, phrase
+
+    diff = compare(tmp_path, Fault("bit", step(20, 1)))
+    view = diff.divergences[0].a
+    assert view is not None
+    assert phrase(view) == "subscription /a of /left"
+    assert "service" in phrase(replace(view, kind=EventKind.SERVICE))
+    assert at(1_500_000_000) == "at 1.5 s"
+    assert at(0) == "at 0.0 s"
