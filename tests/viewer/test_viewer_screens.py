@@ -21,7 +21,7 @@ SCREENS: dict[str, list[str]] = {
     "zoomed": ["j", "j", "j", *["plus"] * 12],
     "exception": ["x"],
     "filter": ["F", *"kind", "colon", *"srv", "enter"],
-    "asking": ["F", *"no", "x"],
+    "asking": ["F", *"kin"],
     "help": ["question_mark"],
     "plot": ["p"],
     "palette": ["ctrl+p"],

@@ -20,6 +20,7 @@ SAMPLES_MAX = 1500
 
 _RATE_BINS = 240
 _NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
+_OF_EVERY_NODE = ("/rosout", "/parameter_events")
 _NUMBERS_MAX = 16
 """Items of an array that are offered one by one."""
 
@@ -60,8 +61,11 @@ _NO_POINTS: npt.NDArray[np.float64] = np.zeros(0)
 def sources_of(run: Run) -> list[Source]:
     """Return rates and latencies of a run; fields of a topic come from ``fields_of``."""
     found = []
+    counts = run.trace.message_counts
+    sent = {c.topic for c in run.trace.channels.values() if counts.get(c.id)}
     for entity in _publishers(run):
-        found.append(Source("rate", entity.name))
+        if entity.name in sent and entity.name not in _OF_EVERY_NODE:
+            found.append(Source("rate", entity.name))
     for entity in run.entities.values():
         if entity.kind is EntityKind.SUBSCRIPTION and entity.name in {e.name for e in found}:
             found.append(Source("latency", f"{entity.name} → {run.node_name(entity.id)}"))
@@ -76,7 +80,8 @@ def topics_with_messages(run: Run) -> list[str]:
         for channel in run.trace.channels.values()
         if counts.get(channel.id) and not channel.topic.startswith("/rsltrace/")
     ]
-    return list(dict.fromkeys(topics))
+    # What every node has comes last: one rarely looks for it.
+    return sorted(dict.fromkeys(topics), key=lambda topic: topic in _OF_EVERY_NODE)
 
 
 def fields_of(run: Run, topic: str) -> list[Source]:
@@ -101,7 +106,7 @@ def series_of(run: Run, source: Source) -> Iterator[Series]:
 def _publishers(run: Run) -> list[Entity]:
     seen: dict[str, Entity] = {}
     for entity in run.entities.values():
-        if entity.kind is EntityKind.PUBLISHER and entity.name != "/parameter_events":
+        if entity.kind is EntityKind.PUBLISHER:
             seen.setdefault(entity.name, entity)
     return list(seen.values())
 

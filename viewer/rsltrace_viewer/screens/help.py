@@ -68,14 +68,14 @@ def _groups(two: bool) -> list[str]:
 
 
 def _keys_block(group: str, two: bool) -> list[Content]:
-    lines = [Content.styled(group, "bold $text-primary")]
+    lines = [Content.styled(group, "bold underline")]
     for key in KEYS:
         if key.group == group and (two or not key.two):
             shown = fit(key.shown, _KEY_WIDTH)
-            lines.append(Content.assemble("  ", (shown, "bold $text-accent"), key.help))
+            lines.append(Content.assemble("  ", (shown, "bold $text-primary"), key.help))
     if group == "Look":
         shown = fit("Ctrl+P", _KEY_WIDTH)
-        lines.append(Content.assemble("  ", (shown, "bold $text-accent"), "command palette"))
+        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), "command palette"))
     return lines
 
 
@@ -97,14 +97,14 @@ def _signs_block(two: bool) -> list[Content]:
             ("~", "the same, at another time or place"),
             ("?", "not compared"),
         ]
-    lines = [Content.styled("Signs at the left of an event", "bold $text-primary")]
+    lines = [Content.styled("Signs at the left of an event", "bold underline")]
     for sign, text in signs:
-        lines.append(Content.assemble("  ", (fit(sign, _KEY_WIDTH), "bold $text-accent"), text))
+        lines.append(Content.assemble("  ", (fit(sign, _KEY_WIDTH), "bold $text-primary"), text))
     return lines
 
 
 def _lanes_block() -> list[Content]:
-    lines = [Content.styled("Lanes, zoomed in to one event per column (+)", "bold $text-primary")]
+    lines = [Content.styled("Lanes, zoomed in to one event per column (+)", "bold underline")]
     pairs = [f"{letter} {kind.label}" for kind, letter in KIND_LETTERS.items()]
     for start in range(0, len(pairs), 4):
         lines.append(Content("  " + "  ".join(pairs[start : start + 4])))
@@ -112,10 +112,10 @@ def _lanes_block() -> list[Content]:
 
 
 def _filter_block() -> list[Content]:
-    lines = [Content.styled("Filters (F) and searches (/)", "bold $text-primary")]
+    lines = [Content.styled("Filters (F) and searches (/)", "bold underline")]
     for name, field in FIELDS.items():
         shown = fit(f"{name}:", _KEY_WIDTH)
-        lines.append(Content.assemble("  ", (shown, "bold $text-accent"), field.help))
+        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), field.help))
     lines += [
         Content("  a bare word looks in names, logs and exceptions"),
         Content("  all must hold; or  not  ( )  and - before a field"),

@@ -130,7 +130,9 @@ class PlotScreen(Screen[None]):
         run = self._session.a
         self._topic = ""
         topics = topics_with_messages(run)
-        self._offer([*topics, *sources_of(run)])
+        here = self._session.same("topic")
+        first = topics.index(here[1]) if here is not None and here[1] in topics else 0
+        self._offer([*topics, *sources_of(run)], first)
         title = self._session.title()
         self.query_one("#what", Static).update(Content(f"plots  {title}"))
 

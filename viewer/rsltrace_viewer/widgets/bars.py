@@ -60,10 +60,10 @@ class FooterBar(Static):
             if used + length > room:
                 continue
             used += length
-            parts += [(shown, "bold $text-accent"), f" {words}  "]
+            parts += [(shown, "bold $text-primary"), f" {words}  "]
             self._places.append((used, action))
         if status:
-            parts += [" " * max(width - used - cells(status), 1), (status, "bold $text-warning")]
+            parts += [" " * max(width - used - cells(status), 1), (status, "bold")]
         self.update(Content.assemble(*parts), layout=False)
 
     async def on_click(self, event: events.Click) -> None:

@@ -1,0 +1,193 @@
+"""Faults in real rclpy nodes: recorded twice, the second time misbehaving at one event."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+import rsltrace
+from rsltrace.diff.model import Diff, Root, Verdict
+
+pytestmark = pytest.mark.ros
+
+NODES = '''
+import os
+import random
+
+from rclpy.node import Node
+from std_msgs.msg import Float64, UInt64
+from std_srvs.srv import Trigger
+
+MODE = os.environ.get("FAULTY_MODE", "")  # what no trace tells: a hidden input
+
+
+class Sensor(Node):
+    """Publishes a reading every 100 ms."""
+
+    def __init__(self):
+        super().__init__("sensor")
+        self.declare_parameter("gain", 1.0)
+        self.publisher = self.create_publisher(Float64, "reading", 10)
+        self.count = 0
+        self.timer = self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.count += 1
+        if MODE == "late" and self.count == 6:
+            self.timer.timer_period_ns = 130_000_000
+        elif MODE == "late" and self.count == 7:
+            self.timer.timer_period_ns = 100_000_000
+        value = self.count * self.get_parameter("gain").value
+        if MODE == "bit" and self.count == 7:
+            value += 1e-12
+        if MODE == "drop" and self.count == 7:
+            return
+        if MODE == "raise" and self.count == 7:
+            raise ValueError("the sensor is unplugged")
+        self.publisher.publish(Float64(data=value))
+        if MODE == "extra" and self.count == 7:
+            self.publisher.publish(Float64(data=value))
+        if MODE == "random":
+            self.publisher.publish(Float64(data=random.random()))
+
+
+class Filter(Node):
+    """Smooths readings and asks a service now and then: feedback through its state."""
+
+    def __init__(self):
+        super().__init__("filter")
+        self.value = 0.0
+        self.heard = 0
+        self.publisher = self.create_publisher(Float64, "smooth", 10)
+        self.create_subscription(Float64, "reading", self.got, 10)
+        self.client = self.create_client(Trigger, "check")
+
+    def got(self, message):
+        self.heard += 1
+        self.value = 0.5 * self.value + 0.5 * message.data
+        self.publisher.publish(Float64(data=self.value))
+        if self.heard % 3 == 0:
+            self.client.call_async(Trigger.Request())
+
+
+class Checker(Node):
+    def __init__(self):
+        super().__init__("checker")
+        self.asked = 0
+        self.create_service(Trigger, "check", self.check)
+        self.create_subscription(Float64, "smooth", lambda message: None, 10)
+        if MODE == "graph":
+            self.create_publisher(UInt64, "unexpected", 1)
+
+    def check(self, request, response):
+        self.asked += 1
+        response.success = True
+        response.message = f"{self.asked}"
+        if MODE == "service" and self.asked == 2:
+            response.message = "2 "
+        return response
+'''
+JOB = """
+nodes:
+  - {node: "faulty_nodes:Sensor", parameters: {gain: GAIN}}
+  - {node: "faulty_nodes:Filter"}
+  - {node: "faulty_nodes:Checker"}
+stop: {duration: 2s}
+seed: SEED
+"""
+
+
+@pytest.fixture
+def diffed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Diff]:
+    """Record twice, the second run in a mode of its own, and diff."""
+    (tmp_path / "faulty_nodes.py").write_text(NODES)
+
+    def go(mode: str = "", *, both: str = "", gain: str = "1.0", seed: int = 0) -> Diff:
+        from rsltrace.run import run
+
+        runs = (("a", both, "1.0", 0), ("b", mode or both, gain, seed))
+        for name, its_mode, its_gain, its_seed in runs:
+            monkeypatch.setenv("FAULTY_MODE", its_mode)
+            job = tmp_path / "job.yaml"
+            job.write_text(JOB.replace("GAIN", its_gain).replace("SEED", str(its_seed)))
+            run(rsltrace.load_job(job), tmp_path / f"{name}.mcap", force=True)
+        return rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+
+    return go
+
+
+def test_nothing_planted(diffed: Callable[..., Diff]) -> None:
+    assert diffed().identical
+    assert diffed(both="random").identical
+
+
+@pytest.mark.parametrize(
+    ("mode", "verdict", "root", "node", "entity"),
+    [
+        ("bit", Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+        ("drop", Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+        ("extra", Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+        ("service", Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/checker", "/check"),
+        ("raise", Verdict.EXCEPTION, Root.EXCEPTION, "/sensor", "Sensor.tick"),
+        ("late", Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+    ],
+)
+def test_a_node_that_misbehaves_once(
+    diffed: Callable[..., Diff],
+    mode: str,
+    verdict: Verdict,
+    root: Root,
+    node: str,
+    entity: str,
+) -> None:
+    diff = diffed(mode)
+    (first,) = diff.divergences
+    assert (diff.verdict, first.root) == (verdict, root), diff.sentence
+    assert first.a is not None
+    assert first.b is not None
+    assert first.a.index == first.b.index == diff.agreeing
+    assert (first.a.entity.node, first.a.entity.name) == (node, entity)
+    assert first.a.position == {"service": 1, "late": 5}.get(mode, 6)
+    if mode == "bit":
+        (message,) = first.messages
+        (field,) = message.fields
+        assert (message.topic, field.path, field.ulp) == ("/reading", "data", 1126)
+        assert {reach.topic for reach in first.reaches} == {"/reading", "/smooth"}
+    if mode == "drop":
+        assert [m.presence for m in first.messages] == ["only a"]
+    if mode == "extra":
+        assert [m.presence for m in first.messages] == ["only b"]
+    if mode == "raise":
+        assert "raised ValueError: the sensor is unplugged in b and not in a" in diff.sentence
+
+
+def test_another_parameter(diffed: Callable[..., Diff]) -> None:
+    diff = diffed(gain="1.5")
+    first = diff.divergences[0]
+    assert (diff.verdict, first.root) == (Verdict.ENVIRONMENT, Root.JOB)
+    assert first.a is not None
+    assert first.a.entity.name == "/sensor"
+    assert [s.place for s in diff.settings] == ["job.yaml:3"]
+    assert first.messages[0].topic == "/parameter_events"
+
+
+def test_another_seed(diffed: Callable[..., Diff]) -> None:
+    diff = diffed(both="random", seed=1)
+    (first,) = diff.divergences
+    assert (diff.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
+    assert first.a is not None
+    assert first.a.entity.node == "/sensor"
+    assert [(s.a, s.b) for s in diff.settings] == [("seed: 0", "seed: 1")]
+    assert "job.yaml:7" in first.root_sentence
+
+
+def test_another_graph(diffed: Callable[..., Diff]) -> None:
+    diff = diffed("graph")
+    (first,) = diff.divergences
+    assert (diff.verdict, first.root) == (Verdict.GRAPH, Root.CALLBACK)
+    assert "new publisher /unexpected only in b" in diff.sentence
+    assert ("entity", None) in {(s.place, s.a) for s in diff.settings}

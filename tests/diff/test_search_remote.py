@@ -1,0 +1,215 @@
+"""Traces on a server: few requests, few bytes, and clear words when it does not work."""
+
+from __future__ import annotations
+
+import re
+import sys
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
+from hypothesis import given
+from hypothesis import strategies as st
+
+import rsltrace
+from rsltrace.errors import SetupError, TraceError, TraceFormatError
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
+from rsltrace.trace.source import FileSource, open_source
+
+PLAN = Plan(
+    (
+        NodePlan("/source", timers=((MS, (Publication("/a"),)),)),
+        NodePlan("/filter", subscriptions=(("/a", (Publication("/b"),)),)),
+        NodePlan("/sink", subscriptions=(("/b", ()),)),
+    ),
+    end_ns=4000 * MS,
+)
+
+
+class Server:
+    """Serves a folder and counts. ``ranges`` can be switched off, as some servers do."""
+
+    def __init__(self, folder: Path) -> None:
+        self.requests: list[str] = []
+        self.sent = 0
+        self.ranges = True
+        self.broken = False
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def log_message(self, *args: object) -> None:
+                pass
+
+            def do_HEAD(self) -> None:  # the base class asks for the name
+                self._answer(send=False)
+
+            def do_GET(self) -> None:
+                self._answer(send=True)
+
+            def _answer(self, *, send: bool) -> None:
+                outer.requests.append(self.headers.get("Range", ""))
+                path = folder / self.path.lstrip("/")
+                data = path.read_bytes() if path.is_file() else b""
+                wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
+                status = 200 if path.is_file() else 404
+                if wanted and outer.broken:
+                    status, data = 500, b"broken"
+                elif wanted and outer.ranges and status == 200:
+                    status, data = 206, data[int(wanted[1]) : int(wanted[2]) + 1]
+                self.send_response(status)
+                self.send_header("Content-Length", str(len(data)))
+                self.end_headers()
+                if send:
+                    outer.sent += len(data)
+                    self.wfile.write(data)
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
+        self._thread.start()
+        self.address = f"http://127.0.0.1:{self._server.server_port}"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+        self._thread.join()
+
+
+@pytest.fixture
+def server(tmp_path: Path) -> Iterator[Server]:
+    pytest.importorskip("fsspec")
+    pytest.importorskip("aiohttp")
+    server = Server(tmp_path)
+    yield server
+    server.close()
+
+
+def test_a_diff_over_http(server: Server, tmp_path: Path) -> None:
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    fault = Fault("bit", 3 + 3 * 3000 + 1)
+    Simulation(PLAN, tmp_path / "b.mcap", (fault,)).run()
+    local = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    remote = rsltrace.diff(f"{server.address}/a.mcap", f"{server.address}/b.mcap")
+    assert remote.agreeing == fault.at
+    assert remote.divergences[0].messages == local.divergences[0].messages
+    assert remote.divergences[0].messages[0].fields
+    assert len(server.requests) < 40
+    assert server.sent == remote.bytes_read < 1_500_000
+    whole = (tmp_path / "a.mcap").stat().st_size + (tmp_path / "b.mcap").stat().st_size
+    assert server.sent < whole * 0.8, "even here, where the files are small"
+
+
+def test_identical_runs_over_http_cost_a_few_requests(server: Server, tmp_path: Path) -> None:
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    assert rsltrace.diff(f"{server.address}/a.mcap", f"{server.address}/a.mcap").identical
+    assert len(server.requests) <= 8
+    assert server.sent < 10 * BLOCK_BYTES
+
+
+def test_an_interrupted_trace_over_http(server: Server, tmp_path: Path) -> None:
+    """It has no index and is read from front to back, in pieces that grow."""
+    Simulation(PLAN, tmp_path / "a.mcap", storage=Storage(100, "")).run()
+    data = (tmp_path / "a.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 2 // 3])
+    diff = rsltrace.diff(tmp_path / "a.mcap", f"{server.address}/cut.mcap")
+    assert diff.verdict is rsltrace.Verdict.ENDED_EARLY
+    assert not diff.b.complete
+    assert len(server.requests) < len(data) // BLOCK_BYTES / 2
+
+
+def test_a_server_without_ranges(server: Server, tmp_path: Path) -> None:
+    """It sends the whole file each time it is asked: once is enough."""
+    server.ranges = False
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    with Trace.open(f"{server.address}/a.mcap") as trace:
+        digest = trace.digest
+        assert trace.bytes_read == trace.size
+    with Trace.open(tmp_path / "a.mcap") as trace:
+        assert trace.digest == digest
+    assert len(server.requests) == 2
+
+
+def test_what_is_not_there(server: Server, tmp_path: Path) -> None:
+    with pytest.raises(TraceError, match=rf"{server.address}/none.mcap does not exist"):
+        Trace.open(f"{server.address}/none.mcap")
+    (tmp_path / "text.mcap").write_bytes(b"hello, this is text")
+    with pytest.raises(TraceFormatError, match=r"text.mcap is not a trace"):
+        Trace.open(f"{server.address}/text.mcap")
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    server.broken = True
+    with pytest.raises(TraceError, match=r"a.mcap cannot be read at offset \d+: .*500"):
+        Trace.open(f"{server.address}/a.mcap")
+    with pytest.raises((TraceError, SetupError), match=r"nothing://a/b"):
+        Trace.open("nothing://a/b")
+
+
+def test_without_fsspec(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "fsspec", None)
+    with pytest.raises(SetupError, match=r"pip install 'rsltrace\[remote\]'"):
+        Trace.open("https://example.org/a.mcap")
+
+
+def test_a_path_is_no_address(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"x")
+    source = open_source(str(tmp_path / "a.mcap"))
+    assert isinstance(source, FileSource)
+    source.close()
+
+
+CONTENT = bytes(range(256)) * 2000  # 512 kB
+
+
+@given(st.lists(st.tuples(st.integers(0, len(CONTENT)), st.integers(0, 200_000)), max_size=20))
+def test_blocks_give_what_was_asked_for(reads: list[tuple[int, int]]) -> None:
+    fetched: list[tuple[int, int]] = []
+
+    def fetch(begin: int, end: int) -> bytes:
+        fetched.append((begin, end))
+        return CONTENT[begin:end]
+
+    source = RemoteSource("memory", len(CONTENT), fetch)
+    for offset, length in reads:
+        length = min(length, len(CONTENT) - offset)
+        assert source.read_at(offset, length) == CONTENT[offset : offset + length]
+    covered = [
+        n for begin, end in fetched for n in range(begin // BLOCK_BYTES, -(-end // BLOCK_BYTES))
+    ]
+    assert len(covered) == len(set(covered)), "no block is fetched twice"
+    assert source.requests == len(fetched)
+    with pytest.raises(TraceError, match="beyond the end"):
+        source.read_at(len(CONTENT) - 1, 2)
+
+
+def test_memory_stays_bounded() -> None:
+    source = RemoteSource("zeros", 1 << 40, lambda begin, end: bytes(end - begin))
+    for place in range(200):
+        source.read_at(place << 30, 300_000)
+    assert len(source._blocks) * BLOCK_BYTES <= CACHE_BYTES
+    assert len(source.read_at(5, CACHE_BYTES + 7)) == CACHE_BYTES + 7
+
+
+def test_a_file_that_changes_while_it_is_read() -> None:
+    source = RemoteSource("short", 1000, lambda begin, end: b"too little")
+    with pytest.raises(TraceError, match="became shorter or longer"):
+        source.read_at(0, 100)
+    large = RemoteSource("large", 1 << 30, lambda begin, end: _Huge(1 << 30))
+    with pytest.raises(TraceError, match="sends the whole file"):
+        large.read_at(0, 100)
+
+
+class _Huge(bytes):
+    """Says that it is long."""
+
+    def __new__(cls, length: int) -> _Huge:
+        return super().__new__(cls)
+
+    def __init__(self, length: int) -> None:
+        self._length = length
+
+    def __len__(self) -> int:
+        return self._length
