@@ -10,7 +10,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test lint types architecture unit setup samples bench clean
+.PHONY: demo test lint types architecture unit setup samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -52,6 +52,16 @@ samples: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/throughput.py
+
+# The pictures of the documentation, drawn from the sample traces without a terminal.
+pictures: $(INSTALLED)
+	@mkdir -p docs/pictures
+	cd sample_traces/delayed_input && $(abspath $(BIN))/rsltrace view a.mcap --at 252 \
+		--export ../../docs/pictures/view.svg
+	cd sample_traces/nondeterministic_callback && $(abspath $(BIN))/rsltrace view a.mcap b.mcap \
+		--export ../../docs/pictures/view_two.svg
+	cd sample_traces/nondeterministic_callback && $(abspath $(BIN))/rsltrace view a.mcap b.mcap --light \
+		--keys "p down enter" --export ../../docs/pictures/view_plot.svg
 
 clean:
 	rm -rf $(VENV) $(OUT)

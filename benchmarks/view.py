@@ -34,7 +34,7 @@ from rsltrace.trace.writer import TraceWriter
 COLUMNS, ROWS = 120, 40
 NODES = 8
 PRESSES = 60
-_AIMS = {"step": 50, "page": 50, "end": 50}
+_KEYS = ("step", "page", "end")
 _ESCAPES = re.compile(rb"\x1b\[[0-9;?]*[ -/]*[@-~]|\x1b\][^\x07]*\x07|\x1b[()][A-Z0-9]|\x1b[=>78]")
 
 
@@ -160,9 +160,6 @@ def measure(path: Path, events: int) -> dict[str, float]:
         place += 1
         times["step"].append(terminal.press(b"j", place, events))
         time.sleep(0.03)
-    before = terminal.press(b"k", place - 1, events)
-    del before
-    place -= 1
     page = _page(terminal, place, events)
     place += page
     for _ in range(PRESSES):
@@ -175,6 +172,7 @@ def measure(path: Path, events: int) -> dict[str, float]:
         times["end"].append(terminal.press(b"\x1b[H", 0, events))
         time.sleep(0.05)
     result = {name: sorted(values)[int(len(values) * 0.95)] for name, values in times.items()}
+    result |= {f"{name} p50": sorted(values)[len(values) // 2] for name, values in times.items()}
     result["memory"] = terminal.memory_mb()
     terminal.quit()
     result["first"] = sorted(firsts)[1]
@@ -203,7 +201,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         folder = arguments.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        print(f"{'events':>10}  first screen  step p95  page p95  end p95  memory")
+        print(f"{'events':>10}  first screen       step       page        end  memory  (p50/p95)")
         for events in sizes:
             path = folder / f"view_{events}.mcap"
             if not path.exists():
@@ -211,8 +209,10 @@ def main() -> None:
             count = _events_in(path)
             found = measure(path, count)
             print(
-                f"{count:>10,}  {found['first']:>10.2f} s  {found['step']:>5.0f} ms  "
-                f"{found['page']:>5.0f} ms  {found['end']:>4.0f} ms  {found['memory']:>3.0f} MB"
+                f"{count:>10,}  {found['first']:>10.2f} s  "
+                + "  ".join(f"{found[f'{n} p50']:>3.0f}/{found[n]:>3.0f} ms" for n in _KEYS)
+                + f"  {found['memory']:>3.0f} MB",
+                flush=True,
             )
 
 

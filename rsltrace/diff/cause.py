@@ -8,7 +8,8 @@ from, so that the way back to the root can be told.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from rsltrace.diff.rows import CONSTRUCT, SHUTDOWN, OutputRow, Rows
@@ -67,17 +68,11 @@ class Cone:
     (a function of item and stretch) is true.
     """
 
-    def __init__(
-        self,
-        tainted_owners: Iterable[int] = (),
-        watch: Callable[[Item, Stretch], bool] | None = None,
-    ) -> None:
-        """``tainted_owners`` are nodes that are in one run only: no wonder that they differ."""
+    def __init__(self, watch: Callable[[Item, Stretch], bool] | None = None) -> None:
         self.found: list[Found] = []
         self.watched: Found | None = None
         self._watch = watch
         self._owners: dict[int, Mark] = {}
-        self._tainted_from_start = frozenset(tainted_owners)
         self._marks_a: dict[int, Mark] = {}
         self._marks_b: dict[int, Mark] = {}
         self._stretch: Stretch
@@ -136,8 +131,6 @@ class Cone:
             why, previous = self._explanation(item)
         if previous is not None and previous.root != UNDECIDED:
             self._consequence(item, why, previous)
-        elif rows.owner[place] in self._tainted_from_start and self.found:
-            self._consequence(item, None, self.found[0].mark)
         elif item.same:
             # It only changed places: with whom, and whether that was due to something, is known
             # when the instant is over.
@@ -286,14 +279,12 @@ class Cone:
                 self._taint(owner, mark)
             return
         self._taint(owner, mark)
-        if rows.kind[place] == CONSTRUCT:
-            for kind, number, _, _ in self._different_outputs(item):
-                if kind == OutputKind.ENTITY:
-                    self._taint(rows.run.identity.nodes[number], mark)
         found = self.found[mark.root]
         stamp = self._stretch.stamp(item)
         for kind, number, _, _ in self._different_outputs(item):
-            if kind in REACHING:
+            if kind == OutputKind.ENTITY:  # the node may be one that only this run has
+                self._taint(rows.run.identity.nodes[number], mark)
+            elif kind in REACHING:
                 first, count = found.reached.get(number, (stamp, 0))
                 found.reached[number] = (min(first, stamp), count + 1)
 
@@ -310,8 +301,26 @@ class Cone:
 
 
 def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:
-    """Return the outputs that differ: those at the same place once, others from either side."""
-    longer, shorter = (a, b) if len(a) >= len(b) else (b, a)
-    both = zip(longer, shorter, strict=False)
-    result = [mine for mine, other in both if mine[:3] != other[:3]]
-    return result + longer[len(shorter) :]
+    """Return the outputs that only one side has; where one changed into another of the same
+    sender, that of ``a``. The order does not matter."""
+    if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
+        return []
+    theirs = Counter(output[:3] for output in b)
+    mine = Counter(output[:3] for output in a)
+    result = list(_beyond(a, theirs))
+    changed = Counter(output[:2] for output in result)
+    for output in _beyond(b, mine):
+        if changed[output[:2]] > 0:
+            changed[output[:2]] -= 1
+        else:
+            result.append(output)
+    return result
+
+
+def _beyond(outputs: list[OutputRow], others: Counter[tuple[int, int, int]]) -> Iterator[OutputRow]:
+    """Yield the outputs of which the others have fewer."""
+    left = Counter(others)
+    for output in outputs:
+        left[output[:3]] -= 1
+        if left[output[:3]] < 0:
+            yield output

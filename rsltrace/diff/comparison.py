@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from itertools import islice
 
 from rsltrace.diff.cause import Cone, Found, different_outputs
@@ -84,7 +83,7 @@ class _Comparison:
     def _aligned(self) -> list[Divergence]:
         options = self._options
         watch = self._wanted if options.nodes or options.topics else None
-        cone = Cone(self._nodes_in_one_run(), watch)
+        cone = Cone(watch)
         per_stretch = options.window
         if options.everything:
             per_stretch = max(options.window, _EVENTS_PER_STRETCH)
@@ -126,12 +125,6 @@ class _Comparison:
             self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
         explainer = self._explainer(cone.found)
         return [explainer.explain(found) for found in chosen[:most]]
-
-    def _nodes_in_one_run(self) -> Iterable[int]:
-        """Return nodes that only one run has: that they act in one run only needs no reason."""
-        identity = self._identity
-        only = {*identity.only_a, *identity.only_b}
-        return [n for n in only if identity.nodes[n] == n]
 
     def _asked(self) -> str:
         return ", ".join((*self._options.nodes, *self._options.topics))

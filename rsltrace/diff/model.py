@@ -68,8 +68,9 @@ class EntityKey:
 class EventView:
     """One event of one run, resolved for printing.
 
-    ``position`` counts the events of this entity before it. ``summary`` is a short text of its
-    outputs (``/t1, call /s1``).
+    ``position`` counts the events of this entity before it; -1 far into a long run, where counting
+    would mean reading all of it. A constructor goes by the node it makes. ``summary`` is a short
+    text of its outputs (``/t1, call /s1``).
     """
 
     index: int
@@ -120,7 +121,7 @@ class MessageDifference:
     ``position`` is the output's place in its event, or -1 for the input. ``presence`` is ``both``,
     ``only a`` or ``only b``. ``fields`` is empty when a payload was not recorded; ``reason`` then
     says so, and how to record it. ``preview`` is the decoded message as one short line where only
-    one side has it.
+    one side has it (of an exception: its last line). A new entity has hash 0: it is known by name.
     """
 
     kind: OutputKind | None
@@ -141,6 +142,8 @@ class CauseStep:
     """One step of the way from the root to the divergence, root first.
 
     ``relation`` says how it leads to the next step: ``published /odom``, ``called /plan``, …
+    A few steps that led to the root may stand before it; they agree in both runs (``a`` and ``b``
+    are equal).
     """
 
     a: EventView | None
@@ -161,8 +164,9 @@ class Reach:
 class Divergence:
     """One place where the runs part. ``independent`` ones follow from no earlier one.
 
-    ``a`` or ``b`` is None where that run has no counterpart. ``root`` and ``root_step`` say where
-    it comes from; for most verdicts that is the diverging event itself. ``before_a``/``before_b``
+    ``a`` or ``b`` is None where that run has no counterpart. Of a schedule they are what either run
+    did first: two events, not one. ``root`` and ``root_sentence`` say where it comes from; for most
+    verdicts that is the diverging event itself. ``before_a``/``before_b``
     are the last events before it in each run, ``same_node_*`` the last ones in the same node.
     """
 

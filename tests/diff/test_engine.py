@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -403,3 +405,20 @@ def test_kinds_are_named_in_words(tmp_path: Path) -> None:
     assert "service" in phrase(replace(view, kind=EventKind.SERVICE))
     assert at(1_500_000_000) == "at 1.5 s"
     assert at(0) == "at 0.0 s"
+
+
+def test_a_diff_loads_only_what_it_needs(tmp_path: Path) -> None:
+    """Waiting for libraries is most of what a user waits for."""
+    compare(tmp_path, Fault("bit", step(20, 1)), storage=Storage(payloads=False))
+    code = (
+        "import sys, rsltrace\n"
+        "rsltrace.diff; assert 'numpy' not in sys.modules\n"
+        "a, b = sys.argv[1:]\n"
+        "assert rsltrace.diff(a, a).identical\n"
+        "assert 'rsltrace.diff.comparison' not in sys.modules\n"
+        "assert not rsltrace.diff(a, b).identical\n"
+        "names = 'pydantic ruamel rosbags rclpy fsspec rich mcap.reader'.split()\n"
+        "assert not [n for n in names if n in sys.modules]\n"
+    )
+    paths = [str(tmp_path / "a.mcap"), str(tmp_path / "b.mcap")]
+    subprocess.run([sys.executable, "-c", code, *paths], check=True, timeout=60)

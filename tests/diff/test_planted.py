@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 import random
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from diff_faults import PLANTERS, Planted, bounded_plan, plant
-from diff_simulator import Fault, Simulation
+from diff_faults import PLANTERS, Planted, bounded_plan, plant, storages
+from diff_simulator import MS, Fault, Simulation
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
@@ -133,3 +134,34 @@ def test_the_check_bites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         if planted is not None:
             wrong += bool(planted.check(diffed(planted, DiffOptions())))
     assert wrong > 3
+
+
+@settings(max_examples=2 * CASES, deadline=None, suppress_health_check=list(HealthCheck))
+@given(SEEDS, st.sampled_from([5, 50, 500]))
+def test_every_event_is_counted_once_whatever_the_runs_are(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, window: int
+) -> None:
+    """Two runs of other graphs, lengths and bags, with several faults: it only has to add up."""
+    folder, rng = tmp_path_factory.mktemp("any"), random.Random(seed)
+    plan, _ = bounded_plan(rng, folder)
+    other = plan
+    if rng.random() < 0.3:
+        other, _ = bounded_plan(rng, folder)
+    elif rng.random() < 0.5:
+        nodes = tuple(rng.sample(plan.nodes, len(plan.nodes)))
+        bag = tuple(message for message in plan.bag if rng.random() < 0.8)
+        other = replace(plan, nodes=nodes, bag=bag, end_ns=plan.end_ns + rng.choice((0, MS)))
+    layouts = storages(rng)
+    kinds = ("bit", "drop", "late", "extra")
+    faults = [Fault(rng.choice(kinds), rng.randrange(10, 400), delay_ns=MS) for _ in range(3)]
+    Simulation(plan, folder / "a.mcap", storage=layouts[0]).run()
+    try:
+        Simulation(other, folder / "b.mcap", tuple(faults), layouts[1]).run()
+    except IndexError:  # there was nothing yet that could come again
+        return
+    with Trace.open(folder / "a.mcap") as a, Trace.open(folder / "b.mcap") as b:
+        diff = diff_traces(a, b, DiffOptions(window=window, everything=True))
+        left = a.event_count - diff.agreeing, b.event_count - diff.agreeing
+    if diff.counts:  # not if one run is the beginning of the other
+        assert sum(c.matching + c.differing + c.only_a for c in diff.counts) == left[0]
+        assert sum(c.matching + c.differing + c.only_b for c in diff.counts) == left[1]

@@ -40,6 +40,7 @@ from rsltrace_viewer.widgets.timeline import Row, Timeline
 
 _WIDE = 110
 _REPORT_S = 0.25
+_EFFECTS_AT_ONCE_S = 0.004
 _INSPECT_S = 0.02
 """Events are inspected when one has stopped at them for this long: holding a key stays smooth."""
 
@@ -236,7 +237,13 @@ class ViewerApp(App[None]):
         self.inspector.show(session.lines(), top=top)
         here = session.current()
         if here is not None and session.effects is None:
-            walk(self, "effects", effects_of(*here), self._effects_arrived)
+            walk(
+                self,
+                "effects",
+                effects_of(*here),
+                self._effects_arrived,
+                at_once_s=_EFFECTS_AT_ONCE_S,
+            )
 
     def _effects_arrived(self, effects: Effects | None, done: bool) -> None:
         here = self.session.current()

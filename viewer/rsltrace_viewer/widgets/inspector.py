@@ -38,7 +38,7 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
     Inspector > .inspector--warning { color: $text-warning; }
     Inspector > .inspector--difference { color: $text-error; text-style: bold; }
     Inspector > .inspector--same { color: $text-muted; }
-    Inspector > .inspector--cursor { background: $primary 45%; }
+    Inspector > .inspector--cursor { background: $primary 30%; }
     """
 
     class Chosen(Message):

@@ -49,7 +49,7 @@ class Prompt(Vertical):
     Prompt Input { border: none; height: 1; padding: 0; background: $panel; }
     Prompt Input:focus { border: none; background-tint: $foreground 0%; }
     Prompt #line { height: 1; layout: horizontal; }
-    Prompt #label { width: auto; text-style: bold; color: $text-accent; }
+    Prompt #label { width: auto; text-style: bold; color: $text-primary; }
     Prompt #hint { height: 1; color: $text-muted; }
     Prompt #hint.wrong { color: $text-error; }
     """

@@ -83,7 +83,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     Timeline > .timeline--time { color: $text; }
     Timeline > .timeline--node { color: $text-primary; }
     Timeline > .timeline--plain { color: $text; }
-    Timeline > .timeline--cursor { background: $primary 45%; text-style: bold; }
+    Timeline > .timeline--cursor { background: $primary 30%; text-style: bold; }
     Timeline > .timeline--related { background: $secondary 25%; }
     Timeline > .timeline--lead { color: $text; text-style: bold; }
     Timeline > .timeline--mark { color: $text-accent; text-style: bold; }
