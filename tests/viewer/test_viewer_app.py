@@ -17,6 +17,7 @@ from rsltrace_viewer.widgets.bars import FooterBar
 from rsltrace_viewer.widgets.inspector import Inspector
 from rsltrace_viewer.widgets.lanes import LanesView
 from rsltrace_viewer.widgets.timeline import Timeline
+from textual import events
 
 Drive = Callable[..., None]
 Steps = Callable[[Any], Awaitable[None]]
@@ -175,6 +176,17 @@ def test_searching(made: Path, run: Run, drive: Drive) -> None:
         assert viewer.place > first
         await viewer.press("escape")
         assert viewer.app.session.search is None
+
+    drive(made, steps)
+
+
+def test_typing_fast_goes_into_the_question(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        for key in "Fkind:srv\r":  # no pause: as a fast hand does it
+            name = {":": "colon", "\r": "enter"}.get(key, key)
+            viewer.app.post_message(events.Key(name, key))
+        await viewer.settle()
+        assert viewer.app.session.filter_text == "kind:srv"
 
     drive(made, steps)
 

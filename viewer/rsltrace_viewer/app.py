@@ -51,8 +51,7 @@ class ViewerApp(App[None]):
     TITLE = "rsltrace view"
     ENABLE_COMMAND_PALETTE = True
     BINDINGS: ClassVar = [
-        Binding(key.keys, key.action, key.help, show=False, priority=key.keys.startswith("tab"))
-        for key in KEYS
+        Binding(key.keys, key.action, key.help, show=False, priority=key.first) for key in KEYS
     ]
     CSS = """
     Screen { layout: vertical; overflow: hidden; }
@@ -479,6 +478,12 @@ class ViewerApp(App[None]):
             self.go(place, centre=True)
 
     # Asking.
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Keys that ask come before the part that has the focus, but not while one types."""
+        if action == "ask":
+            return not self.prompt.asking and len(self.screen_stack) == 1
+        return True
 
     def action_ask(self, kind: str) -> None:
         """Ask for a search, a filter, a time or an index."""

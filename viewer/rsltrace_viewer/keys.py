@@ -22,6 +22,12 @@ class Key:
     rank: int = 99
     two: bool = False
 
+    @property
+    def first(self) -> bool:
+        """Whether the key is looked at before the focused part gets it. Questions are opened so:
+        what is typed right after must not reach that part any more."""
+        return self.action.startswith(("ask", "pane"))
+
 
 MOVE = "Step through events"
 FOLLOW = "Follow cause and effect"

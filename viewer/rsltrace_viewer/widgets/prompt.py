@@ -44,8 +44,7 @@ class Prompt(Vertical):
     """Hidden until something is asked."""
 
     DEFAULT_CSS = """
-    Prompt { height: auto; display: none; background: $panel; padding: 0 1; }
-    Prompt.asking { display: block; }
+    Prompt { height: auto; background: $panel; padding: 0 1; }
     Prompt Input { border: none; height: 1; padding: 0; background: $panel; }
     Prompt Input:focus { border: none; background-tint: $foreground 0%; }
     Prompt #line { height: 1; layout: horizontal; }
@@ -65,6 +64,7 @@ class Prompt(Vertical):
     def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self._question: Question | None = None
+        self.display = False
 
     def compose(self) -> ComposeResult:
         """Make the parts."""
@@ -84,10 +84,11 @@ class Prompt(Vertical):
         self.query_one("#label", Static).update(f"{question.label} ")
         field = self.query_one(Input)
         field.suggester = _Completer(question.complete) if question.complete else None
-        self.add_class("asking")
+        self.display = True
         field.value = question.value
         field.cursor_position = len(question.value)
-        field.focus()
+        # At once: what is typed next must not be taken for keys of the viewer.
+        self.screen.set_focus(field)
         self._say(question.value)
 
     def put_aside(self) -> None:
@@ -167,7 +168,7 @@ class Prompt(Vertical):
 
     def _close(self) -> None:
         self._question = None
-        self.remove_class("asking")
+        self.display = False
 
 
 def _tail(text: str) -> str:
