@@ -50,6 +50,10 @@ class EventLoop:
 
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
     (how many have run), ``activity_ns``.
+
+    ``gate``, if set, is called between time steps with the time of the next one (None: nothing is
+    left); it may switch to another stack and so pause the run. When it returns True, something may
+    have been made ready meanwhile, and the loop looks again.
     """
 
     def __init__(
@@ -70,6 +74,7 @@ class EventLoop:
         self.idle: list[Callable[[], bool]] = []
         self.timers = timers
         self.stop_conditions = stop_conditions
+        self.gate: Callable[[int | None], bool] | None = None
         self.stopped: Stop | None = None
         self._interrupt = False
         self._livelock_limit = livelock_limit
@@ -112,6 +117,8 @@ class EventLoop:
             if self.stopped is not None:  # by an event, or by a signal at any time
                 return self.stopped
             next_ns = self.next_ns()
+            if self.gate is not None and self.gate(next_ns):
+                continue
             stop = self._ask_conditions(next_ns)
             if stop is not None:
                 self.stopped = stop

@@ -16,7 +16,6 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.stop import Stop
 from rsltrace.model.event import EventKind
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.blocking import end_blocked, simulated_waiting
@@ -147,22 +146,22 @@ class World:
                 lambda: self._boundary.jump_clocks(delta_ns),
             )
 
-    def run(self) -> Stop:
-        """Run the loop to its end; a quiet end with somebody still waiting is a deadlock.
+    def go_on(self) -> None:
+        """Run the loop until it ends or its gate pauses it; afterwards this may be called again.
 
-        The loop never runs on this stack, so that no callback can keep it from going on.
+        The loop never runs on this stack, so that no callback can keep it from going on. A quiet
+        end with somebody still waiting is a deadlock.
         """
         core = self.core
         core.next_runner().switch()
+        if core.loop.stopped is None and core.runner_error is None:
+            return  # paused
         end_blocked(core)
         if core.runner_error is not None:
             raise core.runner_error
-        stop = core.loop.stopped
-        assert stop is not None
         if core.stuck and core.error is None:
             lines = "\n".join(f"  {text}" for text in core.stuck[:20])
             core.error = DeadlockError(f"nothing can happen any more, but somebody waits:\n{lines}")
-        return stop
 
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""

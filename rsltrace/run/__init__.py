@@ -2,6 +2,7 @@
 
 from rsltrace.run.process import Observer
 from rsltrace.run.provenance import environment
-from rsltrace.run.recording import RunResult, record, run
+from rsltrace.run.recording import record, run
+from rsltrace.run.session import RunResult
 
 __all__ = ["Observer", "RunResult", "environment", "record", "run"]

@@ -1,0 +1,242 @@
+"""One run of a job in stages: open, begin, go on, finish.
+
+The one way to run a job: ``record`` goes through the stages at once, ``Simulation`` lets somebody
+outside say how far to go.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import BagError, RunError
+from rsltrace.job import Job, locate
+from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.stop import Stop
+from rsltrace.loop.timer_queue import timer_queue
+from rsltrace.model.stamp import format_seconds
+from rsltrace.run.bags import check_bag_types, open_bag_of, start_ns_of, start_players
+from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
+from rsltrace.run.provenance import environment, payload_filter, sources, write_job
+from rsltrace.run.stopping import end_ns_of, stop_conditions
+from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
+from rsltrace.trace.recorder import Recorder
+from rsltrace.trace.writer import TraceWriter
+
+if TYPE_CHECKING:
+    from rsltrace.bag import Bag
+    from rsltrace.ros.world import Entry, World
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """How a run went. Times are simulated nanoseconds.
+
+    ``digest`` is 16 hex digits, empty for a run that recorded nothing. ``error`` is set when the
+    run failed; the trace is complete up to and including the event that failed.
+    """
+
+    path: Path | None
+    digest: str
+    events: int
+    start_ns: int
+    end_ns: int
+    stop_reason: str
+    exit_code: int
+    error: RunError | None = field(default=None, compare=False)
+
+    @property
+    def sim_seconds(self) -> str:
+        """Simulated duration in seconds, with nine decimals."""
+        return format_seconds(self.end_ns - self.start_ns)
+
+
+class Session:
+    """A run under way. Use as a context manager: within it, rclpy is simulated.
+
+    ``begin`` constructs the nodes and jumps to the start, ``go_on`` runs the loop until it ends (or
+    its gate pauses it), ``finish`` destroys the nodes, closes the trace and gives the result.
+    """
+
+    world: World
+    loop: EventLoop
+    start_ns: int
+    end_ns: int | None
+    """The latest simulated time the job lets the run reach, if time ends it."""
+
+    def __init__(
+        self,
+        job: Job,
+        output: Path | None,
+        *,
+        force: bool = False,
+        echo: bool = False,
+        observer: Observer | None = None,
+    ) -> None:
+        self.job = job
+        self.stop: Stop | None = None
+        self._output = output
+        self._force = force
+        self._echo = echo
+        self._observer = observer or Observer()
+        self._stack = ExitStack()
+        self._writer: TraceWriter | None = None
+        self._bags: list[Bag]
+        self._entries: list[Entry]
+
+    def __enter__(self) -> Session:
+        """Open everything. Whatever can be known to be wrong is found before a file is made.
+
+        :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
+        """
+        with ExitStack() as stack:
+            self._open(stack)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
+    ) -> None:
+        self._stack.__exit__(kind, error, where)
+
+    def _open(self, stack: ExitStack) -> None:
+        from rsltrace.ros.world import World
+
+        job, observer = self.job, self._observer
+        self._bags = [stack.enter_context(open_bag_of(job, bag)) for bag in job.bags]
+        self.start_ns = start_ns_of(job, self._bags)
+        self.end_ns = end_ns_of(job, self.start_ns)
+        stack.enter_context(search_path(job))
+        self.loop = loop = EventLoop(
+            start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
+            timers=timer_queue(job.timer_ties),
+            livelock_limit=job.livelock_limit,
+            between_steps=housekeeping(lambda: self.world.core, observer, self.end_ns),
+        )
+        self.world = world = stack.enter_context(
+            World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
+        )
+        loop.stop_conditions = tuple(stop_conditions(job, self.start_ns, world.core.outside_events))
+        self._entries = _prepare(job)
+        check_bag_types(job, self._bags)
+        if self._output is not None:
+            self._writer = writer = stack.enter_context(
+                TraceWriter(self._output, force=self._force)
+            )
+            world.core.recorder = Recorder(writer, keep_payload=payload_filter(job))
+            write_job(writer, job)
+            writer.add_metadata(METADATA_ENVIRONMENT, environment())
+            writer.add_metadata(METADATA_SOURCES, sources(job))
+        if observer.interrupt is not None:
+            observer.interrupt(loop.stop)
+        stack.enter_context(quiet_gc())
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is over, for whatever reason."""
+        return self.stop is not None or self.loop.stopped is not None
+
+    @property
+    def error(self) -> RunError | None:
+        """What went wrong in the run, if anything did."""
+        return self.world.error
+
+    @property
+    def digest(self) -> str:
+        """The digest so far, empty for a run that records nothing."""
+        recorder = self.world.core.recorder
+        return "" if recorder is None else recorder.digest
+
+    def begin(self) -> None:
+        """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
+        core = self.world.core
+        random.seed(self.job.seed)
+        if self.job.stop.topic is not None:
+            from rsltrace.ros.watch import watch_exit_code
+
+            core.watch(self.job.stop.topic.name, watch_exit_code(core, self.job.stop.topic))
+        with self._failures():
+            for entry in self._entries:
+                if not self.world.construct(entry):
+                    break
+            if not self.ended:
+                start_players(self.world, self.job, self._bags)
+            if not self.ended:
+                self.world.jump(self.start_ns)
+
+    def go_on(self) -> None:
+        """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
+        with self._failures():
+            self.world.go_on()
+
+    @contextmanager
+    def _failures(self) -> Iterator[None]:
+        try:
+            yield
+        except (RunError, BagError) as error:
+            # Raised by the loop itself (a livelock) or the bag player, not by a callback.
+            core = self.world.core
+            core.error = error if isinstance(error, RunError) else RunError(str(error))
+            self.stop = Stop(str(error).splitlines()[0], core.error.exit_code)
+
+    def finish(self) -> RunResult:
+        """Destroy the nodes, close the trace, and say how it went.
+
+        :raises OutputError: if the rest of the trace cannot be written.
+        """
+        loop, core = self.loop, self.world.core
+        stop = self.stop or loop.stopped
+        assert stop is not None, "a run ends with a reason"
+        self.world.destroy()
+        error = self.world.error
+        exit_code = error.exit_code if error is not None else stop.exit_code
+        if self._writer is not None:
+            self._writer.close(
+                result={
+                    "start_time": str(self.start_ns),
+                    "end_time": str(loop.now_ns),
+                    "stop_reason": stop.reason,
+                    "exit_code": str(exit_code),
+                }
+            )
+        digest = self.digest
+        core.recorder = None  # what finalizers say from now on comes too late
+        return RunResult(
+            path=self._output,
+            digest=digest,
+            events=loop.events,
+            start_ns=self.start_ns,
+            end_ns=loop.now_ns,
+            stop_reason=stop.reason,
+            exit_code=exit_code,
+            error=error,
+        )
+
+
+def _prepare(job: Job) -> list[Entry]:
+    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
+    from rsltrace.ros.world import Entry, load_target, ros_arguments
+
+    entries = []
+    for index, spec in enumerate(job.nodes):
+        where = locate(job, ("nodes", index, "node"))
+        make: Any = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
+        arguments = ros_arguments(
+            name=spec.name,
+            namespace=spec.namespace,
+            parameters=spec.parameters,
+            parameter_files=[job.resolve(path) for path in spec.parameter_files],
+            remappings=spec.remappings,
+            where=where,
+        )
+        entries.append(Entry(spec.target, partial(make, **spec.arguments), arguments))
+    return entries
