@@ -21,6 +21,16 @@ if TYPE_CHECKING:
     from rsltrace.run import RunResult
 
 
+SET = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.",
+)
+"""Loads a job with other values; list entries by number, by name, or + for a new one."""
+
+
 @click.command()
 @click.argument("job", type=click.Path(path_type=Path))
 @click.option(
@@ -33,6 +43,7 @@ if TYPE_CHECKING:
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+@SET
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
 def record(
     job: Path,
@@ -41,6 +52,7 @@ def record(
     seed: int | None,
     until: str | None,
     as_json: bool,
+    overrides: tuple[str, ...],
     quiet: bool,
 ) -> None:
     """Run JOB (a job.yaml) deterministically and record its trace.
@@ -53,7 +65,7 @@ def record(
     from rsltrace.job import load_job
     from rsltrace.run import Observer, run
 
-    loaded = _changed(load_job(job), seed=seed, until=until)
+    loaded = _changed(load_job(job, overrides=overrides), seed=seed, until=until)
     path = output or default_output(job)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(

@@ -58,6 +58,7 @@ class Job(Part):
     given_text: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None, alias="source_text", exclude=True, repr=False
     )
+    composed: Any = Field(default=None, exclude=True, repr=False)
 
     if TYPE_CHECKING:
 
@@ -83,7 +84,10 @@ class Job(Part):
 
     @property
     def source_text(self) -> str:
-        """The YAML text the job was read from; of a job built in Python, ``to_yaml()``."""
+        """The YAML text the job was read from; of one built in Python, or put together from
+        several files or with overrides, ``to_yaml()``."""
+        if self.composed is not None:
+            return f"{self.composed.header()}{self.to_yaml()}"
         return self.to_yaml() if self.given_text is None else self.given_text
 
     def resolve(self, path: str) -> Path:

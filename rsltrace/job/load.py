@@ -3,53 +3,72 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
 
 from rsltrace.errors import JobError
+from rsltrace.job.compose import Composition, compose
 from rsltrace.job.job import Job
+from rsltrace.job.model import file_fields
 from rsltrace.job.part import FROM_FILE
 from rsltrace.job.problems import Problem, format_loc, problems_of, unknown_key
-from rsltrace.job.yaml_source import Mark, YamlSource, parse_yaml
+from rsltrace.job.tree import Item, Place, YamlSource, place_at, plain
+from rsltrace.job.yaml_source import parse_yaml
 
 SIZE_MAX = 16 << 20
 """A job file of more bytes is something else."""
 
 
-def load_job(path: str | os.PathLike[str]) -> Job:
+def load_job(path: str | os.PathLike[str], *, overrides: Sequence[str] = ()) -> Job:
     """Return the job in the YAML file ``path``; relative paths in it start at its folder.
 
-    Imports neither rclpy nor user code. Raises ``JobError`` with ``file:line:column``, the line
-    itself and what is expected; several mistakes are reported together, in the order of the file.
+    ``overrides`` are ``key=value`` texts as of ``--set``. Imports neither rclpy nor user code.
+    Raises ``JobError`` with ``file:line:column``, the line itself and what is expected; several
+    mistakes are reported together, in the order of the file.
     """
     name = os.fspath(path)
-    source = parse_yaml(_read(Path(name)), name)
-    if source.value is None:
-        raise JobError("the job file is empty: it needs at least 'nodes:' or 'bags:'", where=name)
-    if not isinstance(source.value, dict):
-        raise source.error("a job is a mapping (nodes: ..., stop: ...)", source.mark(()))
+    composed = compose(name, _parse, [("--set", override) for override in overrides])
+    base_dir = os.path.dirname(os.path.abspath(name))
+    given = plain(composed.root, base_dir)
+    assert isinstance(given, dict)
 
-    file_keys = [
-        field.alias or name for name, field in Job.model_fields.items() if not field.exclude
-    ]
+    job_keys = [key for key, _ in file_fields(Job)]
+    composing = {key for key, _ in file_fields(Composition)}
+    problems = _composition_problems({key: given[key] for key in given if key in composing})
     values: dict[str, object] = {}
-    problems: list[Problem] = []
-    for key, value in source.value.items():
-        if key in file_keys:
+    for key, value in given.items():
+        if key in job_keys:
             values[key] = value
-        else:
-            problems.append(unknown_key(key, file_keys, ()))
-    values["base_dir"] = os.path.dirname(os.path.abspath(name))
+        elif key not in composing:
+            problems.append(unknown_key(key, [*job_keys, *sorted(composing)], ()))
+    values["base_dir"] = base_dir
     values["source_name"] = name
-    values["source_text"] = source.text
+    if composed.is_plain:
+        values["source_text"] = composed.source.text
+    else:
+        values["composed"] = composed
     try:
         job = Job.model_validate(values, context=FROM_FILE)
     except ValidationError as error:
         problems += problems_of(error, Job)
     if problems:
-        raise _job_error(source, problems)
+        raise _job_error(composed.root, problems)
     return job
+
+
+def _parse(name: str) -> YamlSource:
+    folder = os.path.dirname(os.path.abspath(name))
+    return parse_yaml(_read(Path(name)), name, folder=folder)
+
+
+def _composition_problems(values: dict[str, object]) -> list[Problem]:
+    try:
+        Composition.model_validate(values, context=FROM_FILE)
+    except ValidationError as error:
+        return problems_of(error, Composition)
+    return []
 
 
 def _read(path: Path) -> str:
@@ -78,17 +97,24 @@ def _read(path: Path) -> str:
         ) from None
 
 
-def _job_error(source: YamlSource, problems: list[Problem]) -> JobError:
-    """Return one error that tells all problems, the first in the file first."""
-    placed: list[tuple[Mark, str]] = sorted(
-        ((source.mark(p.loc, at_key=p.at_key), p.message) for p in problems),
-        key=lambda item: (item[0].line, item[0].column),
+def _job_error(root: Item, problems: list[Problem]) -> JobError:
+    """Return one error that tells all problems: the first file's first, each in its order."""
+    found = [(place_at(root, p.loc, at_key=p.at_key), p.message) for p in problems]
+    names = list(
+        dict.fromkeys([root.place.source.name, *(place.source.name for place, _ in found)])
     )
-    text = ""
-    for mark, message in placed:
-        head = f"\n{source.where(mark)}: " if text else ""
-        text += f"{head}{message}{source.excerpt(mark)}"
-    return JobError(text, where=source.where(placed[0][0]))
+
+    def order(entry: tuple[Place, str]) -> tuple[int, int, int]:
+        place = entry[0]
+        return names.index(place.source.name), place.mark.line, place.mark.column
+
+    texts: list[str] = []
+    for place, message in sorted(found, key=order):
+        source = place.source
+        head = f"{source.where(place.mark)}: " if texts else ""
+        texts.append(f"{head}{message}{source.excerpt(place.mark)}")
+    first = min(found, key=order)[0]
+    return JobError("\n".join(texts), where=first.source.where(first.mark))
 
 
 def locate(job: Job, loc: tuple[str | int, ...]) -> str:
@@ -97,7 +123,12 @@ def locate(job: Job, loc: tuple[str | int, ...]) -> str:
     For mistakes that show only when the run begins. A job built in Python has no lines; its parts
     are named instead: ``<python>: nodes[0].node``.
     """
-    if job.given_text is None:
+    if job.composed is not None:
+        place = place_at(job.composed.root, loc)
+    elif job.given_text is not None:
+        root = parse_yaml(job.given_text, job.source_name).root
+        assert root is not None, "the text has been a job"
+        place = place_at(root, loc)
+    else:
         return f"{job.source_name}: {format_loc(loc)}"
-    source = parse_yaml(job.given_text, job.source_name)
-    return source.where(source.mark(loc))
+    return place.source.where(place.mark)

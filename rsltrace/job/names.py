@@ -7,6 +7,7 @@ rclpy is not imported here (a job is read on machines without ROS); a test compa
 from __future__ import annotations
 
 import re
+from typing import Any
 
 NODE_NAME_LENGTH_MAX = 255
 NAMESPACE_LENGTH_MAX = 245
@@ -14,6 +15,7 @@ NAMESPACE_LENGTH_MAX = 245
 _PART = r"[A-Za-z_][A-Za-z0-9_]*"
 _NODE_NAME = re.compile(_PART, re.ASCII)
 _NAMESPACE = re.compile(rf"/|(?:/{_PART})+", re.ASCII)
+_VARIABLE = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*", re.ASCII)
 _TOPIC = re.compile(rf"(?:/{_PART})+", re.ASCII)
 _FIELD_PATH = re.compile(r"[A-Za-z][A-Za-z0-9_]*(?:\.[A-Za-z][A-Za-z0-9_]*)*", re.ASCII)
 
@@ -78,6 +80,15 @@ def check_target(target: str) -> None:
         raise ValueError(f"expected module:Class or module:function, got {target!r}")
 
 
+def check_variable(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` can be a variable of a job."""
+    if not _VARIABLE.fullmatch(name):
+        raise ValueError(
+            f"{name!r} is not a variable's name: use letters, digits, '_' and '-', not starting "
+            "with a digit"
+        )
+
+
 def check_remap_from(name: str) -> None:
     """Raise ``ValueError`` unless rcl accepts ``name`` on the left of a remapping rule."""
     if name in ("__node", "__name", "__ns"):
@@ -105,3 +116,19 @@ def check_glob(glob: str) -> None:
         raise ValueError("an empty pattern matches no topic: write a topic name or a glob")
     if glob[0] not in "/*?[":
         raise ValueError(f"topic names start with '/': write '/{glob}' (or '*{glob}')")
+
+
+# What the rules accept, for the JSON Schema (whose regular expressions are JavaScript's).
+_PATTERNS: tuple[tuple[Any, str], ...] = (
+    (check_node_name, rf"^{_PART}$"),
+    (check_namespace, rf"^(/|(/{_PART})+)$"),
+    (check_topic, rf"^(/{_PART})+$"),
+    (check_variable, r"^[A-Za-z_][A-Za-z0-9_-]*$"),
+    (check_field_path, r"^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*$"),
+    (check_target, r"^[^\s:]+:[^\s:]+$"),
+    (check_remap_from, r"^[A-Za-z0-9_~/:]+$"),
+    (check_remap_to, r"^[A-Za-z0-9_~/]+$"),
+    (check_glob, r"^[/*?\[]"),
+)
+for _rule, _pattern in _PATTERNS:
+    _rule.pattern = _pattern

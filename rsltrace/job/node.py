@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -16,9 +16,10 @@ from rsltrace.job.names import (
     check_target,
 )
 from rsltrace.job.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.part import Part, check, items, text
+from rsltrace.job.part import Part, attach, check, items, one_of, text
 from rsltrace.job.problems import Problem, Problems, describe
 from rsltrace.job.times import ExactFloat
+from rsltrace.job.tree import FileText, from_its_folder
 
 Target = str | Callable[..., object]
 """``module:attribute`` as text, or (in Python) the class or function itself."""
@@ -46,7 +47,12 @@ def check_path(value: object) -> str:
         value = os.fspath(value)
     if isinstance(value, str) and not value:
         raise Problem("a path cannot be empty")
-    return text()(value)
+    text()(value)
+    return from_its_folder(value)  # type: ignore[arg-type]  # text, as just checked
+
+
+attach(check_path, schema={"type": "string", "minLength": 1})
+attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]
 
 
 def _check_remappings(value: object) -> dict[str, str]:
@@ -61,7 +67,7 @@ def _check_remappings(value: object) -> dict[str, str]:
                 problems.append(Problem(str(error), (str(name),), at_key=at_key))
     if problems:
         raise Problems(problems)
-    return dict(value)
+    return {str(name): str(to) for name, to in value.items()}
 
 
 def _check_arguments(value: object) -> dict[str, Any]:
@@ -77,6 +83,8 @@ def _plain_floats(value: object) -> object:
     # What user code gets must not carry types of ours.
     if isinstance(value, ExactFloat):
         return float(value)
+    if isinstance(value, FileText):
+        return str(value)
     if type(value) is dict:
         return {key: _plain_floats(item) for key, item in value.items()}
     if type(value) is list:
@@ -100,6 +108,7 @@ class NodeSpec(Part):
     parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = ()
     remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(default_factory=dict)
     arguments: Annotated[dict[str, Any], check(_check_arguments)] = Field(default_factory=dict)
+    on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = "stop"
 
     if TYPE_CHECKING:
 
@@ -113,6 +122,7 @@ class NodeSpec(Part):
             parameter_files: list[str | os.PathLike[str]] | tuple[str | os.PathLike[str], ...] = (),
             remappings: dict[str, str] = ...,
             arguments: dict[str, Any] = ...,
+            on_exception: Literal["stop", "log"] = "stop",
         ) -> None: ...
 
     @property

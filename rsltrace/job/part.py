@@ -7,6 +7,7 @@ name (``duration_ns=``). The pydantic context tells the two apart.
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -21,7 +22,7 @@ from pydantic import (
 
 from rsltrace.errors import JobError
 from rsltrace.job.problems import Problem, Problems, describe, problems_of
-from rsltrace.job.times import Nanoseconds, parse_time
+from rsltrace.job.times import TIME_SCHEMA, Nanoseconds, parse_time
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -90,7 +91,19 @@ def check(function: Callable[[Any], object], *, optional: bool = False) -> Befor
             raise Problem("no value is given: give one, or leave the key out")
         return None if value is None and optional else function(value)
 
+    attach(validate, schema=getattr(function, "schema", None))
     return BeforeValidator(validate)
+
+
+def attach(function: Any, **facts: object) -> Any:
+    """Let a check tell the generators of schema and documentation what it accepts.
+
+    ``schema`` is JSON Schema; ``shorthand`` (``entry_shorthand``, of a list's entries) is the key
+    that text alone stands for. Returns ``function``.
+    """
+    for name, value in facts.items():
+        setattr(function, name, value)
+    return function
 
 
 def text(rule: Callable[[str], None] | None = None) -> Callable[[Any], str]:
@@ -101,8 +114,11 @@ def text(rule: Callable[[str], None] | None = None) -> Callable[[Any], str]:
             raise Problem(f"expected text, got {describe(value)}")
         if rule is not None:
             rule(value)
-        return value
+        return str(value)
 
+    pattern = getattr(rule, "pattern", None)
+    schema = {"type": "string"} if pattern is None else {"type": "string", "pattern": pattern}
+    attach(function, schema=schema)
     return function
 
 
@@ -117,6 +133,7 @@ def whole(least: int, most: int = 2**63 - 1) -> Callable[[Any], int]:
             raise Problem(f"must be {bound}, got {value}")
         return int(value)
 
+    attach(function, schema={"type": "integer", "minimum": least, "maximum": most})
     return function
 
 
@@ -125,10 +142,23 @@ def one_of(*choices: str) -> Callable[[Any], str]:
 
     def function(value: object) -> str:
         if not isinstance(value, str) or value not in choices:
-            raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}")
-        return value
+            close = difflib.get_close_matches(str(value), choices, n=1)
+            hint = f"; did you mean {close[0]}?" if close and len(choices) > 2 else ""
+            raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}{hint}")
+        return str(value)
 
+    attach(function, schema={"enum": list(choices)})
     return function
+
+
+def flag(value: object) -> bool:
+    """Check true or false."""
+    if not isinstance(value, bool):
+        raise Problem(f"expected true or false, got {describe(value)}")
+    return value
+
+
+attach(flag, schema={"type": "boolean"})
 
 
 def positive_time(value: object) -> int:
@@ -137,6 +167,10 @@ def positive_time(value: object) -> int:
     if time_ns == 0:
         raise Problem("must be more than 0")
     return time_ns
+
+
+attach(parse_time, schema=TIME_SCHEMA)
+attach(positive_time, schema=TIME_SCHEMA)
 
 
 def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ...]]:
@@ -156,7 +190,8 @@ def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ..
             raise Problems(problems)
         return tuple(checked)
 
-    return check_items
+    schema = getattr(function, "schema", None) or {}
+    return attach(check_items, schema={"type": "array", "items": schema})  # type: ignore[no-any-return]
 
 
 def parts(shorthand: str | None = None) -> BeforeValidator:
@@ -169,6 +204,7 @@ def parts(shorthand: str | None = None) -> BeforeValidator:
             return tuple(values)
         return tuple({shorthand: v} if isinstance(v, str) else v for v in values)
 
+    attach(validate, entry_shorthand=shorthand)
     return BeforeValidator(validate)
 
 
@@ -180,4 +216,5 @@ def part(shorthand: str) -> BeforeValidator:
             raise Problem("no value is given: give one, or leave the key out")
         return {shorthand: value} if isinstance(value, str) else value
 
+    attach(validate, shorthand=shorthand)
     return BeforeValidator(validate)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable
-from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -110,21 +109,11 @@ def _wording(kind: str, message: str, cause: object, value: object) -> str:
 
 def _keys_at(model: type[BaseModel], loc: Loc) -> list[str]:
     """Return the keys a job may have at ``loc``, found by walking the models' annotations."""
-    for part in loc:
-        if isinstance(part, int):
-            continue
-        field = next(f for n, f in model.model_fields.items() if part in (n, f.alias))
-        inner = _model_in(field.annotation)
-        assert inner is not None, "extra keys can only be forbidden inside a model"
-        model = inner
-    fields = model.model_fields.items()
-    return [field.alias or name for name, field in fields if field.exclude is not True]
+    from rsltrace.job.model import field_at, file_fields, models_in
 
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    # In Python 3.10 tuple[X, ...] calls itself a type, so what is inside comes first.
-    if inner := get_args(annotation):
-        return next((found for arg in inner if (found := _model_in(arg))), None)
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return None
+    models = [model]
+    if loc:
+        field = field_at(model, loc)
+        assert field is not None, "extra keys can only be forbidden inside a model"
+        models = models_in(field.annotation)
+    return [key for inner in models for key, _ in file_fields(inner)]

@@ -10,20 +10,14 @@ from pydantic import Field, ValidationInfo, field_validator
 
 from rsltrace.job.names import check_field_path, check_glob, check_topic
 from rsltrace.job.node import Target, check_callable_target, check_path
-from rsltrace.job.part import Part, check, from_file, items, part, positive_time, text, whole
-from rsltrace.job.problems import Problem, describe
+from rsltrace.job.part import Part, check, flag, from_file, items, part, positive_time, text, whole
+from rsltrace.job.problems import Problem
 from rsltrace.job.times import parse_time
 
 TimeLike = str | int | float
 """A time in Python as in YAML: seconds as a number, or text with a unit."""
 
 Globs = Annotated[tuple[str, ...], check(items(text(check_glob)))]
-
-
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise Problem(f"expected true or false, got {describe(value)}")
-    return value
 
 
 class BagSpec(Part):
@@ -109,7 +103,7 @@ class StopSpec(Part):
 class RecordSpec(Part):
     """Which payloads the trace keeps. Hashes are kept in any case."""
 
-    payloads: Annotated[bool, check(_flag)] = True
+    payloads: Annotated[bool, check(flag)] = True
     topics: Globs = ("*",)
     exclude: Globs = ()
 

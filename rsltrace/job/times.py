@@ -28,6 +28,18 @@ UNITS_NS = {
 _TIME_TEXT = re.compile(
     r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-z]*)\s*"
 )
+TIME_SCHEMA: dict[str, object] = {
+    "anyOf": [
+        {"type": "number", "minimum": 0},
+        {
+            "type": "string",
+            "pattern": r"^\s*\+?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
+            r"\s*(ns|us|ms|s|min|h)\s*$",
+        },
+    ]
+}
+"""JSON Schema of what ``parse_time`` takes, as far as a schema can say."""
+
 _EXPECTED = "expected a time: seconds as a number, or a number with a unit (ns, us, ms, s, min, h)"
 
 

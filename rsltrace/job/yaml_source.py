@@ -7,7 +7,7 @@ constructor throws away: the text of each number, the place of each key, and key
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -16,7 +16,6 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from rsltrace.errors import JobError
-from rsltrace.job.problems import Loc
 from rsltrace.job.times import ExactFloat
 
 VALUES_MAX = 100_000
@@ -36,27 +35,27 @@ class Mark:
     column: int
 
 
-@dataclass
+@dataclass(eq=False)
 class YamlSource:
-    """The text of a YAML file with its values and their places."""
+    """The text of a YAML file (or of an option, ``is_option``) with its values.
+
+    ``name`` is how messages call it, ``folder`` (absolute) is where paths in it start.
+    """
 
     name: str
     text: str
-    value: object = None
-    values: dict[Loc, Mark] = field(default_factory=dict)
-    keys: dict[Loc, Mark] = field(default_factory=dict)
+    folder: str | None = None
+    is_option: bool = False
+    root: Item | None = None
 
-    def mark(self, loc: Loc, *, at_key: bool = False) -> Mark:
-        """Return the place of the value (or key) at ``loc``, or of the nearest one around it."""
-        if at_key and loc in self.keys:
-            return self.keys[loc]
-        while loc and loc not in self.values:
-            loc = loc[:-1]
-        return self.values.get(loc, Mark(1, 1))
+    @property
+    def value(self) -> object:
+        """All values, without their places."""
+        return None if self.root is None else self.root.plain()
 
     def where(self, mark: Mark) -> str:
-        """Return ``file:line:column``."""
-        return f"{self.name}:{mark.line}:{mark.column}"
+        """Return ``file:line:column``; an option is short enough to do without."""
+        return self.name if self.is_option else f"{self.name}:{mark.line}:{mark.column}"
 
     def excerpt(self, mark: Mark) -> str:
         """Return the line of ``mark`` with a caret below the column, or nothing past the end."""
@@ -69,7 +68,7 @@ class YamlSource:
         shown = line[start : start + SHOWN_COLUMNS]
         # Tabs stay tabs, so that the caret lines up however wide a terminal draws them.
         before = "".join("\t" if c == "\t" else " " for c in shown[: column - start])
-        gutter = f"{mark.line:>5} | "
+        gutter = "      | " if self.is_option else f"{mark.line:>5} | "
         return f"\n{gutter}{shown.rstrip()}\n{' ' * (len(gutter) - 2)}| {before}^"
 
     def error(self, message: str, mark: Mark) -> JobError:
@@ -77,21 +76,61 @@ class YamlSource:
         return JobError(f"{message}{self.excerpt(mark)}", where=self.where(mark))
 
 
-def parse_yaml(text: str, name: str) -> YamlSource:
+@dataclass(frozen=True)
+class Place:
+    """A mark in one of the files a job is made of."""
+
+    source: YamlSource
+    mark: Mark
+
+    def error(self, message: str) -> JobError:
+        """Return the error that ``message`` is wrong here."""
+        return self.source.error(message, self.mark)
+
+
+@dataclass(frozen=True)
+class Item:
+    """A value with its place: a scalar, or a list or mapping of items.
+
+    ``key_place`` is where its key stands, if it has one. ``is_bare`` tells text without quotes,
+    which may turn out to be a number once ``$(...)`` in it is replaced.
+    """
+
+    value: Any
+    place: Place
+    key_place: Place | None = None
+    is_bare: bool = False
+
+    def plain(self) -> object:
+        """Return the value without places."""
+        if isinstance(self.value, dict):
+            return {key: item.plain() for key, item in self.value.items()}
+        if isinstance(self.value, list):
+            return [item.plain() for item in self.value]
+        return self.value
+
+
+def parse_yaml(
+    text: str, name: str, *, folder: str | None = None, option: str | None = None
+) -> YamlSource:
     """Return the values and places of the one document in ``text``; ``name`` is the file's.
 
-    Raises ``JobError`` for anything that is not plain YAML 1.2 data with distinct keys.
+    ``option`` is the whole text of a command line option that ``text`` is the end of; places then
+    count in the option. Raises ``JobError`` for anything that is not plain YAML 1.2 data with
+    distinct keys.
     """
-    source = YamlSource(name, text)
+    source = YamlSource(name, text if option is None else option, folder, option is not None)
+    # Blanks in front keep the columns; they mean nothing in front of a value on one line.
+    written = text if option is None else " " * (len(option) - len(text)) + text
     try:
-        root = YAML().compose(text)
+        root = YAML().compose(written)
         if root is not None:
-            source.value = _Builder(source).build(root, ())
+            source.root = _Builder(source).build(root)
     except MarkedYAMLError as error:
         raise _syntax_error(source, error) from None
     except ReaderError as error:
-        mark = _mark_at(text, error.position)
-        raise source.error(f"{error.reason}: {text[error.position]!r}", mark) from None
+        mark = _mark_at(written, error.position)
+        raise source.error(f"{error.reason}: {written[error.position]!r}", mark) from None
     except YAMLError as error:
         raise JobError(f"not YAML: {error}", where=name) from None
     except RecursionError:
@@ -99,47 +138,48 @@ def parse_yaml(text: str, name: str) -> YamlSource:
     return source
 
 
+def bare_value(text: str) -> object:
+    """Return what ``text`` without quotes means in YAML: a number, true, null, or itself."""
+    kind = str(YAML().resolver.resolve(ScalarNode, text, (True, False)))
+    try:
+        return _value(kind.removeprefix(_TAG), text)
+    except ValueError:
+        return text
+
+
 class _Builder:
-    """Makes plain values of composed nodes and notes where each came from."""
+    """Makes items of composed nodes."""
 
     def __init__(self, source: YamlSource) -> None:
         self.source = source
         self.open: set[int] = set()
         self.count = 0
 
-    def build(self, node: Node, loc: Loc) -> object:
-        mark = _mark(node)
-        self.source.values[loc] = mark
+    def build(self, node: Node, key: Node | None = None) -> Item:
+        place = Place(self.source, _mark(node))
+        key_place = None if key is None else Place(self.source, _mark(key))
         self.count += 1
         if self.count > VALUES_MAX:
-            raise self.source.error(
-                f"more than {VALUES_MAX} values once aliases are followed", mark
-            )
+            raise place.error(f"more than {VALUES_MAX} values once aliases are followed")
         if isinstance(node, ScalarNode):
-            return self._scalar(node)
+            if key_place is not None and not _is_written(node):
+                # The mark of a value that is not there lies wherever the next token begins.
+                place = key_place
+            value = self._scalar(node)
+            return Item(value, place, key_place, is_bare=node.style is None)
         if id(node) in self.open:
-            raise self.source.error("an alias refers to a value that contains it", mark)
+            raise place.error("an alias refers to a value that contains it")
         self.open.add(id(node))
-        value: object
+        inner: object
         if isinstance(node, SequenceNode) and _tag(node) == f"{_TAG}seq":
-            value = [self.build(item, (*loc, index)) for index, item in enumerate(node.value)]
+            inner = [self.build(item) for item in node.value]
         elif isinstance(node, MappingNode) and _tag(node) == f"{_TAG}map":
-            value = self._mapping(node, loc)
+            pairs = self._pairs(node).items()
+            inner = {name: self.build(item, name_node) for name, (name_node, item) in pairs}
         else:
             raise self._unknown_tag(node)
         self.open.discard(id(node))
-        return value
-
-    def _mapping(self, node: MappingNode, loc: Loc) -> dict[object, object]:
-        values: dict[object, object] = {}
-        for key, (key_node, value_node) in self._pairs(node).items():
-            place = (*loc, key if isinstance(key, (str, int)) else str(key))
-            self.source.keys[place] = _mark(key_node)
-            values[key] = self.build(value_node, place)
-            if isinstance(value_node, ScalarNode) and not _is_written(value_node):
-                # The mark of a value that is not there lies wherever the next token begins.
-                self.source.values[place] = self.source.keys[place]
-        return values
+        return Item(inner, place, key_place)
 
     def _pairs(self, node: MappingNode) -> dict[object, tuple[ScalarNode, Node]]:
         """Return the keys of a mapping, then those that ``<<`` merges in and it lacks itself."""
@@ -169,23 +209,31 @@ class _Builder:
     def _scalar(self, node: ScalarNode) -> object:
         tag, text = _tag(node), str(node.value)
         kind = tag[len(_TAG) :] if tag.startswith(_TAG) else ""
-        if kind == "null":
-            return None
-        if kind == "bool":
-            return text.lower() in ("true", "yes", "on")
-        if kind in ("int", "float"):
-            try:
-                return _integer(text) if kind == "int" else ExactFloat(_float(text), text)
-            except ValueError:
-                raise self.source.error(f"{text!r} is not a number", _mark(node)) from None
-        # A date is text to a job, and so is the lone '=' that YAML 1.1 gave a meaning.
-        if kind in ("str", "timestamp", "value", "merge"):
-            return text
-        raise self._unknown_tag(node)
+        if kind not in _SCALARS:
+            raise self._unknown_tag(node)
+        try:
+            return _value(kind, text)
+        except ValueError:
+            raise self.source.error(f"{text!r} is not a number", _mark(node)) from None
 
     def _unknown_tag(self, node: Node) -> JobError:
         tag = _tag(node).replace(_TAG, "!!")
         return self.source.error(f"the YAML tag {tag} has no meaning in a job", _mark(node))
+
+
+# A date is text to a job, and so is the lone '=' that YAML 1.1 gave a meaning.
+_SCALARS = ("null", "bool", "int", "float", "str", "timestamp", "value", "merge")
+
+
+def _value(kind: str, text: str) -> object:
+    """Return the value of a scalar. Raises ``ValueError`` for what looks like a number only."""
+    if kind == "null":
+        return None
+    if kind == "bool":
+        return text.lower() in ("true", "yes", "on")
+    if kind == "int":
+        return _integer(text)
+    return ExactFloat(_float(text), text) if kind == "float" else text
 
 
 def _tag(node: Any) -> str:

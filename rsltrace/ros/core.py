@@ -40,6 +40,8 @@ if TYPE_CHECKING:
     from rsltrace.ros.tasks import TaskRun
 
 _RAISED = int(EventFlag.RAISED)
+_LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))
+_ERROR = 40
 _pack_value = struct.Struct("<Bq").pack
 
 
@@ -80,6 +82,7 @@ class Core:
         self.logs: Logs
         self.main_context: ContextHandle | None = None
         self.node_arguments: list[RosArguments] = []
+        self.log_exceptions = False
         self.suspended: dict[TaskRun, None] = {}
         self.polled: list[TaskRun] = []
         self.polls = 0
@@ -330,6 +333,11 @@ class Core:
         if isinstance(error, KeyboardInterrupt):
             self.loop.stop(Stop("interrupted", 130))
             return
+        if self._goes_on(error):
+            assert self.current_node is not None
+            message = f"{label} raised {type(error).__qualname__}: {said}"
+            self.logs.log(_ERROR, self.current_node.logger_name(), message, "", "", 0)
+            return
         where = f"{label}, at simulated time {format_seconds(stamp_ns)} s"
         if isinstance(error, RsltraceError):
             # Raised by the middleware itself: the message says what to do, this says where.
@@ -346,6 +354,16 @@ class Core:
             )
         self.error.__cause__ = error
         self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
+
+    def _goes_on(self, error: BaseException) -> bool:
+        """Say whether an exception is only logged: of a callback whose job entry says so.
+
+        What rsltrace itself refuses always ends the run; so does a node that was never made.
+        """
+        node = self.current_node
+        if node is None or not node.log_exceptions or self.kind in _LIFE:
+            return False
+        return isinstance(error, Exception) and not isinstance(error, RsltraceError)
 
     def run_outside(
         self,

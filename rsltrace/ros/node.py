@@ -63,6 +63,7 @@ class NodeHandle(EntityHandle):
         super().__init__(core, None)
         self.node = self
         self.rosout: PublisherHandle | None = None
+        self.log_exceptions = core.log_exceptions
         core.graph.nodes.append(self)
         core.current_node = self
         if enable_rosout:

@@ -37,6 +37,8 @@ class Entry:
     name: str
     make: Callable[[], Any]
     arguments: list[RosArguments]
+    log_exceptions: bool = False
+    """Whether a callback of its nodes that raises is logged instead of ending the run."""
 
 
 class World:
@@ -113,9 +115,11 @@ class World:
 
         # A constructor that blocks (on a service, say) is left waiting while others go on.
         core.node_arguments = entry.arguments
+        core.log_exceptions = entry.log_exceptions
         core.runners.append(getcurrent())
         greenlet(construct).switch()
         core.node_arguments = []
+        core.log_exceptions = False
         return core.loop.stopped is None
 
     def _adopt(self, node: Any, name: str) -> None:

@@ -238,5 +238,6 @@ def _prepare(job: Job) -> list[Entry]:
             remappings=spec.remappings,
             where=where,
         )
-        entries.append(Entry(spec.target, partial(make, **spec.arguments), arguments))
+        log = spec.on_exception == "log"
+        entries.append(Entry(spec.target, partial(make, **spec.arguments), arguments, log))
     return entries

@@ -139,6 +139,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
                 "parameter_files": [],
                 "remappings": {},
                 "arguments": {},
+                "on_exception": "stop",
             }
         ],
         "search_path": ["."],

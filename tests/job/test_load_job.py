@@ -376,13 +376,13 @@ GOLDEN = {
     "names from Python are not keys": (
         "nodes: [{node: m:N}]\nbase_dir: /\nstop: {duration_ns: 5}\n",
         """
-        job.yaml:2:1: unknown key 'base_dir'; valid keys are nodes, search_path, start, construct_time, stop, seed, timer_ties, livelock_limit, bags, record
+        job.yaml:2:1: unknown key 'base_dir'; did you mean 'base'?
             2 | base_dir: /
               | ^
         job.yaml:3:8: unknown key 'duration_ns' in stop; did you mean 'duration'?
             3 | stop: {duration_ns: 5}
               |        ^
-        """,  # noqa: E501
+        """,
     ),
     "node missing": (
         """\

@@ -1,0 +1,62 @@
+"""The keys of a job as the models have them: walked for messages, overrides, schema and docs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from rsltrace.job.problems import Loc
+
+
+def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
+    """Yield (key in a job file, field) of a model, in order."""
+    for name, field in model.model_fields.items():
+        if field.exclude is not True:
+            yield field.alias or name, field
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that values of an annotation may be made of."""
+    # In Python 3.10 tuple[X, ...] calls itself a type, so what is inside comes first.
+    if inner := get_args(annotation):
+        return [found for argument in inner for found in models_in(argument)]
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return []
+
+
+def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
+    """Return the field that governs the value at ``loc``, or None below free-form values."""
+    models, found = [model], None
+    for part in loc:
+        if isinstance(part, int):
+            continue
+        fields = [field for m in models for key, field in file_fields(m) if key == part]
+        if fields:
+            found = fields[0]
+            models = models_in(found.annotation)
+        elif not models:
+            return None
+    return found
+
+
+def attached(field: FieldInfo, name: str) -> Any:
+    """Return what a field's check says about itself under ``name``, or None."""
+    for item in field.metadata:
+        value = getattr(getattr(item, "func", None), name, None)
+        if value is not None:
+            return value
+    return None
+
+
+def shorthand_at(model: type[BaseModel], loc: Loc) -> str | None:
+    """Return the key that text alone stands for at ``loc``, if it does."""
+    field = field_at(model, loc)
+    if field is None or not loc:
+        return None
+    is_entry = isinstance(loc[-1], int)
+    value = attached(field, "entry_shorthand" if is_entry else "shorthand")
+    return None if value is None else str(value)
