@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.cli.text import printable
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, EventFlag, Output, OutputKind
+from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.reader import Trace

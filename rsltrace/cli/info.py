@@ -9,9 +9,10 @@ from typing import Any
 
 import click
 
-from rsltrace.cli.text import printable, table
+from rsltrace.cli.text import table
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import FORMAT_VERSION

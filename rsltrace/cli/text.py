@@ -1,27 +1,8 @@
-"""Text on a terminal or in a pipe: aligned, stable, and safe whatever a trace contains."""
+"""Text on a terminal or in a pipe: aligned and stable."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Sequence
-
-_NOT_PRINTABLE = re.compile(
-    r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
-)
-_SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
-
-
-def printable(text: str) -> str:
-    """Return ``text`` on one line, with what could steer a terminal written as escapes.
-
-    Names and log texts come from the trace, and a trace may come from anybody.
-    """
-    return _NOT_PRINTABLE.sub(_escaped, text)
-
-
-def _escaped(match: re.Match[str]) -> str:
-    character = match.group()
-    return _SHORT.get(character) or character.encode("unicode_escape").decode("ascii")
 
 
 def table(rows: Iterable[Sequence[str]], *, right: frozenset[int] = frozenset()) -> list[str]:

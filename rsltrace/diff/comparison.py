@@ -45,8 +45,6 @@ class _Comparison:
         self._job = job_settings(a, b)
         self._environment = environment_settings(a, b)
         self._notes = list(interruptions(a, b))
-        if self._identity.nothing_in_common:
-            self._notes.insert(0, "these are traces of different jobs: no entity is in both")
         self._tally = Tally()
         self._aligned_to = (start, start)
 
@@ -59,7 +57,7 @@ class _Comparison:
             a=side(self._a),
             b=side(self._b),
             verdict=first.verdict,
-            sentence=first.sentence,
+            sentence=self._sentence(first),
             agreeing=self._start,
             divergences=tuple(divergences),
             settings=(*self._job, *self._environment, *entity_settings(self._identity)),
@@ -69,6 +67,13 @@ class _Comparison:
             bytes_read=self._a.bytes_read + self._b.bytes_read,
             notes=tuple(self._notes),
         )
+
+    def _sentence(self, first: Divergence) -> str:
+        if not self._identity.different_jobs:
+            return first.sentence
+        jobs = [f'"{trace.job["name"]}"' for trace in (self._a, self._b) if trace.job.get("name")]
+        which = f" ({jobs[0]}, {jobs[1]})" if len(set(jobs)) == 2 else ""
+        return f"these are runs of different jobs{which} without a common node: {first.sentence}"
 
     def _explainer(self, found: list[Found]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)

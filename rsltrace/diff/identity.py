@@ -16,8 +16,10 @@ import numpy.typing as npt
 
 from rsltrace.diff.model import EntityKey
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity
+from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.trace.reader import Trace
+
+_NODE = EntityKind.NODE.label
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,11 @@ class Identity:
         return self.nodes[self.by_key[key]]
 
     @property
-    def nothing_in_common(self) -> bool:
-        """Whether the two graphs share no entity at all: they are of different jobs."""
-        own_a = len(self.keys) - 1 - len(self.only_b)
-        return bool(self.only_a and self.only_b) and own_a == len(self.only_a)
+    def different_jobs(self) -> bool:
+        """Whether both runs have nodes and no node is in both: they are runs of different jobs."""
+        only_a, only_b = set(self.only_a), set(self.only_b)
+        nodes = {number for number, key in enumerate(self.keys) if key.kind == _NODE}
+        return bool(nodes & only_a and nodes & only_b) and nodes <= only_a | only_b
 
 
 def identify(a: Trace, b: Trace) -> Identity:

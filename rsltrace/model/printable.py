@@ -11,7 +11,10 @@ _SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
 def printable(text: str) -> str:
-    """Return ``text`` on one line, with what could steer a terminal written as escapes."""
+    """Return ``text`` on one line, with what could steer a terminal written as escapes.
+
+    Names and log texts come from the trace, and a trace may come from anybody.
+    """
     return _NOT_PRINTABLE.sub(_escaped, text)
 
 

@@ -43,8 +43,9 @@ OUTPUTS_PER_SEGMENT = 65536
 """A segment ends early with the event that brings it to this many outputs: memory stays bounded
 even when every event publishes thousands of messages."""
 
-PAYLOAD_BYTES_PER_CHUNK = 1 << 20
-"""A payload chunk is closed once it holds at least this many bytes."""
+PAYLOAD_BYTES_PER_CHUNK = 512 << 10
+"""A payload chunk is closed once it holds at least this many bytes: a whole one has to be fetched
+to look at one message, and larger ones hardly compress better."""
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 """Encapsulation of plain little-endian CDR (XCDR version 1)."""

@@ -30,7 +30,8 @@ from rsltrace.trace.records import (
 from rsltrace.trace.source import ByteSource
 
 _CHUNKS_CACHED = 4
-"""Payload chunks have about 1 MB, so this is memory; two topics read side by side need two."""
+"""Payload chunks have about half a megabyte, so this is memory; two topics read side by side need
+two."""
 
 _INDEX_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 

@@ -75,6 +75,8 @@ class TraceWriter:
         self._outputs: list[bytes] = []
         self._payloads: list[chunks.Payload] = []
         self._payload_bytes = 0
+        self._entities: list[chunks.Payload] = []
+        self._entity_bytes = 0
         self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
         self._segment_end = EVENTS_PER_SEGMENT
@@ -195,7 +197,14 @@ class TraceWriter:
 
     def add_entity(self, entity: Entity) -> int:
         """Take an entity; to be called before the first event that names it."""
-        return self.add_payload(self._entity_channel, entity.created_ns, pack_entity(entity))
+        channel_id, data = self._entity_channel, pack_entity(entity)
+        sequence = self._sequences[channel_id]
+        self._entities.append((channel_id, sequence, entity.created_ns, data))
+        self._sequences[channel_id] = sequence + 1
+        self._entity_bytes += len(data) + _HEADER_BYTES
+        if self._entity_bytes >= PAYLOAD_BYTES_PER_CHUNK:
+            self._write_entities()
+        return sequence
 
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
         """Take the text of output number ``output`` of ``event``. Returns its sequence."""
@@ -213,6 +222,7 @@ class TraceWriter:
             self._drop_unfinished_event()
             if self._rests:
                 self._write_segment()
+            self._write_entities()
             self._write_payloads()
             self._stream.attachment(ATTACHMENT_INDEX, SEGMENT_MEDIA_TYPE, b"".join(self._segments))
             self._stream.metadata(METADATA_RESULT, self._result(result))
@@ -228,6 +238,12 @@ class TraceWriter:
     def _own_channel(self, topic: str, type_name: str) -> int:
         return self.add_channel(topic, type_name, SCHEMA_TEXT[type_name])
 
+    def _write_entities(self) -> None:
+        """Write them apart: who reads a trace needs them first, and should get nothing else."""
+        if self._entities:
+            self._write_waiting(self._entities)
+            self._entity_bytes = 0
+
     def _write_payloads(self) -> None:
         if not self._payloads:
             return
@@ -236,16 +252,20 @@ class TraceWriter:
                 f"a topic has more than {NO_SEQUENCE} messages, more than a trace can number; "
                 "leave its payloads out (record: exclude: in the job)"
             )
+        self._write_waiting(self._payloads)
+        self._payload_bytes = 0
+
+    def _write_waiting(self, waiting: list[chunks.Payload]) -> None:
         try:
-            self._stream.chunk(chunks.payloads_chunk(self._payloads))
-            self._payloads.clear()
-            self._payload_bytes = 0
+            self._stream.chunk(chunks.payloads_chunk(waiting))
+            waiting.clear()
         except BaseException:
             self._stream.poison()
             raise
 
     def _write_segment(self) -> None:
         try:
+            self._write_entities()
             self._write_payloads()
             self._write_events_and_outputs()
         except BaseException:

@@ -186,7 +186,8 @@ def test_a_corrupted_chunk_is_named(diff: Callable[..., Done], tmp_path: Path) -
 def test_traces_of_different_jobs_are_said_first_and_compared(diff: Callable[..., Done]) -> None:
     done = diff(A, SAMPLES / "missing_event" / "a.mcap")
     assert done.returncode == 1
-    assert "different jobs" in done.stdout
+    assert done.stdout.startswith("These are runs of different jobs without a common node: ")
+    assert "entity" in done.stdout, "and then compared"
 
 
 def bag_of(trace: Path, path: Path, storage: str, drop: int = -1) -> Path:

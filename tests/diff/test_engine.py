@@ -225,7 +225,9 @@ def test_a_constructor_that_differs(tmp_path: Path) -> None:
 def test_traces_of_different_jobs(tmp_path: Path) -> None:
     other = Plan((NodePlan("/else", timers=((7 * MS, ()),)),), end_ns=100 * MS)
     diff = compare(tmp_path, b=other)
-    assert diff.notes[0] == "these are traces of different jobs: no entity is in both"
+    assert diff.sentence.startswith(
+        "these are runs of different jobs without a common node: the gr"
+    )
     assert diff.verdict is Verdict.GRAPH
     assert diff.divergences[0].root is Root.JOB
     assert {s.place for s in diff.settings} >= {"entity", "job.yaml:3"}

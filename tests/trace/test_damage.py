@@ -74,7 +74,7 @@ def test_cut_at_every_record_reads_up_to_the_last_whole_segment(
     data, feeder = large
     offsets = boundaries(data)
     codes = opcodes(data, offsets)
-    with_events = [i for i, code in enumerate(codes) if code == CHUNK][2::3]
+    with_events = [i for i, code in enumerate(codes) if code == CHUNK][3::3]  # first: entities
     path = tmp_path / "cut.mcap"
     for cut in range(2, len(offsets) - 1):
         expected = sum(1 for chunk in with_events if chunk < cut)
@@ -90,7 +90,7 @@ def test_cut_anywhere_reads_up_to_the_last_whole_segment(
     offsets = boundaries(data)
     codes = opcodes(data, offsets)
     chunks = [i for i, code in enumerate(codes) if code == CHUNK]
-    ends = [offsets[i + 1] for i in chunks[2::3]]
+    ends = [offsets[i + 1] for i in chunks[3::3]]
     rng = random.Random(1)
     path = tmp_path / "cut.mcap"
     for _ in range(150):
@@ -128,12 +128,12 @@ def test_zeros_where_a_crash_came_before_the_data_end_the_trace(
     data, feeder = large
     offsets = boundaries(data)
     chunks = [i for i, code in enumerate(opcodes(data, offsets)) if code == CHUNK]
-    cut = offsets[chunks[3]]
+    cut = offsets[chunks[4]]
     events = open_and_check(tmp_path / "run.mcap", data[:cut] + bytes(100_000), feeder)
     assert events == EVENTS_PER_SEGMENT
 
 
-@pytest.mark.parametrize("chunk", range(3))
+@pytest.mark.parametrize("chunk", range(4))
 @pytest.mark.parametrize("complete", [True, False])
 def test_a_corrupted_chunk_is_named_with_its_place(
     tmp_path: Path, small: tuple[bytes, Feeder], chunk: int, complete: bool
@@ -153,6 +153,7 @@ def test_a_corrupted_chunk_is_named_with_its_place(
                 for _ in part():
                     pass
             list(trace.messages("/count"))
+            assert trace.entities
 
     with pytest.raises(TraceError, match=rf"damaged\.mcap: .*chunk at offset {offsets[place]} "):
         read_all()

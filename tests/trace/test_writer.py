@@ -102,7 +102,7 @@ def test_the_same_calls_give_the_same_bytes_under_any_name(
     assert paths[0].read_bytes() == paths[1].read_bytes()
 
 
-def test_a_segment_is_payloads_then_outputs_then_events(tmp_path: Path) -> None:
+def test_a_segment_is_entities_then_payloads_then_outputs_then_events(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     feeder = write_run(path, 2 * EVENTS_PER_SEGMENT + 100)
     with path.open("rb") as stream:
@@ -113,9 +113,10 @@ def test_a_segment_is_payloads_then_outputs_then_events(tmp_path: Path) -> None:
         {topics[c] for c in index.message_index_offsets}
         for index in sorted(summary.chunk_indexes, key=lambda index: index.chunk_start_offset)
     ]
+    assert kinds.pop(0) == {"/rsltrace/entities"}
     own = ({"/rsltrace/outputs"}, {"/rsltrace/events"})
     for start in range(0, 9, 3):
-        assert not kinds[start] & (own[0] | own[1])
+        assert not kinds[start] & (own[0] | own[1] | {"/rsltrace/entities"})
         assert tuple(kinds[start + 1 : start + 3]) == own
     assert len(kinds) == 9
     with Trace.open(path) as trace:
@@ -134,7 +135,7 @@ def test_what_a_segment_refers_to_is_in_the_file_before_its_events(tmp_path: Pat
                 assert (trace.payload(output) is None) == (output.sequence == NO_SEQUENCE)
 
 
-def test_payloads_are_written_when_a_megabyte_has_gathered(tmp_path: Path) -> None:
+def test_payloads_are_written_when_half_a_megabyte_has_gathered(tmp_path: Path) -> None:
     with Opened(tmp_path / "run.mcap", compression="") as feeder:
         channel = feeder.writer.add_channel("/image", "x/msg/Image", "uint8[] data\n")
         before = feeder.writer.bytes_written
