@@ -10,7 +10,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test lint types architecture unit setup samples bench pictures clean
+.PHONY: rclpy-tests demo test lint types architecture unit setup samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -46,6 +46,11 @@ architecture: $(INSTALLED)
 
 unit: $(INSTALLED)
 	$(BIN)/python -m pytest -n auto
+
+# rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
+RCLPY ?=
+rclpy-tests: $(INSTALLED)
+	$(BIN)/python tests/rclpy_suite --rclpy $(RCLPY)
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py

@@ -87,13 +87,15 @@ class _ActionHandle(Destroyable):
 
     waitable_attribute: str
 
-    def __init__(self, core: Core, node: NodeHandle, name: str) -> None:
+    def __init__(self, core: Core, node: NodeHandle, action_type: Any, name: str) -> None:
         super().__init__()
         self.core = core
         self.node = node
         self.name = node.resolve(name, service=False)
         self.parts: list[_Part] = []
         self.publishers: list[PublisherHandle] = []
+        self.action_type = action_type
+        node.actions.append(self)
         self._ready: _Part | None = None
 
     def _own(self, part: Any) -> Any:
@@ -119,12 +121,8 @@ class _ActionHandle(Destroyable):
             future._set_executor(self.core.executor)
         await waitable.execute(data)
 
-    def _take(self, part: Any) -> tuple[bytes, Any]:
-        """Take the oldest arrival of a part: its bytes and its header."""
-        data, _, _, _, header, *_ = part.queue.popleft()
-        return data, header
-
     def _destroy(self) -> None:
+        self.node.actions.remove(self)
         for handle in [*self.parts, *self.publishers]:
             if not handle._destroyed:
                 handle.destroy_when_not_in_use()
@@ -150,7 +148,7 @@ class ActionServerHandle(_ActionHandle):
         status_qos: Any,
         result_timeout: float,
     ) -> None:
-        super().__init__(core, node, name)
+        super().__init__(core, node, action_type, name)
         self.boundary = boundary
         self.goals: dict[bytes, GoalHandle] = {}
         self._timeout_ns = int(result_timeout * 1_000_000_000) if result_timeout >= 0 else None
@@ -186,9 +184,13 @@ class ActionServerHandle(_ActionHandle):
             self._expired,
         )
 
+    def get_num_entities(self) -> tuple[int, int, int, int, int]:
+        """Count its subscriptions, guard conditions, timers, clients and services, as rcl does."""
+        return 0, 0, 1, 0, 3
+
     def _take_request(self, part: Any, request_type: Any) -> tuple[RequestId, Any]:
-        data, info = self._take(part)
-        return info.request_id, part._request.deserialize(data)
+        request, info = part.service_take_request(request_type)
+        return info.request_id, request
 
     def take_goal_request(self, request_type: Any) -> tuple[RequestId, Any]:
         """Take the goal request that is being executed."""
@@ -374,7 +376,7 @@ class ActionClientHandle(_ActionHandle):
         feedback_qos: Any,
         status_qos: Any,
     ) -> None:
-        super().__init__(core, node, name)
+        super().__init__(core, node, action_type, name)
         impl = action_type.Impl
         base = f"{self.name}/_action"
         self._goal = self._own(_client(self, impl.SendGoalService, f"{base}/send_goal", goal_qos))
@@ -423,29 +425,33 @@ class ActionClientHandle(_ActionHandle):
         """Ask for a goal's result; return the sequence number of the request."""
         return int(self._result.send_request(request))
 
-    def _take_response(self, part: Any) -> tuple[int, Any]:
-        data, info = self._take(part)
-        return info.request_id.sequence_number, part._response.deserialize(data)
+    def get_num_entities(self) -> tuple[int, int, int, int, int]:
+        """Count its subscriptions, guard conditions, timers, clients and services, as rcl does."""
+        return 2, 0, 0, 3, 0
+
+    def _take_response(self, part: Any, response_type: Any) -> tuple[int, Any]:
+        info, response = part.take_response(response_type)
+        return info.request_id.sequence_number, response
 
     def take_goal_response(self, response_type: Any) -> tuple[int, Any]:
         """Take the response that is being executed: its sequence number and content."""
-        return self._take_response(self._goal)
+        return self._take_response(self._goal, response_type)
 
     def take_cancel_response(self, response_type: Any) -> tuple[int, Any]:
         """Take the response that is being executed: its sequence number and content."""
-        return self._take_response(self._cancel)
+        return self._take_response(self._cancel, response_type)
 
     def take_result_response(self, response_type: Any) -> tuple[int, Any]:
         """Take the response that is being executed: its sequence number and content."""
-        return self._take_response(self._result)
+        return self._take_response(self._result, response_type)
 
     def take_feedback(self, message_type: Any) -> Any:
         """Take the feedback that is being executed."""
-        return self._feedback._deserialize(self._take(self._feedback)[0])
+        return self._feedback.take_message(message_type, False)[0]
 
     def take_status(self, message_type: Any) -> Any:
         """Take the status array that is being executed."""
-        return self._status._deserialize(self._take(self._status)[0])
+        return self._status.take_message(message_type, False)[0]
 
 
 def _part(kind: Any, owner: _ActionHandle, *arguments: Any) -> Any:

@@ -125,6 +125,11 @@ def _library() -> Any:
     )
     rcl.rcl_arguments_fini.argtypes = (POINTER(_Arguments),)
     rcl.rcl_arguments_get_count_unparsed_ros.argtypes = (POINTER(_Arguments),)
+    rcl.rcl_arguments_get_unparsed_ros.argtypes = (
+        POINTER(_Arguments),
+        _Allocator,
+        POINTER(POINTER(ctypes.c_int)),
+    )
     rcl.rcl_arguments_get_param_overrides.argtypes = (
         POINTER(_Arguments),
         POINTER(POINTER(_Params)),
@@ -152,6 +157,10 @@ class InvalidArgumentsError(ValueError):
     """rcl could not parse the ROS arguments."""
 
 
+class UnknownArgumentsError(InvalidArgumentsError):
+    """There are words among the ROS arguments that mean nothing to rcl; the text lists them."""
+
+
 class RosArguments:
     """A parsed argument list. Free of ROS: ``RosArguments([])`` remaps nothing."""
 
@@ -172,7 +181,22 @@ class RosArguments:
         if code != _OK:
             raise InvalidArgumentsError(self._error(f"rcl refuses the arguments (code {code})"))
         if self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed)) > 0:
-            raise InvalidArgumentsError(f"unknown ROS arguments in {' '.join(arguments)}")
+            raise UnknownArgumentsError(f"unknown ROS arguments: {self._unknown()}")
+
+    def _unknown(self) -> list[str]:
+        """Return the words that rcl makes nothing of."""
+        count = self._rcl.rcl_arguments_get_count_unparsed_ros(byref(self._parsed))
+        places = POINTER(ctypes.c_int)()
+        self._rcl.rcl_arguments_get_unparsed_ros(
+            byref(self._parsed), self._allocator, byref(places)
+        )
+        words = [self.arguments[places[index]] for index in range(count)]
+        self._deallocate(ctypes.cast(places, c_void_p).value)
+        return words
+
+    def _deallocate(self, address: int | None) -> None:
+        deallocate = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)(self._allocator.deallocate)
+        deallocate(address, self._allocator.state)
 
     def __del__(self) -> None:
         if getattr(self, "_parsed", None) is not None and self._parsed.impl:
@@ -231,8 +255,7 @@ class RosArguments:
         try:
             return ctypes.string_at(output.value).decode()
         finally:
-            deallocate = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)(self._allocator.deallocate)
-            deallocate(output.value, self._allocator.state)
+            self._deallocate(output.value)
 
     def remap_node_name(self, name: str, outer: RosArguments | None) -> str:
         """Return the name a node gets; these arguments go before ``outer`` (global) ones."""

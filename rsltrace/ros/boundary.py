@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import SetupError, UnsupportedError
 from rsltrace.ros import graph as graph_queries
 from rsltrace.ros.actions import ActionClientHandle, ActionServerHandle, GoalHandle
-from rsltrace.ros.arguments import InvalidArgumentsError
+from rsltrace.ros.arguments import InvalidArgumentsError, UnknownArgumentsError
 from rsltrace.ros.clock import ClockEventHandle, ClockHandle
 from rsltrace.ros.codec import codec_for
 from rsltrace.ros.context import ContextHandle
@@ -135,6 +135,8 @@ class Boundary:
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         try:
             context = ContextHandle(self.core, arguments, domain_id)
+        except UnknownArgumentsError as error:
+            raise self.real.UnknownROSArgsError(str(error)) from error
         except InvalidArgumentsError as error:
             raise self.real.RCLInvalidROSArgsError(str(error)) from error
         if self.core.main_context is None:

@@ -22,6 +22,8 @@ class ContextHandle(Destroyable):
     def __init__(self, core: Core, arguments: Sequence[str], domain_id: int) -> None:
         super().__init__()
         self.core = core
+        for argument in arguments:
+            argument.encode()  # raises what rclpy raises for what is not text
         self.arguments = RosArguments(_only_ros(arguments))
         self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
         self._ok = True

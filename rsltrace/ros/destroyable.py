@@ -36,11 +36,10 @@ class Destroyable:
         pass
 
     def destroy_when_not_in_use(self) -> None:
-        """Destroy the handle. A second call is an error."""
-        if self._destroyed:
-            raise _invalid_handle("cannot use Destroyable because destruction was requested")
-        self._destroyed = True
-        self._destroy()
+        """Destroy the handle, unless that has been done."""
+        if not self._destroyed:
+            self._destroyed = True
+            self._destroy()
 
     @property
     def pointer(self) -> int:

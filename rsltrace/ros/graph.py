@@ -6,7 +6,8 @@ hashes of addresses).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import UnsupportedError
 from rsltrace.ros.qos import incompatible_policy
@@ -131,6 +132,16 @@ class Graph:
 
     # -- queries ---------------------------------------------------------------------------------
 
+    def interfaces_of(self, node: NodeHandle) -> Iterator[Any]:
+        """Yield the classes of the messages, services and actions that a node uses."""
+        for topics in (self._publishers, self._subscriptions):
+            for topic_ends in topics.values():
+                yield from (end._msg_type for end in topic_ends if end.node is node)
+        for services in (self._services, self._clients):
+            for service_ends in services.values():
+                yield from (end._srv_type for end in service_ends if end.node is node)
+        yield from (action.action_type for action in node.actions)
+
     def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every topic with its type, sorted by name."""
         topics: dict[str, str] = {}
@@ -149,6 +160,18 @@ class Graph:
             services.setdefault(name, set()).update(client.type_name for client in clients)
         services = {name: types for name, types in services.items() if types}
         return [(name, sorted(services[name])) for name in sorted(services)]
+
+
+def action_names_and_types(
+    topics: list[tuple[str, list[str]]],
+) -> list[tuple[str, list[str]]]:
+    """Return the actions among topics: each has one for feedback, by which rcl finds it, too."""
+    name_end, type_end = "/_action/feedback", "_FeedbackMessage"
+    return [
+        (name.removesuffix(name_end), [t.removesuffix(type_end) for t in types])
+        for name, types in topics
+        if name.endswith(name_end) and all(t.endswith(type_end) for t in types)
+    ]
 
 
 def names_and_types(endpoints: list[tuple[str, str]]) -> list[tuple[str, list[str]]]:

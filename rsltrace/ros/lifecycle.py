@@ -164,29 +164,29 @@ class StateMachineHandle(Destroyable):
     # -- services ----------------------------------------------------------------------------------
 
     @property
-    def service_change_state(self) -> ServiceHandle:
-        """The service ``~/change_state``."""
-        return self._services["change_state"]
+    def service_change_state(self) -> ServiceHandle | None:
+        """The service ``~/change_state``, if the node has any."""
+        return self._services.get("change_state")
 
     @property
-    def service_get_state(self) -> ServiceHandle:
-        """The service ``~/get_state``."""
-        return self._services["get_state"]
+    def service_get_state(self) -> ServiceHandle | None:
+        """The service ``~/get_state``, if the node has any."""
+        return self._services.get("get_state")
 
     @property
-    def service_get_available_states(self) -> ServiceHandle:
-        """The service ``~/get_available_states``."""
-        return self._services["get_available_states"]
+    def service_get_available_states(self) -> ServiceHandle | None:
+        """The service ``~/get_available_states``, if the node has any."""
+        return self._services.get("get_available_states")
 
     @property
-    def service_get_available_transitions(self) -> ServiceHandle:
-        """The service ``~/get_available_transitions``."""
-        return self._services["get_available_transitions"]
+    def service_get_available_transitions(self) -> ServiceHandle | None:
+        """The service ``~/get_available_transitions``, if the node has any."""
+        return self._services.get("get_available_transitions")
 
     @property
-    def service_get_transition_graph(self) -> ServiceHandle:
-        """The service ``~/get_transition_graph``."""
-        return self._services["get_transition_graph"]
+    def service_get_transition_graph(self) -> ServiceHandle | None:
+        """The service ``~/get_transition_graph``, if the node has any."""
+        return self._services.get("get_transition_graph")
 
     def _destroy(self) -> None:
         for handle in [*self._services.values(), self._events]:

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import NodeError
 from rsltrace.model.entity import EntityKind
-from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments, UnknownArgumentsError
 from rsltrace.ros.entity_handle import EntityHandle
+from rsltrace.ros.graph import action_names_and_types
 
 if TYPE_CHECKING:
     from rsltrace.ros.boundary import Boundary
@@ -46,8 +47,11 @@ class NodeHandle(EntityHandle):
             raise ValueError(f"invalid node namespace: {namespace}")
         try:
             self.arguments = RosArguments(["--ros-args", *cli_args] if cli_args else [])
+        except UnknownArgumentsError as error:
+            raise real.UnknownROSArgsError(str(error)) from error
         except InvalidArgumentsError as error:
-            raise real.RCLInvalidROSArgsError(str(error)) from error
+            message = f"Failed to parse ROS arguments: {error}"
+            raise real.RCLInvalidROSArgsError(message) from error
         # The job's arguments for this node are the process's arguments of ``ros2 run``.
         self._outer = [context.arguments, *core.node_arguments] if use_global_arguments else []
         self.boundary = boundary
@@ -64,6 +68,7 @@ class NodeHandle(EntityHandle):
         self.node = self
         self.rosout: PublisherHandle | None = None
         self.log_exceptions = core.log_exceptions
+        self.actions: list[Any] = []
         core.graph.nodes.append(self)
         core.current_node = self
         if enable_rosout:
@@ -141,6 +146,24 @@ class NodeHandle(EntityHandle):
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
         """Return every node of the graph with its enclave (always the root one)."""
         return [(node.name, node.namespace, "/") for node in self.core.graph.nodes]
+
+    def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
+        """Return every action of the graph with its type."""
+        return action_names_and_types(self.core.graph.topic_names_and_types())
+
+    def get_action_client_names_and_types_by_node(
+        self, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        """Return the actions that a node is a client of."""
+        query = self.boundary.rclpy_get_subscriber_names_and_types_by_node
+        return action_names_and_types(query(self, False, name, namespace))
+
+    def get_action_server_names_and_types_by_node(
+        self, name: str, namespace: str
+    ) -> list[tuple[str, list[str]]]:
+        """Return the actions that a node serves."""
+        query = self.boundary.rclpy_get_publisher_names_and_types_by_node
+        return action_names_and_types(query(self, False, name, namespace))
 
     # -- the trace -----------------------------------------------------------------------------
 

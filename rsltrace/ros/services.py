@@ -11,8 +11,17 @@ from rsltrace.ros.codec import codec_for
 from rsltrace.ros.entity_handle import Receiver, callback_name
 from rsltrace.ros.groups import begin
 from rsltrace.ros.interfaces import schema_text
+from rsltrace.ros.introspection import (
+    REQUEST_RECEIVED,
+    REQUEST_SENT,
+    RESPONSE_RECEIVED,
+    RESPONSE_SENT,
+    ServiceEvents,
+    reconfigured,
+)
 from rsltrace.ros.qos import Qos
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
+from rsltrace.ros.type_descriptions import answer
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE
 
@@ -64,6 +73,7 @@ class _End(Receiver):
         super().__init__(core, node)
         self.queue: deque[Exchange] = deque()
         self._channel: int | None = None
+        self._events: ServiceEvents | None = None
 
     def _emit(self, kind: int, prefix: str, codec: Any, part: Any, data: bytes) -> tuple[int, int]:
         """Record an outgoing request or response; return its output position and hash."""
@@ -83,7 +93,19 @@ class _End(Receiver):
         return position, digest
 
     def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
-        """Accept the switch; requests and responses are in the trace in any case."""
+        """Publish what is sent and received from now on, or no longer."""
+        self._events = reconfigured(self._events, self, clock, qos, state)
+
+    def _tell(self, event_type: int, request_id: RequestId, message: Any) -> None:
+        """Publish a service event, if introspection is on."""
+        if self._events is not None:
+            self._events.publish(event_type, request_id, message)
+
+    def _close(self) -> None:
+        """Let go of what has arrived, and of the publisher of service events."""
+        self.queue.clear()
+        if self._events is not None:
+            self._events.close()
 
     def trace_name(self) -> str:
         return self.service
@@ -140,11 +162,14 @@ class ServiceHandle(_End):
 
     def _serve(self, request: Any, header: ServiceInfo) -> None:
         wrapper = self.wrapper
+        if self._events is not None:
+            self._tell(REQUEST_RECEIVED, header.request_id, request)
         response = wrapper.callback(request, self._srv_type.Response())
         wrapper.send_response(response, header)
 
     async def _serve_async(self, request: Any, header: ServiceInfo) -> None:
         wrapper = self.wrapper
+        self._tell(REQUEST_RECEIVED, header.request_id, request)
         response = await wrapper.callback(request, self._srv_type.Response())
         wrapper.send_response(response, header)
 
@@ -153,7 +178,9 @@ class ServiceHandle(_End):
         if not self.queue:
             return None, None
         data, _, _, _, header = self.queue.popleft()
-        return self._request.deserialize(data), header
+        request = self._request.deserialize(data)
+        self._tell(REQUEST_RECEIVED, header.request_id, request)
+        return request, header
 
     def service_send_response(self, response: Any, request_id: RequestId) -> None:
         """Send a response to the client that asked."""
@@ -165,13 +192,15 @@ class ServiceHandle(_End):
         if not client._destroyed:
             info = ServiceInfo(request_id, self.core.loop.now_ns)
             client.deliver((data, self.core.loop.events, position, digest, info))
+        if self._events is not None:
+            self._tell(RESPONSE_SENT, request_id, response)
 
     def trace_detail(self) -> dict[str, object]:
         return {"callback": callback_name(getattr(self.wrapper, "callback", None))}
 
     def _destroy(self) -> None:
         self.core.graph.remove_service(self)
-        self.queue.clear()
+        self._close()
 
 
 class ClientHandle(_End):
@@ -204,6 +233,8 @@ class ClientHandle(_End):
         header = ServiceInfo(RequestId(self, self._sequence), self.core.loop.now_ns)
         for server in self.core.graph.services(self.service):
             server.deliver((data, self.core.loop.events, position, digest, header))
+        if self._events is not None:
+            self._tell(REQUEST_SENT, header.request_id, request)
         return self._sequence
 
     def take_response(self, response_type: Any) -> tuple[Any, Any]:
@@ -211,7 +242,9 @@ class ClientHandle(_End):
         if not self.queue:
             return None, None
         data, _, _, _, header = self.queue.popleft()
-        return header, self._response.deserialize(data)
+        response = self._response.deserialize(data)
+        self._tell(RESPONSE_RECEIVED, header.request_id, response)
+        return header, response
 
     def dispatch(self) -> None:
         """Take the oldest response and complete its future."""
@@ -224,16 +257,18 @@ class ClientHandle(_End):
             self.node,
             _CLIENT,
             self._complete,
-            (self._response.deserialize(data), header.request_id.sequence_number),
+            (self._response.deserialize(data), header.request_id),
             event,
             position,
             digest,
         )
 
-    def _complete(self, response: Any, sequence: int) -> None:
+    def _complete(self, response: Any, request_id: RequestId) -> None:
         """Set the result; plain done callbacks belong to this event, coroutines become tasks."""
+        if self._events is not None:
+            self._tell(RESPONSE_RECEIVED, request_id, response)
         try:
-            future = self.wrapper.get_pending_request(sequence)
+            future = self.wrapper.get_pending_request(request_id.sequence_number)
         except KeyError:
             return  # cancelled, or another server was faster
         future._set_executor(self.core.executor)
@@ -248,7 +283,7 @@ class ClientHandle(_End):
 
     def _destroy(self) -> None:
         self.core.graph.remove_client(self)
-        self.queue.clear()
+        self._close()
 
 
 class TypeDescriptionServiceHandle:
@@ -259,14 +294,12 @@ class TypeDescriptionServiceHandle:
         from type_description_interfaces.srv import GetTypeDescription
 
         profile = boundary.rmw_qos_profile_t.predefined("qos_profile_services_default")
+        self._core = core
         self.impl = ServiceHandle(core, node, GetTypeDescription, "~/get_type_description", profile)
 
     def handle_request(self, request: Any, response_type: Any, node: Any) -> Any:
-        """Answer that descriptions are not available here."""
-        return response_type(
-            successful=False,
-            failure_reason=f"no type description of {request.type_name} in a simulation",
-        )
+        """Describe an interface that one of the node's endpoints uses."""
+        return answer(request, response_type, self._core.graph.interfaces_of(node))
 
     def destroy_when_not_in_use(self) -> None:
         """Destroy the service, unless the node has done so already."""
