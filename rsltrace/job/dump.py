@@ -63,18 +63,15 @@ def _explicit(part: Part) -> dict[str, Any]:
             continue
         key = field.alias or name
         values[key] = format_time(value) if key in part.TIMES else _plain(value, _explicit)
-    if isinstance(part, NodeSpec):
-        values["node"] = part.target
     return values
 
 
 def _complete(part: Part) -> dict[str, Any]:
     values: dict[str, Any] = {}
+    absent = part.absent if isinstance(part, NodeSpec) else ()
     for name, field in type(part).model_fields.items():
-        if not field.exclude:
+        if not field.exclude and name not in absent:
             values[name] = _json(_plain(getattr(part, name), _complete))
-    if isinstance(part, NodeSpec):
-        values["node"] = part.target
     return values
 
 

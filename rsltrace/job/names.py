@@ -27,6 +27,7 @@ _REMAP_TO = re.compile(_RULE_NAME, re.ASCII)
 
 _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
+_EXECUTABLE = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", re.ASCII)
 
 
 def check_node_name(name: str) -> None:
@@ -80,6 +81,12 @@ def check_target(target: str) -> None:
         raise ValueError(f"expected module:Class or module:function, got {target!r}")
 
 
+def check_executable(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` looks like ``package/executable``."""
+    if not _EXECUTABLE.fullmatch(name):
+        raise ValueError(f"expected package/executable (as ros2 run has them), got {name!r}")
+
+
 def check_variable(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` can be a variable of a job."""
     if not _VARIABLE.fullmatch(name):
@@ -126,6 +133,7 @@ _PATTERNS: tuple[tuple[Any, str], ...] = (
     (check_variable, r"^[A-Za-z_][A-Za-z0-9_-]*$"),
     (check_field_path, r"^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*$"),
     (check_target, r"^[^\s:]+:[^\s:]+$"),
+    (check_executable, r"^[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+$"),
     (check_remap_from, r"^[A-Za-z0-9_~/:]+$"),
     (check_remap_to, r"^[A-Za-z0-9_~/]+$"),
     (check_glob, r"^[/*?\[]"),

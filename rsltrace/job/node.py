@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from rsltrace.job.names import (
+    check_executable,
     check_namespace,
     check_node_name,
     check_remap_from,
@@ -70,13 +71,48 @@ def _check_remappings(value: object) -> dict[str, str]:
     return {str(name): str(to) for name, to in value.items()}
 
 
-def _check_arguments(value: object) -> dict[str, Any]:
+def _check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:
+    if isinstance(value, (list, tuple)):
+        return _check_words(value)
     if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of argument names to values, got {describe(value)}")
+        raise Problem(
+            "expected a mapping of argument names to values (node:) or a list of command-line "
+            f"words (main:, executable:), got {describe(value)}"
+        )
     for name in value:
         if not isinstance(name, str) or not name.isidentifier():
             raise Problem(f"{name!r} cannot be the name of an argument", (str(name),), at_key=True)
     return {name: _plain_floats(item) for name, item in value.items()}
+
+
+def _check_words(values: list[object] | tuple[object, ...]) -> tuple[str, ...]:
+    """Check command-line words; a number stands for its digits, as on a command line."""
+    problems = [
+        Problem(f"expected a word of a command line, got {describe(value)}", (index,))
+        for index, value in enumerate(values)
+        if isinstance(value, bool) or not isinstance(value, (str, int, float))
+    ]
+    if problems:
+        raise Problems(problems)
+    return tuple(str(getattr(value, "text", value)) for value in values)
+
+
+attach(
+    _check_arguments,
+    schema={
+        "anyOf": [
+            {"type": "object"},
+            {"type": "array", "items": {"type": ["string", "number"]}},
+        ]
+    },
+)
+
+
+def _check_executable(value: object) -> str:
+    return text(check_executable)(value)
+
+
+attach(_check_executable, schema={"type": "string", "pattern": check_executable.pattern})  # type: ignore[attr-defined]
 
 
 def _plain_floats(value: object) -> object:
@@ -92,14 +128,22 @@ def _plain_floats(value: object) -> object:
     return value
 
 
-class NodeSpec(Part):
-    """One entry of ``nodes:``.
+_KINDS = ("node", "main", "executable")
 
-    ``node`` is a Node subclass or a function returning a node or a list of nodes; ``parameters``
-    are flat (dotted names); paths are relative to the job's folder.
+
+class NodeSpec(Part):
+    """One entry of ``nodes:``: one of ``node``, ``main`` and ``executable``.
+
+    ``node`` is a Node subclass or a function returning a node or a list of nodes, ``main`` a
+    function that initializes rclpy, makes nodes and spins, ``executable`` (``package/name``) an
+    installed one. ``arguments`` are keyword arguments of a ``node``, and command-line words (a
+    list) of the other two. ``parameters`` are flat (dotted names); paths are relative to the job's
+    folder.
     """
 
-    node: Annotated[Target, check(check_callable_target)]
+    node: Annotated[Target | None, check(check_callable_target, optional=True)] = None
+    main: Annotated[Target | None, check(check_callable_target, optional=True)] = None
+    executable: Annotated[str | None, check(_check_executable, optional=True)] = None
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = None
     namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = None
     parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
@@ -107,7 +151,9 @@ class NodeSpec(Part):
     )
     parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = ()
     remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(default_factory=dict)
-    arguments: Annotated[dict[str, Any], check(_check_arguments)] = Field(default_factory=dict)
+    arguments: Annotated[dict[str, Any] | tuple[str, ...], check(_check_arguments)] = Field(
+        default_factory=dict
+    )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = "stop"
 
     if TYPE_CHECKING:
@@ -115,17 +161,54 @@ class NodeSpec(Part):
         def __init__(
             self,
             *,
-            node: Target,
+            node: Target | None = None,
+            main: Target | None = None,
+            executable: str | None = None,
             name: str | None = None,
             namespace: str | None = None,
             parameters: dict[str, Any] = ...,
             parameter_files: list[str | os.PathLike[str]] | tuple[str | os.PathLike[str], ...] = (),
             remappings: dict[str, str] = ...,
-            arguments: dict[str, Any] = ...,
+            arguments: dict[str, Any] | Sequence[str] = ...,
             on_exception: Literal["stop", "log"] = "stop",
         ) -> None: ...
 
+    @model_validator(mode="after")
+    def _check_kind(self) -> NodeSpec:
+        kinds = [name for name in _KINDS if getattr(self, name) is not None]
+        if not kinds:
+            raise Problem("missing key: give one of 'node', 'main' and 'executable'")
+        if len(kinds) > 1:
+            raise Problem(
+                f"'{kinds[0]}' says what to run already: give only one of 'node', 'main' and "
+                "'executable'",
+                (kinds[1],),
+                at_key=True,
+            )
+        if self.node is not None and isinstance(self.arguments, tuple):
+            raise Problem(
+                "a node takes arguments by name (a mapping); a list of command-line words is for "
+                "'main' and 'executable'",
+                ("arguments",),
+            )
+        if self.node is None and isinstance(self.arguments, dict) and self.arguments:
+            raise Problem(
+                f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
+                ("arguments",),
+            )
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Which of ``node``, ``main`` and ``executable`` the entry is."""
+        return next(name for name in _KINDS if getattr(self, name) is not None)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """The other two of ``node``, ``main`` and ``executable``."""
+        return tuple(name for name in _KINDS if name != self.kind)
+
     @property
     def target(self) -> str:
-        """``module:attribute`` of what is constructed."""
-        return target_text(self.node)
+        """What is run: ``module:attribute``, or ``package/name`` of an executable."""
+        return target_text(getattr(self, self.kind))

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import BagError, RunError
+from rsltrace.errors import BagError, JobError, RunError
 from rsltrace.job import Job, locate
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
@@ -228,7 +228,9 @@ def _prepare(job: Job) -> list[Entry]:
 
     entries = []
     for index, spec in enumerate(job.nodes):
-        where = locate(job, ("nodes", index, "node"))
+        where = locate(job, ("nodes", index, spec.kind))
+        if spec.node is None or not isinstance(spec.arguments, dict):
+            raise JobError(f"'{spec.kind}:' is not run yet by this version", where=where)
         make: Any = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
         arguments = ros_arguments(
             name=spec.name,

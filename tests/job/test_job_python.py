@@ -76,7 +76,7 @@ def test_paths_are_relative_to_the_current_folder(
     [
         (lambda: NodeSpec(node="Talker"), "NodeSpec: node: expected module:Class or module:function, got 'Talker'"),
         (lambda: NodeSpec(node=3), "NodeSpec: node: expected text, got the number 3"),
-        (lambda: NodeSpec(nod="m:N"), "NodeSpec: the key 'node' is missing\nunknown key 'nod'; did you mean 'node'?"),
+        (lambda: NodeSpec(nod="m:N"), "NodeSpec: unknown key 'nod'; did you mean 'node'?"),
         (lambda: StopSpec(duration=1, duration_ns=1), "StopSpec: duration_ns: give either duration or duration_ns, not both"),
         (lambda: StopSpec(duration_ns=1.0), "StopSpec: duration: expected an integer number of nanoseconds, got 1.0"),
         (lambda: StopSpec(quiescence_ns=0), "StopSpec: quiescence: must be more than 0"),

@@ -390,10 +390,36 @@ GOLDEN = {
           - name: talker
         """,
         """
-        job.yaml:2:5: nodes[0]: the key 'node' is missing
+        job.yaml:2:5: nodes[0]: missing key: give one of 'node', 'main' and 'executable'
             2 |   - name: talker
               |     ^
         """,
+    ),
+    "two kinds of entry at once, and arguments of the wrong kind": (
+        """\
+        nodes:
+          - node: m:N
+            main: m:main
+          - main: m:main
+            arguments: {rate: 1}
+          - node: m:N
+            arguments: [--rate, 1]
+          - executable: talker
+        """,
+        """
+        job.yaml:3:5: nodes[0]: 'node' says what to run already: give only one of 'node', 'main' and 'executable'
+            3 |     main: m:main
+              |     ^
+        job.yaml:5:16: nodes[1].arguments: 'main' takes a list of command-line words: arguments: [--rate, 10]
+            5 |     arguments: {rate: 1}
+              |                ^
+        job.yaml:7:16: nodes[2].arguments: a node takes arguments by name (a mapping); a list of command-line words is for 'main' and 'executable'
+            7 |     arguments: [--rate, 1]
+              |                ^
+        job.yaml:8:17: nodes[3].executable: expected package/executable (as ros2 run has them), got 'talker'
+            8 |   - executable: talker
+              |                 ^
+        """,  # noqa: E501
     ),
     "nothing to run": (
         "seed: 1\n",
