@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.errors import RsltraceError
     from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
-    from rsltrace.run import RunResult, record
+    from rsltrace.run import RunResult, Simulation, record
     from rsltrace.trace.reader import Trace
 
 _HOMES = {
@@ -34,6 +34,7 @@ _HOMES = {
     "RecordSpec": "rsltrace.job",
     "RsltraceError": "rsltrace.errors",
     "RunResult": "rsltrace.run",
+    "Simulation": "rsltrace.run",
     "StopSpec": "rsltrace.job",
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
@@ -51,6 +52,7 @@ __all__ = [
     "RecordSpec",
     "RsltraceError",
     "RunResult",
+    "Simulation",
     "StopSpec",
     "TopicStop",
     "Trace",

@@ -28,6 +28,7 @@ class EventKind(IntEnum):
     SHUTDOWN = 11
     ACTION = 12
     CLOCK_JUMP = 13
+    OUTSIDE = 14
 
     @property
     def label(self) -> str:

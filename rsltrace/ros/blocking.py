@@ -131,6 +131,11 @@ def wait(
         )
     if core.ending:
         _refuse(core)
+    if core.current_handle is None:
+        raise UnsupportedError(
+            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
+            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
+        )
     group = _hold_group(core)
     blocked = Wait(core, what, group)
     core.flags |= _SUSPENDED

@@ -199,8 +199,12 @@ class Core:
         """Remember who still waits if the run has ended because nothing can happen any more."""
         stopped = self.loop.stopped
         if stopped is not None and stopped.reason == NOTHING_LEFT and not self.stuck:
-            self.stuck = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
-            self.stuck += [blocked.waits_for() for blocked in self.blocked]
+            self.stuck = self.who_waits()
+
+    def who_waits(self) -> list[str]:
+        """Say of every suspended coroutine and blocked call what it waits for."""
+        runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
+        return runs + [blocked.waits_for() for blocked in self.blocked]
 
     # -- entities ----------------------------------------------------------------------------
 
@@ -229,7 +233,10 @@ class Core:
 
     def watch(self, topic: str, watcher: Callable[[Any, bytes], None]) -> None:
         """Call ``watcher(message class, canonical bytes)`` for every message on a topic."""
-        self.watchers[topic] = watcher
+        first = self.watchers.get(topic)
+        self.watchers[topic] = watcher if first is None else _both(first, watcher)
+        for publisher in self.graph.publishers(topic):
+            publisher._watcher = self.watchers[topic]
 
     def activate_node(self, node: NodeHandle) -> None:
         """Run the callbacks of a node from now on: an executor of this run has it."""
@@ -375,6 +382,16 @@ class Core:
     ) -> None:
         """Run an event that is no entity's callback: construction, shutdown, a clock jump."""
         self.execute(_Outside(describe), entity, node, kind, callback, (), NO_EVENT, 0, 0)
+
+
+def _both(
+    first: Callable[[Any, bytes], None], second: Callable[[Any, bytes], None]
+) -> Callable[[Any, bytes], None]:
+    def watch(message_class: Any, data: bytes) -> None:
+        first(message_class, data)
+        second(message_class, data)
+
+    return watch
 
 
 def _handles(node: NodeHandle) -> Iterator[Any]:

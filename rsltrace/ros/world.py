@@ -164,8 +164,11 @@ class World:
         if core.runner_error is not None:
             raise core.runner_error
         if core.stuck and core.error is None:
-            lines = "\n".join(f"  {text}" for text in core.stuck[:20])
-            core.error = DeadlockError(f"nothing can happen any more, but somebody waits:\n{lines}")
+            core.error = DeadlockError(_deadlock(core.stuck))
+
+    def waiting(self) -> str:
+        """Say who waits for what, where nothing can happen any more."""
+        return _deadlock(self.core.who_waits())
 
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
@@ -184,6 +187,11 @@ class World:
     def error(self) -> RunError | None:
         """What went wrong, if anything did."""
         return self.core.error
+
+
+def _deadlock(waits: list[str]) -> str:
+    lines = "\n".join(f"  {text}" for text in waits[:20])
+    return f"nothing can happen any more, but somebody waits:\n{lines}"
 
 
 @contextmanager

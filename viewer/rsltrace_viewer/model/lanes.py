@@ -37,6 +37,7 @@ KIND_LETTERS = {
     EventKind.SHUTDOWN: "E",
     EventKind.ACTION: "a",
     EventKind.CLOCK_JUMP: "J",
+    EventKind.OUTSIDE: "O",
 }
 
 

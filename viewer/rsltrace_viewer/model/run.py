@@ -43,6 +43,7 @@ KIND_WORDS = {
     EventKind.SHUTDOWN: "end",
     EventKind.ACTION: "action",
     EventKind.CLOCK_JUMP: "jump",
+    EventKind.OUTSIDE: "driver",
 }
 """Kinds in at most six letters, for columns; the inspector writes them out."""
 

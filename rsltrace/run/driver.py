@@ -1,0 +1,198 @@
+"""Driving a run from outside: how far the loop may go, and standing still between two steps.
+
+The loop asks its gate between time steps. The gate hands control to the driver's stack where the
+driver wants it, and the run must not notice: a run that is driven and otherwise left alone does
+the same, event by event, as one that is recorded at once.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+from greenlet import getcurrent
+
+from rsltrace.errors import RunError
+from rsltrace.run.session import Session
+
+if TYPE_CHECKING:
+    from rsltrace.ros.outside import Outside
+
+_INTERRUPTED = 130
+
+
+class _Who(Enum):
+    """Whose code is running."""
+
+    DRIVER = "driver"
+    RUN = "run"
+    LISTENER = "listener"
+
+
+class Driver:
+    """The loop of an open session, under control.
+
+    ``outside`` is where the driver stands while the loop does not run.
+    """
+
+    def __init__(self, session: Session) -> None:
+        from rsltrace.ros.outside import Outside
+
+        self.session = session
+        self.loop = session.loop
+        self.loop.gate = self._gate
+        self.outside: Outside = Outside(session.world)
+        self._who = _Who.DRIVER
+        self._steps: int | None = 0
+        self._until_ns: int | None = None
+        self._to_the_end = False
+        self._held: tuple[int, int] | None = None
+        self._news: list[tuple[Callable[[Any], object], Any]] = []
+        self._raised = False
+
+    def begin(self) -> None:
+        """Construct the nodes and jump to the start.
+
+        :raises RunError: what went wrong.
+        """
+        self.session.begin()
+        self.outside.enter()
+        self.raise_error()
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is over."""
+        return self.session.ended
+
+    def position(self) -> tuple[int, int]:
+        """Return how far the run is: events and time. Unchanged: nothing is left to happen."""
+        return self.loop.events, self.loop.now_ns
+
+    def go(
+        self,
+        *,
+        steps: int | None = None,
+        until_ns: int | None = None,
+        to_the_end: bool = False,
+    ) -> None:
+        """Let the loop run ``steps`` time steps (None: any number), none after ``until_ns``.
+
+        With ``until_ns``, time stands still there afterwards. Unless ``to_the_end``, the loop also
+        stops where nothing is left to happen.
+
+        :raises RunError: what went wrong in the run.
+        """
+        self.check_driver()
+        if self.ended:
+            return
+        self.leave()
+        if steps is not None and self._something_is_ready():
+            steps -= 1  # that step is run before the gate is asked
+        self._steps, self._until_ns, self._to_the_end = steps, until_ns, to_the_end
+        while True:
+            self._who = _Who.RUN
+            try:
+                self.session.go_on()
+            finally:
+                self._who = _Who.DRIVER
+            self.outside.enter()
+            self.raise_error()
+            if not self._tell():
+                return
+            self.leave()
+
+    def leave(self) -> None:
+        """Go back from the outside to the run.
+
+        Where time stood still between two steps and nothing was done there, the clock is put back
+        to the last step.
+        """
+        self.outside.leave()
+        if self._held is not None:
+            last_ns, events = self._held
+            loop = self.loop
+            if events == loop.events and not loop.ready and not loop.tasks:
+                loop.now_ns = last_ns
+            self._held = None
+
+    def _something_is_ready(self) -> bool:
+        loop = self.loop
+        next_ns = loop.next_ns()
+        return bool(loop.ready or loop.tasks or (next_ns is not None and next_ns <= loop.now_ns))
+
+    # -- the gate, on the loop's stack ---------------------------------------------------------
+
+    def _gate(self, next_ns: int | None) -> bool:
+        if not self._news:
+            if self._to_the_end:
+                return False
+            if self._steps != 0 and self._may_advance(next_ns):
+                if self._steps is not None:
+                    self._steps -= 1
+                return False
+        core = self.session.world.core
+        core.runners.append(getcurrent())
+        assert core.main is not None
+        core.main.switch()
+        return True
+
+    def _may_advance(self, next_ns: int | None) -> bool:
+        until_ns, end_ns = self._until_ns, self.session.end_ns
+        if next_ns is not None and (until_ns is None or next_ns <= until_ns):
+            return True
+        if until_ns is None:
+            return False  # nothing is left to happen, unless the driver does something
+        if end_ns is not None and until_ns >= end_ns:
+            return True  # the job ends before that: its stop condition will say so
+        self._held = (self.loop.now_ns, self.loop.events)
+        self.loop.now_ns = until_ns
+        return False
+
+    # -- who listens -------------------------------------------------------------------------------
+
+    def tell_later(self, callback: Callable[[Any], object], message: Any) -> None:
+        """Have ``callback(message)`` called at the end of the present time step."""
+        self._news.append((callback, message))
+
+    def _tell(self) -> bool:
+        """Call who listens; return whether the loop has to go on from where it was stopped."""
+        news, self._news = self._news, []
+        self._who = _Who.LISTENER
+        try:
+            for callback, message in news:
+                callback(message)
+        finally:
+            self._who = _Who.DRIVER
+        return bool(news) and not self.ended
+
+    # -- checks ------------------------------------------------------------------------------------
+
+    def check_driver(self) -> None:
+        """Raise RunError unless the present code may move time."""
+        self.check_outside()
+        if self._who is _Who.LISTENER:
+            raise RunError("a callback of subscribe cannot move time; it may publish")
+
+    def check_outside(self) -> None:
+        """Raise RunError if the present code is a node's, or that of another thread."""
+        if threading.get_ident() != self.session.world.core.thread:
+            raise RunError("a simulation is driven by the thread that has entered it")
+        if self._who is _Who.RUN:
+            raise RunError("a node cannot drive the simulation that it is part of")
+
+    def raise_error(self) -> None:
+        """Raise what went wrong in the run, once.
+
+        :raises KeyboardInterrupt: if the run was interrupted.
+        """
+        if self._raised:
+            return
+        error, stopped = self.session.error, self.loop.stopped
+        if error is not None:
+            self._raised = True
+            raise error
+        if stopped is not None and stopped.exit_code == _INTERRUPTED:
+            self._raised = True
+            raise KeyboardInterrupt
