@@ -69,6 +69,8 @@ ROOT_OF = {
     Verdict.ENVIRONMENT: Root.JOB,
 }
 
+_DRIVEN_DIFFERENTLY = "whoever drove the simulations did not do the same"
+
 
 def judge(case: Case) -> Judgement:
     """Return the verdict on a place where the runs differ."""
@@ -165,6 +167,8 @@ def _one_sided(case: Case) -> Judgement:
         )
     elif one.kind is EventKind.BAG:
         root_sentence = f"only the bag of {has} has this message"
+    elif one.kind is EventKind.OUTSIDE:
+        root_sentence = f"whoever drove the simulation did this only in {has}"
     else:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
     return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
@@ -204,6 +208,9 @@ def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
     if a.kind is EventKind.BAG:
         sentence = f"{phrase(a)} {at(a.stamp_ns)} is another one"
         root, why = Root.EXTERNAL_INPUT, "the bags that were played differ in this message"
+    elif a.kind is EventKind.OUTSIDE:
+        sentence = f"{phrase(a)} {at(a.stamp_ns)} is another one"
+        root, why = Root.EXTERNAL_INPUT, _DRIVEN_DIFFERENTLY
     else:
         sentence = f"{phrase(a)} {at(a.stamp_ns)} received {what}"
         root = Root.UNKNOWN
@@ -230,6 +237,10 @@ def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
 
 
 def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
+    if a.kind is EventKind.OUTSIDE:
+        sentence = f"{phrase(a)} {at(a.stamp_ns)} is something else{_what_differs(case)}"
+        root = Root.EXTERNAL_INPUT
+        return Judgement(Verdict.DIFFERENT_INPUT, root, sentence, _DRIVEN_DIFFERENTLY, a, b)
     same = "the same input" if a.input_hash else "no input"
     sentence = f"{phrase(a)} {at(a.stamp_ns)} got {same} in both runs"
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:

@@ -12,6 +12,7 @@ from rsltrace.diff.outputs import matched_outputs
 from rsltrace.diff.rows import OutputRow, Run, outputs_of
 from rsltrace.diff.views import output_text
 from rsltrace.errors import TraceError
+from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
@@ -60,10 +61,10 @@ class _Evidence:
             yield self._difference(_INPUT, input_a, input_b, hash_a, hash_b)
         outputs_a = outputs_of(self._run_a, a.index) if a is not None else []
         outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
-        bag = any(view is not None and view.kind is EventKind.BAG for view in (a, b))
+        bag = any(view is not None and _is_published_input(view) for view in (a, b))
         for position, x, y, moved in matched_outputs(outputs_a, outputs_b):
             if bag and (x or y or (0,))[0] == OutputKind.MESSAGE:
-                continue  # what the player publishes is its input, shown already
+                continue  # what is published is the input, shown already
             reason = "sent in another order" if moved else ""
             yield self._difference(position, x, y, x and x[2], y and y[2], reason)
 
@@ -71,7 +72,7 @@ class _Evidence:
         """Return the output that was an event's input; for a bag message, its own publication."""
         if view is None or view.kind in _WITHOUT_INPUT:
             return None
-        if view.kind is EventKind.BAG:
+        if _is_published_input(view):
             outputs = outputs_of(run, view.index)
             return outputs[0] if outputs else None
         if view.cause_event == NO_EVENT or view.cause_event >= view.index:
@@ -159,6 +160,13 @@ class _Evidence:
             f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
             f"and a topic glob that matches {topic} (record: in the job)"
         )
+
+
+def _is_published_input(view: EventView) -> bool:
+    """Return whether an event publishes what it got from outside: a bag's message, a driver's."""
+    if view.kind is EventKind.OUTSIDE:
+        return view.entity.kind == EntityKind.PUBLISHER.label
+    return view.kind is EventKind.BAG
 
 
 def _entity_id(run: Run, number: int) -> int:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from rsltrace.diff.model import EntityKey, EventView
 from rsltrace.diff.rows import CONSTRUCT, OutputRow, Run, outputs_of
+from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 
@@ -130,6 +131,9 @@ def phrase(view: EventView) -> str:
         return f"the constructor of {key.name}" if key.name else "the construction"
     if view.kind is EventKind.BAG:
         return f"the bag's message on {key.name}"
+    if view.kind is EventKind.OUTSIDE:
+        published = key.kind == EntityKind.PUBLISHER.label
+        return f"the message from outside on {key.name}" if published else "what outside did"
     if view.kind is EventKind.SHUTDOWN:
         return f"the end of {key.name or 'the run'}"
     if view.kind is EventKind.CLOCK_JUMP:

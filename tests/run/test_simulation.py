@@ -84,6 +84,7 @@ STOPS = [
     "{topic: /numbers}",
     "{time: 12.25s}",
 ]
+TALK = "nodes: [{node: nodes_under_test:Talker}, {node: nodes_under_test:Echo}]\n"
 GRAPH = BOTH + "start: 10s\n"
 BLOCKING = (
     "nodes: [{node: nodes_under_test:Sleeper}, {node: nodes_under_test:Talker}]\nstart: 10s\n"
@@ -250,8 +251,7 @@ def test_taps_keep_what_was_published(simulate: Any) -> None:
 def test_who_listens_may_answer_at_once(simulate: Any) -> None:
     from std_msgs.msg import UInt64
 
-    jobs = "nodes: [{node: nodes_under_test:Talker}, {node: nodes_under_test:Echo}]\n"
-    with simulate(jobs) as sim:
+    with simulate(TALK) as sim:
 
         def answer(message: UInt64) -> None:
             assert sim.publish("numbers", UInt64(data=message.data * 100)) == 1
@@ -308,6 +308,35 @@ def test_the_same_driver_gives_the_same_trace(simulate: Any, tmp_path: Path) -> 
 
     assert go("a.mcap").digest == go("b.mcap").digest
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("second", "said"),
+    [
+        (
+            lambda sim: sim.publish("numbers", _number(5)),
+            "the message from outside on /numbers at 1.0 s is another one",
+        ),
+        (
+            lambda sim: sim.call(sim.node("echo").say, 5),
+            "the message from outside on /numbers at 1.0 s happened only in a",
+        ),
+        (lambda sim: None, "the message from outside on /numbers at 1.0 s happened only in a"),
+    ],
+)
+def test_a_diff_blames_the_driver(simulate: Any, tmp_path: Path, second: Any, said: str) -> None:
+    def go(name: str, act: Callable[[Simulation], object]) -> Path:
+        with simulate(TALK, tmp_path / name) as sim:
+            sim.publish("numbers", _number(1))
+            sim.run_for(1)
+            act(sim)
+            sim.run_for(1)
+        return tmp_path / name
+
+    difference = rsltrace.diff(
+        go("a.mcap", lambda sim: sim.publish("numbers", _number(4))), go("b.mcap", second)
+    )
+    assert said.lower() in difference.sentence.lower()
 
 
 def test_what_is_done_to_a_node_directly_is_an_event_from_outside(
