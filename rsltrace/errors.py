@@ -11,7 +11,8 @@
         ├── NodeError                3  a node's constructor or callback raised
         ├── LivelockError            3  events without end while simulated time stands still
         ├── DeadlockError            3  something waits for what can never come
-        └── UnsupportedError         3  a node used a part of rclpy that a simulation does not have
+        ├── UnsupportedError         3  a node used a part of rclpy that a simulation does not have
+        └── GuardError               3  a node made a call that its job forbids (see ``guard:``)
 
 A job can end a run with an exit status of its own (see ``stop:``); these are for failures.
 An interrupted run (Ctrl-C, SIGTERM) exits with 130 or 143, as shells expect.
@@ -93,3 +94,7 @@ class DeadlockError(RunError):
 
 class UnsupportedError(RunError):
     """A node used a part of rclpy that the simulation does not offer."""
+
+
+class GuardError(RunError):
+    """A node made a call whose answer can differ from run to run, and its job forbids that."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.job import Job
     from rsltrace.job.load import load_job, locate
     from rsltrace.job.node import NodeSpec
@@ -15,24 +16,30 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "BagSpec": "spec",
+    "GuardSpec": "guard",
     "Job": "job",
     "NodeSpec": "node",
     "RecordSpec": "spec",
+    "SourceSpec": "guard",
     "StopSpec": "spec",
     "TopicStop": "spec",
     "load_job": "load",
     "locate": "load",
+    "policy_of": "guard",
 }
 
 __all__ = [
     "BagSpec",
+    "GuardSpec",
     "Job",
     "NodeSpec",
     "RecordSpec",
+    "SourceSpec",
     "StopSpec",
     "TopicStop",
     "load_job",
     "locate",
+    "policy_of",
 ]
 
 

@@ -7,6 +7,7 @@ import os
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.job.guard import resolved_guard
 from rsltrace.job.node import NodeSpec, target_text
 from rsltrace.job.part import Part
 from rsltrace.job.times import format_time
@@ -48,6 +49,10 @@ def job_resolved(job: Job) -> dict[str, Any]:
         node["parameter_files"] = [_relative(job, path) for path in spec.parameter_files]
     for bag, bag_spec in zip(values["bags"], job.bags, strict=True):
         bag["path"] = _relative(job, bag_spec.path)
+    values["guard"] = resolved_guard(job.guard)
+    for node, spec in zip(values["nodes"], job.nodes, strict=True):
+        if spec.guard is not None:
+            node["guard"] = resolved_guard(job.guard, spec.guard)
     return values
 
 

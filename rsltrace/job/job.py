@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from rsltrace.job.guard import GuardSpec, guard_part
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, check, items, one_of, parts, text, whole
 from rsltrace.job.problems import Problem, Problems
@@ -49,6 +50,7 @@ class Job(Part):
     livelock_limit: Annotated[int, check(whole(1))] = LIVELOCK_LIMIT
     bags: Annotated[tuple[BagSpec, ...], parts("path")] = ()
     record: RecordSpec = RecordSpec()
+    guard: Annotated[GuardSpec, guard_part()] = GuardSpec()
 
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(
@@ -77,6 +79,7 @@ class Job(Part):
             livelock_limit: int = LIVELOCK_LIMIT,
             bags: Sequence[BagSpec | dict[str, Any] | str] = (),
             record: RecordSpec | dict[str, Any] = ...,
+            guard: GuardSpec | dict[str, Any] | bool = ...,
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from rsltrace.job.guard import GuardSpec, guard_part
 from rsltrace.job.names import (
     check_executable,
     check_namespace,
@@ -155,6 +156,7 @@ class NodeSpec(Part):
         default_factory=dict
     )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = "stop"
+    guard: Annotated[GuardSpec | None, guard_part()] = None
 
     if TYPE_CHECKING:
 
@@ -171,6 +173,7 @@ class NodeSpec(Part):
             remappings: dict[str, str] = ...,
             arguments: dict[str, Any] | Sequence[str] = ...,
             on_exception: Literal["stop", "log"] = "stop",
+            guard: GuardSpec | dict[str, Any] | bool | None = None,
         ) -> None: ...
 
     @model_validator(mode="after")

@@ -22,6 +22,7 @@ from rsltrace.errors import EXIT_RUN, NodeError, OutputError, RsltraceError, Run
 from rsltrace.loop.loop import NOTHING_LEFT, Dispatchable, EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.model.finding import Policy
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
 from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.logs import Logs
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.tasks import TaskRun
+    from rsltrace.ros.world import Entry
 
 _RAISED = int(EventFlag.RAISED)
 _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))
@@ -205,6 +207,19 @@ class Core:
         """Say of every suspended coroutine and blocked call what it waits for."""
         runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
         return runs + [blocked.waits_for() for blocked in self.blocked]
+
+    @property
+    def entry(self) -> Entry | None:
+        """The entry of the job whose constructor runs, as long as it has made no node."""
+        return getattr(self.current_handle, "entry", None)
+
+    @property
+    def policy(self) -> Policy | None:
+        """The guard's policy for whoever runs, or None for the job's."""
+        if self.current_node is not None:
+            return self.current_node.policy
+        entry = self.entry
+        return entry.policy if entry is not None else None
 
     # -- entities ----------------------------------------------------------------------------
 
@@ -379,9 +394,11 @@ class Core:
         entity: int,
         node: NodeHandle | None,
         callback: Callable[[], object],
+        *,
+        entry: Entry | None = None,
     ) -> None:
         """Run an event that is no entity's callback: construction, shutdown, a clock jump."""
-        self.execute(_Outside(describe), entity, node, kind, callback, (), NO_EVENT, 0, 0)
+        self.execute(_Outside(describe, entry), entity, node, kind, callback, (), NO_EVENT, 0, 0)
 
 
 def _both(
@@ -409,8 +426,9 @@ def _handles(node: NodeHandle) -> Iterator[Any]:
 class _Outside:
     """A nameable stand-in for an entity in ``run_outside``."""
 
-    def __init__(self, describe: Callable[[], str]) -> None:
+    def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
         self.describe = describe
+        self.entry = entry
 
     def dispatch(self) -> None:
         raise AssertionError("never in a queue")

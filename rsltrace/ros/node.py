@@ -66,6 +66,7 @@ class NodeHandle(EntityHandle):
             raise _duplicate(core, self.fully_qualified_name)
         super().__init__(core, None)
         self.node = self
+        self.policy = core.policy
         self.rosout: PublisherHandle | None = None
         self.log_exceptions = core.log_exceptions
         self.actions: list[Any] = []

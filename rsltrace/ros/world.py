@@ -17,6 +17,7 @@ from greenlet import getcurrent, greenlet
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.model.event import EventKind
+from rsltrace.model.finding import Policy
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.blocking import end_blocked, simulated_waiting
 from rsltrace.ros.boundary import Boundary, installed
@@ -31,7 +32,8 @@ class Entry:
     """One entry of a job, ready to be constructed.
 
     ``make`` returns a node or a list of nodes; ``arguments`` are what ``ros2 run`` would give
-    them, in lists of which later ones have the last word on parameters.
+    them, in lists of which later ones have the last word on parameters. ``key`` is a name of its
+    own among the entries, whatever other entries there are.
     """
 
     name: str
@@ -39,6 +41,8 @@ class Entry:
     arguments: list[RosArguments]
     log_exceptions: bool = False
     """Whether a callback of its nodes that raises is logged instead of ending the run."""
+    key: str = ""
+    policy: Policy | None = None
 
 
 class World:
@@ -109,7 +113,7 @@ class World:
 
         def construct() -> None:
             name = f"constructing {entry.name}"
-            core.run_outside(lambda: name, EventKind.CONSTRUCT, 0, None, build)
+            core.run_outside(lambda: name, EventKind.CONSTRUCT, 0, None, build, entry=entry)
             # Whoever switched here goes on: this function, or the loop's runner after a wait.
             getcurrent().parent = core.runners.pop()
 

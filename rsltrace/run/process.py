@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 
@@ -48,7 +49,8 @@ def housekeeping(
             with core().outside_events():
                 gc.collect(1)
         if steps % 1000 == 0 and observer.progress is not None:
-            observer.progress(core().loop.now_ns, end_ns, events)
+            with engage(None):  # whoever watches lives in real time
+                observer.progress(core().loop.now_ns, end_ns, events)
 
     return between_steps
 

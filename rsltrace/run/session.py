@@ -6,7 +6,6 @@ outside say how far to go.
 
 from __future__ import annotations
 
-import random
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -16,12 +15,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, JobError, RunError
-from rsltrace.job import Job, locate
+from rsltrace.job import Job, locate, policy_of
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.bags import check_bag_types, open_bag_of, start_ns_of, start_players
+from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
 from rsltrace.run.stopping import end_ns_of, stop_conditions
@@ -116,6 +116,7 @@ class Session:
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
         stack.enter_context(search_path(job))
+        self._guarded = guarding(stack, job)
         self.loop = loop = EventLoop(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
@@ -125,8 +126,12 @@ class Session:
         self.world = world = stack.enter_context(
             World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
-        loop.stop_conditions = tuple(stop_conditions(job, self.start_ns, world.core.outside_events))
-        self._entries = _prepare(job)
+        self._guarded.begin(world.core)
+        with self._guarded.engaged():
+            loop.stop_conditions = tuple(
+                stop_conditions(job, self.start_ns, world.core.outside_events)
+            )
+            self._entries = _prepare(job)
         check_bag_types(job, self._bags)
         if self._output is not None:
             self._writer = writer = stack.enter_context(
@@ -159,12 +164,11 @@ class Session:
     def begin(self) -> None:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
         core = self.world.core
-        random.seed(self.job.seed)
         if self.job.stop.topic is not None:
             from rsltrace.ros.watch import watch_exit_code
 
             core.watch(self.job.stop.topic.name, watch_exit_code(core, self.job.stop.topic))
-        with self._failures():
+        with self._failures(), self._guarded.engaged():
             for entry in self._entries:
                 if not self.world.construct(entry):
                     break
@@ -175,7 +179,7 @@ class Session:
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
-        with self._failures():
+        with self._failures(), self._guarded.engaged():
             self.world.go_on()
 
     @contextmanager
@@ -196,7 +200,8 @@ class Session:
         loop, core = self.loop, self.world.core
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
-        self.world.destroy()
+        with self._guarded.engaged():
+            self.world.destroy()
         error = self.world.error
         exit_code = error.exit_code if error is not None else stop.exit_code
         if self._writer is not None:
@@ -240,6 +245,14 @@ def _prepare(job: Job) -> list[Entry]:
             remappings=spec.remappings,
             where=where,
         )
-        log = spec.on_exception == "log"
-        entries.append(Entry(spec.target, partial(make, **spec.arguments), arguments, log))
+        entries.append(
+            Entry(
+                spec.target,
+                partial(make, **spec.arguments),
+                arguments,
+                log_exceptions=spec.on_exception == "log",
+                key=entry_key(spec, job.nodes[:index]),
+                policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
+            )
+        )
     return entries

@@ -140,6 +140,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
                 "remappings": {},
                 "arguments": {},
                 "on_exception": "stop",
+                "guard": None,
             }
         ],
         "search_path": ["."],
@@ -158,6 +159,18 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "livelock_limit": 100_000,
         "bags": [],
         "record": {"payloads": True, "topics": ["*"], "exclude": []},
+        "guard": {
+            "enabled": True,
+            "state": "false",
+            **{
+                name: {"mode": "virtual", "allow": []}
+                for name in ("clock", "random", "directory", "order")
+            },
+            **{
+                name: {"mode": "warn", "allow": []}
+                for name in ("file", "environment", "thread", "process", "socket", "address")
+            },
+        },
     }
 
 

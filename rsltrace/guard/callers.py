@@ -1,0 +1,80 @@
+"""Whose call is it? The user's code is told from libraries, Python's own modules and ourselves."""
+
+from __future__ import annotations
+
+import os
+import sysconfig
+from types import FrameType
+
+_HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_GUARD = os.path.join(_HERE, "guard", "")
+_PYTHON = tuple(
+    path.rstrip(os.sep) + os.sep
+    for path in {sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")}
+)
+_INSTALLED = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
+_LINES_MAX = 6
+
+_USER, _LIBRARY, _OURS, _IMPORT = range(4)
+_kinds: dict[str, int] = {}
+
+
+def _kind_of(file: str) -> int:
+    kind = _kinds.get(file)
+    if kind is None:
+        if file.startswith("<frozen importlib"):
+            kind = _IMPORT
+        elif file.startswith(_GUARD):
+            kind = _LIBRARY  # a redirected function: its caller counts
+        elif file.startswith(_HERE):
+            kind = _OURS
+        elif any(part in file for part in _INSTALLED) or file.startswith(("<frozen", *_PYTHON)):
+            kind = _LIBRARY
+        else:
+            kind = _USER
+        _kinds[file] = kind
+    return kind
+
+
+def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
+    """Return the innermost frame of user code that led to ``frame``, or None if none did.
+
+    User code is what lies outside of Python and of the installed packages, or in ``packages``
+    (where installed nodes are). What a library does while it is imported is not the user's doing.
+    """
+    while frame is not None:
+        kind = _kind_of(frame.f_code.co_filename)
+        if kind == _USER or (packages and is_in(frame, packages)):
+            return frame
+        if kind != _LIBRARY:
+            return None
+        frame = frame.f_back
+    return None
+
+
+def is_in(frame: FrameType, packages: frozenset[str]) -> bool:
+    """Return whether a frame's module is in one of the packages."""
+    return module_of(frame).partition(".")[0] in packages
+
+
+def module_of(frame: FrameType) -> str:
+    """Return the name of a frame's module."""
+    return str(frame.f_globals.get("__name__", ""))
+
+
+def stack_of(frame: FrameType | None, packages: frozenset[str]) -> str:
+    """Return the lines of user code from ``frame`` outwards, without paths of this machine."""
+    lines: list[str] = []
+    while frame is not None and len(lines) < _LINES_MAX:
+        kind = _kind_of(frame.f_code.co_filename)
+        if kind == _USER or (packages and is_in(frame, packages)):
+            code = frame.f_code
+            folder = module_of(frame).rpartition(".")[0].replace(".", "/")
+            file = os.path.basename(code.co_filename)
+            place = f"{folder}/{file}" if folder else file
+            name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
+            lines.append(f"{place}:{frame.f_lineno} in {name}")
+        elif kind == _OURS:
+            break
+        frame = frame.f_back
+    return "\n".join(lines)

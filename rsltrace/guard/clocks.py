@@ -1,0 +1,222 @@
+"""Every clock a node can read shows simulated time: ``time``, ``datetime``, also where it is bound.
+
+Built-in functions are redirected, ``datetime.now`` and ``utcnow`` (which belong to a type) are
+exchanged in the type. Clocks of processor time show what has passed of the simulation: computing
+takes no simulated time.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import datetime, timezone
+from functools import partial
+from types import BuiltinFunctionType, FrameType
+from typing import Any
+
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.model.finding import Mode, Source
+
+_NS = 1_000_000_000
+
+REAL_TIME_MODULES = {
+    "asyncio.base_events",
+    "multiprocessing.connection",
+    "multiprocessing.popen_fork",
+    "multiprocessing.synchronize",
+    "selectors",
+    "socket",
+    "socketserver",
+    "subprocess",
+}
+"""Modules whose clocks measure how long the operating system takes: they wait for real, so what
+they read must go on. Their users get simulated time."""
+
+
+def clock_call(
+    guard: Guard,
+    frame: FrameType,
+    call: str,
+    virtual: Callable[[int], Any],
+    real: Callable[[], Any],
+) -> Any:
+    """Answer the reading of a clock as the job says."""
+    if frame.f_globals.get("__name__") in REAL_TIME_MODULES:
+        return real()
+    mode = guard.mode(Source.CLOCK, frame)
+    if mode is Mode.VIRTUAL:
+        guard.clock_read()
+        guard.count(Source.CLOCK, mode, call)
+        return virtual(guard.context.now_ns())
+    if mode is Mode.ALLOW:
+        return real()
+    value = guard.outside(Source.CLOCK, call, real) if mode is Mode.RECORD else real()
+    guard.found(Source.CLOCK, mode, call, value, frame)
+    return value
+
+
+def _readers() -> dict[str, Callable[[int], Any]]:
+    """Return what each clock function gives at a simulated time in nanoseconds."""
+    readers: dict[str, Callable[[int], Any]] = {}
+    for name in ("time", "monotonic", "perf_counter", "process_time", "thread_time"):
+        readers[name] = lambda now_ns: now_ns / _NS
+        readers[f"{name}_ns"] = lambda now_ns: now_ns
+    return readers
+
+
+def _reading(name: str, virtual: Callable[[int], Any], real: Callable[..., Any]) -> Any:
+    call = f"time.{name}()"
+
+    def read(*arguments: Any) -> Any:
+        guard = None if arguments else engaged()
+        if guard is None:
+            return real(*arguments)
+        return clock_call(guard, sys._getframe(1), call, virtual, real)
+
+    return read
+
+
+def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[..., Any]) -> Any:
+    def read(*arguments: Any) -> Any:
+        guard = engaged()
+        value = real(*arguments)  # raises for a clock that does not exist
+        if guard is None:
+            return value
+        return clock_call(guard, sys._getframe(1), f"time.{name}()", virtual, lambda: value)
+
+    return read
+
+
+def _broken_down(name: str, real: Callable[..., Any]) -> Any:
+    """``localtime()`` and its like: without an argument, or with None, they mean now."""
+
+    def read(*arguments: Any) -> Any:
+        guard = engaged() if arguments in ((), (None,)) else None
+        if guard is None:
+            return real(*arguments)
+        return clock_call(
+            guard, sys._getframe(1), f"time.{name}()", lambda now_ns: real(now_ns // _NS), real
+        )
+
+    return read
+
+
+def _formatting(
+    name: str, given: int, real: Callable[..., Any], localtime: Callable[..., Any]
+) -> Any:
+    """``strftime(format)`` and ``asctime()``: without the last argument they mean now."""
+
+    def read(*arguments: Any) -> Any:
+        guard = engaged() if len(arguments) == given else None
+        if guard is None:
+            return real(*arguments)
+        return clock_call(
+            guard,
+            sys._getframe(1),
+            f"time.{name}()",
+            lambda now_ns: real(*arguments, localtime(now_ns // _NS)),
+            lambda: real(*arguments),
+        )
+
+    return read
+
+
+def _now(real: Any) -> Any:
+    def now(cls: type[datetime], tz: Any = None) -> datetime:
+        guard = engaged()
+
+        def virtual(now_ns: int) -> datetime:
+            whole = cls.fromtimestamp(now_ns // _NS, tz)
+            return whole.replace(microsecond=now_ns % _NS // 1000)
+
+        if guard is None:
+            return real.__get__(None, cls)(tz)  # type: ignore[no-any-return]
+        return clock_call(  # type: ignore[no-any-return]
+            guard,
+            sys._getframe(1),
+            "datetime.now()",
+            virtual,
+            lambda: real.__get__(None, cls)(tz),
+        )
+
+    return now
+
+
+def _utcnow(real: Any) -> Any:
+    def utcnow(cls: type[datetime]) -> datetime:
+        guard = engaged()
+
+        def virtual(now_ns: int) -> datetime:
+            whole = cls.fromtimestamp(now_ns // _NS, timezone.utc).replace(tzinfo=None)
+            return whole.replace(microsecond=now_ns % _NS // 1000)
+
+        if guard is None:
+            return real.__get__(None, cls)()  # type: ignore[no-any-return]
+        return clock_call(  # type: ignore[no-any-return]
+            guard, sys._getframe(1), "datetime.utcnow()", virtual, real.__get__(None, cls)
+        )
+
+    return utcnow
+
+
+@contextmanager
+def clocks() -> Iterator[None]:
+    """Redirect every clock; which guard answers is asked at each call."""
+    with ExitStack() as stack:
+
+        def redirect(name: str, make: Callable[[Any], Any]) -> None:
+            function = getattr(time, name, None)
+            if isinstance(function, BuiltinFunctionType):
+                stack.callback(Redirected(function, make(copy_of(function))).restore)
+
+        for name, virtual in _readers().items():
+            redirect(name, partial(_reading, name, virtual))
+        localtime = copy_of(time.localtime)  # type: ignore[arg-type]
+        redirect(
+            "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
+        )
+        redirect(
+            "clock_gettime_ns", lambda real: _clock_gettime("clock_gettime_ns", lambda ns: ns, real)
+        )
+        for name in ("localtime", "gmtime", "ctime"):
+            redirect(name, partial(_broken_down, name))
+        redirect("strftime", lambda real: _formatting("strftime", 1, real, localtime))
+        redirect("asctime", lambda real: _formatting("asctime", 0, real, localtime))
+        for name, make in (("now", _now), ("utcnow", _utcnow)):
+            _exchange(stack, name, make)
+        yield
+
+
+def _exchange(stack: ExitStack, name: str, make: Callable[[Any], Any]) -> None:
+    """Exchange a class method of ``datetime``, in the type and where it was bound before."""
+    real = datetime.__dict__[name]
+    ours = make(real)
+    for bound in _bound_before(name):
+        target = ours.__get__(bound.__self__)
+        stack.callback(Redirected(bound, target).restore)
+    _set(datetime, name, classmethod(ours))
+    stack.callback(_set, datetime, name, real)
+
+
+def _bound_before(name: str) -> list[BuiltinFunctionType]:
+    """Return the bound class methods that somebody keeps (``now = datetime.now``)."""
+    return [
+        thing
+        for thing in gc.get_objects()
+        if type(thing) is BuiltinFunctionType
+        and thing.__name__ == name
+        and isinstance(thing.__self__, type)
+        and issubclass(thing.__self__, datetime)
+    ]
+
+
+def _set(cls: type, name: str, value: object) -> None:
+    """Set an attribute of a built-in type, which Python itself refuses."""
+    (members,) = gc.get_referents(cls.__dict__)
+    members[name] = value
+    ctypes.pythonapi.PyType_Modified(ctypes.py_object(cls))

@@ -1,0 +1,197 @@
+"""The guard of one run: who is calling, what the job says about it, what was seen.
+
+Replaced functions ask ``engaged()`` for the guard that is in charge of the calling thread. There is
+one only while a simulation is at work; everywhere else the replaced functions do what they always
+did.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from fnmatch import fnmatchcase
+from types import FrameType
+from typing import Any, Protocol
+
+from rsltrace.errors import GuardError
+from rsltrace.guard.callers import module_of, stack_of, user_frame
+from rsltrace.guard.outside import Outside
+from rsltrace.guard.streams import Streams
+from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
+
+FINDINGS_PER_EVENT = 100
+"""An event that looks at the address of a million objects is one problem, not a million."""
+
+_READS_PER_EVENT = 50_000
+_BUSY_NS = 10_000
+
+
+class Context(Protocol):
+    """What a guard asks of the simulation."""
+
+    def now_ns(self) -> int:
+        """Return simulated time."""
+
+    def node(self) -> str:
+        """Return the node whose code runs, or an empty text."""
+
+    def policy(self) -> Policy | None:
+        """Return the policy of that node, or None for the job's."""
+
+    def place(self) -> tuple[int, int]:
+        """Return the index of the event under way and the entity that runs."""
+
+    def pass_time(self, for_ns: int) -> None:
+        """Let simulated time pass, if whoever runs can wait."""
+
+
+class Guard:
+    """State of one run. ``on_finding`` takes what is worth a line in the trace.
+
+    ``counts`` says how often each call was met: by (source, mode, node, call).
+    """
+
+    def __init__(
+        self,
+        context: Context,
+        *,
+        policy: Policy,
+        seed: int = 0,
+        packages: frozenset[str] = frozenset(),
+        on_finding: Callable[[Finding], None] = lambda finding: None,
+    ) -> None:
+        self.context = context
+        self.packages = packages
+        self.on_finding = on_finding
+        self.counts: Counter[tuple[Source, Mode, str, str]] = Counter()
+        self.streams = Streams(seed)
+        self.outside: Outside = Outside()
+        self._policy = policy
+        self._thread = threading.get_ident()
+        self._process = os.getpid()
+        self._event = -1
+        self._in_event = 0
+        self._reads = 0
+        self._reads_event = -1
+
+    def in_charge(self) -> bool:
+        """Return whether the calling thread is the simulation's (and no child process)."""
+        return threading.get_ident() == self._thread and os.getpid() == self._process
+
+    def mode(self, source: Source, frame: FrameType) -> Mode:
+        """Return what the job says about ``source`` in the code of ``frame``."""
+        policy = self.context.policy() or self._policy
+        allowed = policy.allowed.get(source)
+        if allowed:
+            user = user_frame(frame, self.packages) or frame
+            names = {module_of(frame), module_of(user)}
+            if any(fnmatchcase(name, glob) for name in names for glob in allowed):
+                return Mode.ALLOW
+        return policy.modes.get(source, DEFAULT_MODES[source])
+
+    def stream(self, frame: FrameType) -> str:
+        """Return the name of the random stream of whoever runs: the node's, or its module's."""
+        node = self.context.node()
+        if node:
+            return node
+        return f"module {module_of(user_frame(frame, self.packages) or frame)}"
+
+    def count(self, source: Source, mode: Mode, call: str) -> None:
+        """Count a call that is no finding."""
+        self.counts[source, mode, self.context.node(), call] += 1
+
+    def found(self, source: Source, mode: Mode, call: str, value: object, frame: FrameType) -> None:
+        """Report a call; ``frame`` is where it was made.
+
+        :raises GuardError: if the job says that it is an error.
+        """
+        node = self.context.node()
+        self.counts[source, mode, node, call] += 1
+        event, entity = self.context.place()
+        if event != self._event:
+            self._event, self._in_event = event, 0
+        self._in_event += 1
+        if self._in_event <= FINDINGS_PER_EVENT or mode is Mode.ERROR:
+            user = user_frame(frame, self.packages)
+            stack = stack_of(user or frame, self.packages)
+            text = value if isinstance(value, str) else repr(value)
+            self.on_finding(Finding(event, entity, node, source, mode, call, text, stack))
+            if mode is Mode.ERROR:
+                where = stack.partition("\n")[0] or module_of(frame)
+                raise GuardError(
+                    f"{call} at {where}: the job says 'guard: {{{source.value}: error}}'; "
+                    f"{ADVICE[source]}"
+                )
+
+    def watched(self, source: Source, call: str, value: object, frame: FrameType) -> None:
+        """Report a call that cannot be virtual, if user code made it and the job wants to know."""
+        user = user_frame(frame, self.packages)
+        if user is None:
+            return
+        mode = self.mode(source, frame)
+        if mode is Mode.ALLOW:
+            return
+        self.found(source, Mode.WARN if mode is Mode.VIRTUAL else mode, call, value, frame)
+
+    def clock_read(self) -> None:
+        """Keep whoever reads a clock until time has passed from waiting for ever."""
+        event = self.context.place()[0]
+        if event != self._reads_event:
+            self._reads_event, self._reads = event, 0
+        self._reads += 1
+        if self._reads > _READS_PER_EVENT:
+            self.context.pass_time(_BUSY_NS)
+            self._reads_event = self.context.place()[0]
+
+
+ADVICE = {
+    Source.CLOCK: "use the node's clock: self.get_clock().now()",
+    Source.RANDOM: "use a generator with a seed of its own",
+    Source.DIRECTORY: "sort what is listed",
+    Source.FILE: "read the file before the run, or write 'file: record'",
+    Source.ENVIRONMENT: "make it a parameter of the node",
+    Source.THREAD: "use timers, tasks or callback groups",
+    Source.PROCESS: "do it before the run, or in a node of its own outside",
+    Source.SOCKET: "record what comes from outside into a bag, or write 'socket: record'",
+    Source.ADDRESS: "use a name or a number of your own instead of an object's address",
+    Source.ORDER: "sort it, or use a dict or a list",
+}
+"""What to do instead, by source."""
+
+_engaged: list[Guard] = []
+
+
+def engaged() -> Guard | None:
+    """Return the guard in charge of the calling thread, or None."""
+    if _engaged:
+        guard = _engaged[-1]
+        if guard.in_charge():
+            return guard
+    return None
+
+
+@contextmanager
+def engage(guard: Guard | None) -> Iterator[None]:
+    """Put ``guard`` in charge of what this thread does now (None: nobody)."""
+    if guard is None:
+        saved, _engaged[:] = list(_engaged), []
+        try:
+            yield
+        finally:
+            _engaged[:] = saved
+        return
+    _engaged.append(guard)
+    try:
+        yield
+    finally:
+        _engaged.remove(guard)
+
+
+def caller(depth: int = 2) -> FrameType:
+    """Return the frame of whoever called the function that calls this one."""
+    frame: Any = sys._getframe(depth)
+    return frame  # type: ignore[no-any-return]

@@ -1,0 +1,31 @@
+"""Putting all replacements in place for the time of a run, and taking them back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+from rsltrace.guard.clocks import clocks
+from rsltrace.guard.folders import folders
+from rsltrace.guard.randomness import randomness
+
+_users = 0
+_stack = ExitStack()
+
+
+@contextmanager
+def installed() -> Iterator[None]:
+    """Redirect the sources; the last one to leave takes everything back."""
+    global _users, _stack
+    if _users == 0:
+        with ExitStack() as stack:
+            for replacement in (clocks, randomness, folders):
+                stack.enter_context(replacement())
+            _stack = stack.pop_all()
+    _users += 1
+    try:
+        yield
+    finally:
+        _users -= 1
+        if _users == 0:
+            _stack.close()

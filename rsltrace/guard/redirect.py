@@ -1,0 +1,121 @@
+"""Making a built-in function call a Python function, wherever somebody has already bound it.
+
+``time.time = ours`` misses ``from time import time``, default arguments and tables of functions
+that were made before. All of them hold the same function object, so the object itself is turned:
+its method definition becomes one that calls our function (CPython's ``PyObject_Call`` has just the
+signature that a built-in with keywords needs). Nothing is compiled, a call costs what a call of a
+Python function costs, exceptions pass, and ``restore`` puts three pointers back.
+
+The layout is CPython's and has not changed since 3.8; it is checked before anything is written.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from collections.abc import Callable
+from types import BuiltinFunctionType, MethodType
+from typing import Any
+
+from rsltrace.errors import SetupError
+
+_VARARGS_KEYWORDS = 0x3
+_api = ctypes.pythonapi
+_CALL = ctypes.cast(_api.PyObject_Call, ctypes.c_void_p).value
+_new_function = ctypes.PYFUNCTYPE(
+    ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p
+)(("PyCFunction_NewEx", _api))
+_count_up = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("Py_IncRef", _api))
+_count_down = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("Py_DecRef", _api))
+
+
+class _MethodDef(ctypes.Structure):
+    _fields_ = (
+        ("name", ctypes.c_char_p),
+        ("function", ctypes.c_void_p),
+        ("flags", ctypes.c_int),
+        ("doc", ctypes.c_char_p),
+    )
+
+
+class _Function(ctypes.Structure):
+    _fields_ = (
+        ("references", ctypes.c_ssize_t),
+        ("type", ctypes.c_void_p),
+        ("definition", ctypes.c_void_p),
+        ("owner", ctypes.c_void_p),
+        ("module", ctypes.c_void_p),
+        ("weak_references", ctypes.c_void_p),
+        ("vectorcall", ctypes.c_void_p),
+    )
+
+
+class _Method(ctypes.Structure):
+    _fields_ = (
+        ("references", ctypes.c_ssize_t),
+        ("type", ctypes.c_void_p),
+        ("function", ctypes.c_void_p),
+        ("owner", ctypes.c_void_p),
+    )
+
+
+class Redirected:
+    """A built-in function that calls something else until ``restore``. ``real`` is what it was."""
+
+    def __init__(self, function: BuiltinFunctionType, target: Callable[..., Any]) -> None:
+        self._function = function
+        self._target = target
+        self.real = copy_of(function)
+        place = _Function.from_address(id(function))
+        self._saved = (place.definition, place.owner, place.vectorcall)
+        name = function.__name__.encode()
+        self._definition = _MethodDef(name, _CALL, _VARARGS_KEYWORDS, None)
+        _count_up(id(target))
+        place.definition = ctypes.addressof(self._definition)
+        place.owner = id(target)
+        place.vectorcall = None
+
+    def restore(self) -> None:
+        """Let the function be what it was."""
+        place = _Function.from_address(id(self._function))
+        place.definition, place.owner, place.vectorcall = self._saved
+        _count_down(id(self._target))
+
+
+class RedirectedMethod:
+    """A bound method (``random.seed``) that calls ``target`` instead, until ``restore``."""
+
+    def __init__(self, method: MethodType, target: Callable[..., Any]) -> None:
+        self._method = method
+        self._target = target
+        self.real: Callable[..., Any] = MethodType(method.__func__, method.__self__)
+        place = _Method.from_address(id(method))
+        if place.function != id(method.__func__) or place.owner != id(method.__self__):
+            raise _unknown_layout()
+        self._saved = place.function
+        _count_up(id(target))
+        place.function = id(target)
+
+    def restore(self) -> None:
+        """Let the method be what it was."""
+        _Method.from_address(id(self._method)).function = self._saved
+        _count_down(id(self._target))
+
+
+def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
+    """Return a second function object that does what ``function`` does now."""
+    place = _Function.from_address(id(function))
+    definition = place.definition
+    name = _MethodDef.from_address(definition).name if definition else None
+    owner = function.__self__
+    if name != function.__name__.encode() or place.owner not in (None, id(owner)):
+        raise _unknown_layout()
+    copy: Callable[..., Any] = _new_function(definition, place.owner, place.module)
+    return copy
+
+
+def _unknown_layout() -> SetupError:
+    return SetupError(
+        f"Python {sys.version.split()[0]} ({sys.implementation.name}) keeps its functions in a way "
+        "that the guard does not know; write 'guard: false' in the job to record without it"
+    )

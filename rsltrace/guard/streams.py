@@ -1,0 +1,42 @@
+"""Random generators by name: each node draws from its own, so one more node changes nothing."""
+
+from __future__ import annotations
+
+from random import Random
+from typing import Any
+
+
+class Streams:
+    """The generators of one run, by name: made when first used, seeded by the job's seed."""
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self._random: dict[str, Random] = {}
+        self._entropy: dict[str, Random] = {}
+        self._numpy: dict[str, Any] = {}
+        self.last_uuid: dict[str, int | None] = {}
+
+    def random(self, name: str) -> Random:
+        """Return the stand-in for the generator behind ``random``'s functions."""
+        return _made(self._random, f"random {self._seed}", name)
+
+    def entropy(self, name: str, size: int) -> bytes:
+        """Return the next bytes in place of the operating system's."""
+        return _made(self._entropy, f"entropy {self._seed}", name).randbytes(size)
+
+    def numpy(self, name: str) -> Any:
+        """Return the stand-in for the generator behind ``numpy.random``'s functions."""
+        found = self._numpy.get(name)
+        if found is None:
+            import numpy as np
+
+            seed = Random(f"numpy {self._seed} {name}").getrandbits(32)
+            found = self._numpy[name] = np.random.RandomState(seed)
+        return found
+
+
+def _made(streams: dict[str, Random], kind: str, name: str) -> Random:
+    found = streams.get(name)
+    if found is None:
+        found = streams[name] = Random(f"{kind} {name}")
+    return found

@@ -1,0 +1,88 @@
+"""Sources of nondeterminism, what is done about each, and what was seen of them in a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class Source(str, Enum):
+    """Kinds of calls whose answer comes from outside of the run, or from chance."""
+
+    CLOCK = "clock"
+    RANDOM = "random"
+    DIRECTORY = "directory"
+    FILE = "file"
+    ENVIRONMENT = "environment"
+    THREAD = "thread"
+    PROCESS = "process"
+    SOCKET = "socket"
+    ADDRESS = "address"
+    ORDER = "order"
+
+
+class Mode(str, Enum):
+    """What is done about a source.
+
+    ``virtual``: the answer is made by the run; ``record``: the real answer is kept in the trace, to
+    be given again; ``warn``: the call is a finding; ``error``: it ends the run; ``allow``: nothing.
+    """
+
+    VIRTUAL = "virtual"
+    RECORD = "record"
+    WARN = "warn"
+    ERROR = "error"
+    ALLOW = "allow"
+
+
+_ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
+MODES: Mapping[Source, tuple[Mode, ...]] = {
+    Source.CLOCK: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
+    Source.RANDOM: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
+    Source.DIRECTORY: (Mode.VIRTUAL, *_ALWAYS),
+    Source.FILE: (Mode.RECORD, *_ALWAYS),
+    Source.ENVIRONMENT: (Mode.RECORD, *_ALWAYS),
+    Source.THREAD: _ALWAYS,
+    Source.PROCESS: _ALWAYS,
+    Source.SOCKET: (Mode.RECORD, *_ALWAYS),
+    Source.ADDRESS: _ALWAYS,
+    Source.ORDER: (Mode.VIRTUAL, *_ALWAYS),
+}
+"""What can be done about each source."""
+
+DEFAULT_MODES: Mapping[Source, Mode] = {
+    source: Mode.VIRTUAL if Mode.VIRTUAL in modes else Mode.WARN for source, modes in MODES.items()
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """What is done about each source in the code of one node, and which modules are exempt.
+
+    ``allowed`` holds globs of module names by source. ``state`` is empty, ``true`` (hashed after
+    each callback) or ``record`` (its attributes are kept, too).
+    """
+
+    modes: Mapping[Source, Mode] = field(default_factory=lambda: DEFAULT_MODES)
+    allowed: Mapping[Source, tuple[str, ...]] = field(default_factory=dict)
+    state: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A call that could make runs differ.
+
+    ``event`` is the index of the event it happened in, ``entity`` what ran. ``call`` names the call
+    (``os.environ['HOME']``), ``value`` is what it gave, as text; ``stack`` the lines of user code
+    that led to it, innermost first, one per line.
+    """
+
+    event: int
+    entity: int
+    node: str
+    source: Source
+    mode: Mode
+    call: str
+    value: str
+    stack: str

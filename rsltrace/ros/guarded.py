@@ -1,0 +1,45 @@
+"""What the guard asks of the simulated world: the time, the node, the event under way."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from rsltrace.model.finding import Policy
+from rsltrace.ros.blocking import wait
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+
+class GuardContext:
+    """Answers for one world."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+
+    def now_ns(self) -> int:
+        """Return simulated time."""
+        return self._core.loop.now_ns
+
+    def node(self) -> str:
+        """Return the node whose code runs, or the entry whose constructor has made none yet."""
+        core = self._core
+        if core.current_node is not None:
+            return core.current_node.fully_qualified_name
+        entry = core.entry
+        return entry.key if entry is not None else ""
+
+    def policy(self) -> Policy | None:
+        """Return the policy of that node."""
+        return self._core.policy
+
+    def place(self) -> tuple[int, int]:
+        """Return the index of the event under way and the entity that runs."""
+        core = self._core
+        return core.loop.events, core.current_entity
+
+    def pass_time(self, for_ns: int) -> None:
+        """Let time pass for a callback that does nothing but look at the clock."""
+        core = self._core
+        if core.current_handle is not None and not core.ending:
+            wait(core, "time to pass (it reads a clock again and again)", for_ns=for_ns)

@@ -1,0 +1,74 @@
+"""The guard of a run, as its job wants it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import TYPE_CHECKING
+
+from rsltrace.guard.guard import Guard, engage
+from rsltrace.guard.install import installed
+from rsltrace.guard.randomness import begin_shared
+from rsltrace.job import Job, NodeSpec, policy_of
+from rsltrace.model.finding import Finding
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+
+class Guarding:
+    """The guard of one run; without one (``guard: false``) everything here does nothing."""
+
+    def __init__(self, job: Job) -> None:
+        self._job = job
+        self.guard: Guard | None = None
+
+    def begin(self, core: Core) -> None:
+        """Make the guard of a world: from here on ``engaged`` puts it in charge."""
+        from rsltrace.ros.guarded import GuardContext
+
+        def on_finding(finding: Finding) -> None:
+            pass
+
+        job = self._job
+        if job.guard.enabled:
+            self.guard = Guard(
+                GuardContext(core),
+                policy=policy_of(job.guard),
+                seed=job.seed,
+                packages=_packages(job.nodes),
+                on_finding=on_finding,
+            )
+            begin_shared(job.seed)
+
+    def engaged(self) -> AbstractContextManager[None]:
+        """Put the guard in charge of what this thread does now."""
+        return nullcontext() if self.guard is None else engage(self.guard)
+
+
+def guarding(stack: ExitStack, job: Job) -> Guarding:
+    """Put the replacements in place until ``stack`` ends."""
+    if job.guard.enabled:
+        stack.enter_context(installed())
+    return Guarding(job)
+
+
+def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
+    """Return a name for an entry that other entries (of other classes) do not change."""
+
+    def own(other: NodeSpec) -> tuple[str, str | None, str | None]:
+        return other.target, other.namespace, other.name
+
+    same = sum(1 for other in before if own(other) == own(spec))
+    name = " ".join(part for part in own(spec) if part)
+    return f"{name} #{same + 1}" if same else name
+
+
+def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+    return frozenset(spec.target.partition(":")[0].partition(".")[0] for spec in nodes) - {
+        "rsltrace",
+        "rclpy",
+    }
+
+
+__all__ = ["Guarding", "entry_key", "guarding"]

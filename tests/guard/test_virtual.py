@@ -1,0 +1,227 @@
+"""Clocks, chance and directory listings answer from the simulation, wherever they are bound."""
+
+from __future__ import annotations
+
+import datetime
+import os
+import random
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.guard.conftest import node_code
+
+pytestmark = pytest.mark.ros
+
+Said = Callable[..., list[Any]]
+
+# Bound long before any run, as in a module that a test suite has imported.
+bound_before = time.time
+now_before = datetime.datetime.now
+table_before = {"clock": time.perf_counter_ns, "draw": random.random, "entropy": os.urandom}
+
+
+class Before(datetime.datetime):
+    """A subclass made before the run."""
+
+
+def with_default(clock: Callable[[], float] = time.monotonic) -> float:
+    return clock()
+
+
+@pytest.mark.parametrize(
+    "expression",
+    [
+        "time.time()",
+        "time.time_ns() / 1e9",
+        "time.monotonic()",
+        "time.monotonic_ns() / 1e9",
+        "time.perf_counter()",
+        "time.perf_counter_ns() / 1e9",
+        "time.process_time()",
+        "time.thread_time_ns() / 1e9",
+        "time.clock_gettime(time.CLOCK_REALTIME)",
+        "time.clock_gettime_ns(time.CLOCK_MONOTONIC) / 1e9",
+        "t2()",
+        "self.default()",
+        "datetime.now(timezone.utc).timestamp()",
+        "D.now(timezone.utc).timestamp()",
+        "datetime.utcnow().replace(tzinfo=timezone.utc).timestamp()",
+        "datetime.today().timestamp()",
+        "sum(map(test.bound_before, ()), 0) + test.bound_before()",
+        "test.now_before(timezone.utc).timestamp()",
+        "test.Before.now(timezone.utc).timestamp()",
+        "test.with_default()",
+        "test.table_before['clock']() / 1e9",
+    ],
+)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_every_clock_shows_simulated_time(said: Said, expression: str) -> None:
+    code = node_code(
+        f"self.say({expression})",
+        imports="import sys, time\nfrom time import time as t2\n"
+        "from datetime import datetime, timezone\n"
+        f"test = sys.modules[{__name__!r}]",
+        module="class D(datetime): pass\n",
+        init="self.default = lambda clock=time.perf_counter: clock()",
+    )
+    assert said(code) == [[0.5], [1.0]]
+
+
+def test_broken_down_times_and_texts(said: Said) -> None:
+    code = node_code(
+        "self.say(time.gmtime()[:6], time.gmtime(None)[:6], time.gmtime(86400)[:3],\n"
+        "         time.strftime('%M:%S'), time.strftime('%Y', (1999, *[1] * 8)),\n"
+        "         time.ctime() == time.asctime() == time.ctime(time.time()), date.today().year)",
+        imports="import time\nfrom datetime import date",
+    )
+    day = [1970, 1, 1, 0, 0]
+    assert said(code) == [
+        [[*day, 0], [*day, 0], [1970, 1, 2], "00:00", "1999", True, 1970],
+        [[*day, 1], [*day, 1], [1970, 1, 2], "00:01", "1999", True, 1970],
+    ]
+
+
+DRAWS = """
+[random.random(), random.gauss(0, 1), random.choice('abc'), random.getrandbits(70)],
+[random.Random().random(), random.SystemRandom().random(), os.urandom(4).hex()],
+[secrets.token_hex(4), str(uuid.uuid4()), str(uuid.uuid1()), uuid.getnode()],
+[np.random.rand(), np.random.normal(), int(np.random.randint(1000))],
+[np.random.default_rng().random(), np.random.RandomState().rand(), np.random.PCG64().random_raw()],
+[test.table_before['draw'](), test.table_before['entropy'](3).hex()],
+AT_IMPORT
+"""
+
+
+def drawing() -> str:
+    return node_code(
+        f"self.say({DRAWS})",
+        imports="import os, random, secrets, sys, uuid\nimport numpy as np\n"
+        f"test = sys.modules[{__name__!r}]",
+        module="AT_IMPORT = [random.random(), os.urandom(2).hex(), int(np.random.randint(1000))]",
+    )
+
+
+def test_chance_is_the_same_in_every_run_and_different_for_every_seed(said: Said) -> None:
+    first = said(drawing())
+    random.random()
+    np.random.rand()
+    assert said(drawing()) == first
+    assert len(first) == 2
+    assert first[0][:4] != first[1][:4], "a stream goes on"
+    other = said(drawing(), job="nodes: [{node: 'm:N'}]\nseed: 1")
+    for group, group_other in zip(first[0], other[0], strict=True):
+        for value, value_other in zip(group[:2], group_other[:2], strict=True):
+            assert value != value_other
+
+
+def test_one_more_node_does_not_disturb_the_others(said: Said) -> None:
+    alone = said(drawing())
+    extra = "nodes: [{node: 'm:N', name: first}, {node: 'm:N'}, {node: 'm:N', name: last}]"
+    together = said(drawing(), job=extra)
+    assert [together[1], together[4]] == alone
+    assert together[0] != alone[0] != together[2]
+
+
+def test_a_seed_of_the_nodes_own_is_its_own(said: Said) -> None:
+    code = node_code(
+        "self.say(random.random(), np.random.rand(), random.getstate()[1][0] > 0)",
+        imports="import random\nimport numpy as np",
+        init="random.seed(5); np.random.seed(5)",
+    )
+    expected = [random.Random(5).random(), np.random.RandomState(5).rand(), True]
+    assert said(code)[0] == expected
+    assert said(code, job="nodes: [{node: 'm:N', name: a}, {node: 'm:N'}]")[:2] == [expected] * 2
+
+
+def test_busy_waiting_takes_simulated_time_and_ends(said: Said) -> None:
+    code = node_code(
+        "start = time.monotonic()\nwhile time.monotonic() - start < 0.02: pass\n"
+        "self.say(time.monotonic() - start < 0.021)",
+        imports="import time",
+    )
+    assert said(code) == [[True], [True]]
+
+
+def test_directories_are_listed_in_the_order_of_names(said: Said, tmp_path: Path) -> None:
+    folder = tmp_path / "many"
+    folder.mkdir()
+    names = [f"{random.getrandbits(40):x}" for _ in range(50)]
+    for name in names:
+        (folder / name).touch()
+    code = node_code(
+        f"f = {str(folder)!r}\n"
+        "with os.scandir(f) as entries: scanned = [e.name for e in entries]\n"
+        "self.say(os.listdir(f) == sorted(os.listdir(f)) == scanned\n"
+        "    == [p.name for p in pathlib.Path(f).iterdir()] == next(os.walk(f))[2]\n"
+        "    == [os.path.basename(p) for p in glob.glob(f + '/*')])",
+        imports="import glob, os, pathlib",
+    )
+    assert said(code)[0] == [True]
+
+
+def test_guard_false_leaves_everything_alone(said: Said) -> None:
+    code = node_code("self.say(time.time() > 1e9, random.random())", imports="import random, time")
+    off = "nodes: [{node: 'm:N'}]\nguard: false"
+    first, second = said(code, job=off), said(code, job=off)
+    assert first[0][0] is True
+    assert first != second
+
+
+def test_one_node_may_be_allowed_what_others_are_not(said: Said) -> None:
+    code = node_code("self.say(time.time() > 1e9)", imports="import time")
+    job = "nodes: [{node: 'm:N'}, {node: 'm:N', name: b, guard: {clock: allow}}]"
+    assert said(code, job=job)[:2] == [[False], [True]]
+    by_module = "nodes: [{node: 'm:N'}]\nguard: {clock: {allow: [m]}}"
+    assert said(code, job=by_module)[0] == [True]
+
+
+def test_nothing_is_left_after_a_run(said: Said) -> None:
+    def state() -> list[object]:
+        state = np.random.get_state()
+        return [
+            random.getstate(),
+            state[1].tolist(),  # type: ignore[index,union-attr]
+            random.Random.seed,
+            np.random.seed,
+            uuid._generate_time_safe,  # type: ignore[attr-defined]
+            uuid._node,  # type: ignore[attr-defined]
+            datetime.datetime.__dict__["now"],
+            time.time.__self__,  # type: ignore[attr-defined]
+            random.random.__self__,  # type: ignore[attr-defined]
+            random.seed.__func__,  # type: ignore[attr-defined]
+        ]
+
+    before = state()
+    said(drawing())
+    with pytest.raises(Exception, match="boom"):
+        said(node_code("raise RuntimeError('boom')"))
+    assert state() == before
+    assert abs(time.time() - time.clock_gettime(time.CLOCK_REALTIME)) < 5 < time.time()
+    assert os.urandom(8) != os.urandom(8)
+    assert random.Random().random() != random.Random().random()
+    assert now_before().year > 2000
+
+
+def test_libraries_work_under_the_guard(said: Said) -> None:
+    for name in ("pandas", "scipy", "matplotlib"):
+        pytest.importorskip(name)
+    code = node_code(
+        "figure = Figure(); figure.add_subplot().plot([1, 2], [3, 4])\n"
+        "png = io.BytesIO(); figure.savefig(png, format='png')\n"
+        "frame = pd.DataFrame({'x': np.random.rand(5)}, index=pd.date_range('2020', periods=5))\n"
+        "self.say(str(pd.Timestamp.now()), frame.sample(2).x.tolist(),\n"
+        "    scipy.stats.norm.rvs(size=2).tolist(), float(scipy.optimize.brentq(np.cos, 1, 2)),\n"
+        "    hash(png.getvalue()) != 0)",
+        imports="import io\nimport numpy as np\nimport pandas as pd\n"
+        "import scipy.optimize, scipy.stats\n"
+        "from matplotlib.figure import Figure",
+    )
+    first = said(code)
+    assert first == said(code)
+    assert first[0][0] == "1970-01-01 00:00:00.500000"
