@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 import shlex
 import sys
@@ -154,6 +155,8 @@ def _run(app: ViewerApp) -> None:
         raise SetupError(
             "the viewer needs a terminal; --export writes a screen to a file, `rsltrace cat` prints"
         )
+    for name in ("COLUMNS", "LINES"):
+        os.environ.pop(name, None)  # exported by some shells; they would be believed over the tty
     app.run()
     if app.return_code:
         sys.exit(app.return_code)

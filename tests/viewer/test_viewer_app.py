@@ -182,11 +182,25 @@ def test_searching(made: Path, run: Run, drive: Drive) -> None:
 
 def test_typing_fast_goes_into_the_question(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
-        for key in "Fkind:srv\r":  # no pause: as a fast hand does it
-            name = {":": "colon", "\r": "enter"}.get(key, key)
-            viewer.app.post_message(events.Key(name, key))
-        await viewer.settle()
+        names = {"/": "slash", ":": "colon", "\r": "enter", "\t": "tab", "\x1b": "escape"}
+
+        async def burst(text: str) -> None:  # no pause: as a fast hand does it
+            for key in text:
+                viewer.app.post_message(events.Key(names.get(key, key), key))
+            await viewer.settle()
+
+        await burst("Fkind:srv\r")
         assert viewer.app.session.filter_text == "kind:srv"
+        await viewer.press("escape")
+        await burst("Fno\t/lis\t\r")
+        assert viewer.app.session.filter_text == "node:/listener"
+        await viewer.press("escape")
+        await burst("i10\rjj")
+        assert viewer.place == 12
+        await burst("t1\x1bk")
+        assert viewer.place == 11
+        await burst("/kind:srv\rnN")
+        assert viewer.app.session.search_text == "kind:srv"
 
     drive(made, steps)
 

@@ -16,6 +16,7 @@ from textual import events
 from textual.app import App, ComposeResult, SystemCommand
 from textual.binding import Binding
 from textual.containers import Container
+from textual.geometry import Size
 from textual.screen import Screen
 from textual.worker import get_current_worker
 
@@ -197,8 +198,8 @@ class ViewerApp(App[None]):
 
     # Drawing.
 
-    def _show_header(self) -> None:
-        session = self.session
+    def _show_header(self, size: Size | None = None) -> None:
+        session, size = self.session, size or self.size
         verdict, bad = "", False
         if session.comparison is not None:
             verdict, bad = session.comparison.verdict(), not session.comparison.identical
@@ -207,7 +208,8 @@ class ViewerApp(App[None]):
             session.facts(),
             verdict,
             bad=bad,
-            lines=2 if self.size.height >= 20 else 1 if self.size.height >= 10 else 0,
+            lines=2 if size.height >= 20 else 1 if size.height >= 10 else 0,
+            width=size.width,
         )
 
     def _show_rows(self, *, centre: bool = False) -> None:
@@ -295,9 +297,9 @@ class ViewerApp(App[None]):
         return inspect
 
     def on_resize(self, event: events.Resize) -> None:
-        """Use the new size."""
+        """Use the new size, which the app and its parts will have a moment later."""
         self._fit(event.size.width, event.size.height)
-        self._show_header()
+        self._show_header(event.size)
         self.call_after_refresh(self._redraw)
 
     def on_timeline_resized(self) -> None:
@@ -480,9 +482,11 @@ class ViewerApp(App[None]):
     # Asking.
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Keys that ask come before the part that has the focus, but not while one types."""
+        """Some keys come before the part that has the focus, but not while one types."""
         if action == "ask":
             return not self.prompt.asking and len(self.screen_stack) == 1
+        if action == "pane":
+            return not self.prompt.asking
         return True
 
     def action_ask(self, kind: str) -> None:
@@ -627,10 +631,7 @@ class ViewerApp(App[None]):
             self.go(session.place_at_time(event.position), centre=True)
 
     def action_pane(self, step: int) -> None:
-        """Go to the next part of the screen; while something is asked, complete the answer."""
-        if self.prompt.asking:
-            self.prompt.complete()
-            return
+        """Go to the next part of the screen."""
         if len(self.screen_stack) > 1:
             self.screen.focus_next()
             return

@@ -18,10 +18,11 @@ class HeaderBar(Static):
     """
 
     def show(
-        self, title: str, facts: str, verdict: str = "", *, bad: bool = False, lines: int = 2
+        self, title: str, facts: str, verdict: str, *, bad: bool, lines: int, width: int
     ) -> None:
-        """Show a title, facts about it, and the verdict on two runs in at most ``lines``."""
-        width = max(self.app.size.width - 2, 1)
+        """Show a title, facts about it, and the verdict on two runs in at most ``lines``, on a
+        screen of ``width`` cells."""
+        width = max(width - 2, 1)
         title = fit(title, min(width, cells(title)))
         rest = f"  {facts}"
         room = width - cells(title)

@@ -40,6 +40,26 @@ class _Completer(Suggester):
         return next((c for c in self._complete(value) if c.startswith(value)), None)
 
 
+class _Field(Input):
+    """Where the answer is typed. It takes the keys that end or complete an answer itself: as
+    bindings of the app they would overtake, or be overtaken by, what a fast hand types."""
+
+    async def _on_key(self, event: events.Key) -> None:
+        prompt = self.query_ancestor(Prompt)
+        if not prompt.asking:  # typed right after Enter, when the focus was still here
+            self.app.post_message(events.Key(event.key, event.character))
+        elif event.key == "enter":
+            prompt.answer()
+        elif event.key == "escape":
+            prompt.put_aside()
+        elif event.key == "tab":
+            prompt.complete()
+        else:
+            return
+        event.stop()
+        event.prevent_default()
+
+
 class Prompt(Vertical):
     """Hidden until something is asked."""
 
@@ -70,7 +90,7 @@ class Prompt(Vertical):
         """Make the parts."""
         with Vertical(id="line"):
             yield Static(id="label")
-            yield Input(id="answer", select_on_focus=False, compact=True)
+            yield _Field(id="answer", select_on_focus=False, compact=True)
         yield Static(id="hint")
 
     @property
@@ -93,35 +113,24 @@ class Prompt(Vertical):
 
     def put_aside(self) -> None:
         """Close without an answer."""
-        if self._question is not None:
-            kind = self._question.kind
-            self._close()
-            self.post_message(self.Answered(kind, None))
+        self._close(None)
 
     def on_input_changed(self, event: Input.Changed) -> None:
         """Say what is wrong, or how it could go on."""
         event.stop()
         self._say(event.value)
 
-    def on_input_submitted(self, event: Input.Submitted) -> None:
+    def answer(self) -> None:
         """Answer, if the answer is good."""
-        event.stop()
-        question = self._question
+        question, value = self._question, self.query_one(Input).value
         if question is None:
             return
         try:
-            question.check(event.value)
+            question.check(value)
         except ValueError as error:
             self._complain(error)
             return
-        self._close()
-        self.post_message(self.Answered(question.kind, event.value))
-
-    def on_key(self, event: events.Key) -> None:
-        """Escape puts the question aside."""
-        if self._question is not None and event.key == "escape":
-            event.stop()
-            self.put_aside()
+        self._close(value)
 
     def complete(self) -> None:
         """Finish the last word as far as there is one way to."""
@@ -166,9 +175,14 @@ class Prompt(Vertical):
                 pointer = f"at character {start + 1}: "
         hint.update(Content(f"{pointer}{error}"))
 
-    def _close(self) -> None:
-        self._question = None
+    def _close(self, text: str | None) -> None:
+        question, self._question = self._question, None
+        if question is None:
+            return
         self.display = False
+        # At once, and straight to the app: what is typed next must find the answer given.
+        self.screen.set_focus(None)
+        self.app.post_message(self.Answered(question.kind, text))
 
 
 def _tail(text: str) -> str:
