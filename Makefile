@@ -10,7 +10,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: rclpy-tests demo test lint types architecture unit setup samples bench pictures clean
+.PHONY: rclpy-tests demo test lint types architecture unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -51,6 +51,10 @@ unit: $(INSTALLED)
 RCLPY ?=
 rclpy-tests: $(INSTALLED)
 	$(BIN)/python tests/rclpy_suite --rclpy $(RCLPY)
+
+# docs/jobs.md is made from the models of rsltrace.job; a test fails when it is stale.
+docs: $(INSTALLED)
+	$(BIN)/python -m rsltrace.job.reference > docs/jobs.md
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py

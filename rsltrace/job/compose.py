@@ -262,7 +262,7 @@ def _merged_nodes(under: list[Item], over: list[Item], *, add_up: bool, strict: 
         same = named if len(named) == 1 and (space is None or not says_what) else exact
         if len(same) == 1 and not (add_up and says_what):
             merged = merge(nodes[same[0]], item, loc=("nodes", same[0]))
-            if "node" in item.value and item.value["node"].value is None:
+            if any(item.value[key].value is None for key in _WHAT if key in item.value):
                 del nodes[same[0]]  # `node: null` takes the node itself away
             else:
                 nodes[same[0]] = merged

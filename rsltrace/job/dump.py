@@ -36,8 +36,9 @@ def _quoted(value: Any) -> Any:
         return {_quoted(key): _quoted(item) for key, item in value.items()}
     if isinstance(value, list):
         return [_quoted(item) for item in value]
-    if isinstance(value, str) and not value.isprintable():
-        return DoubleQuotedScalarString(value)
+    if isinstance(value, str):
+        value = value.replace("$(", "\\$(")  # it is to stay as it is, not to be replaced
+        return value if value.isprintable() else DoubleQuotedScalarString(value)
     return value
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, ValidationInfo
+from pydantic import BeforeValidator, Field, ValidationInfo
 
-from rsltrace.job.part import Part, check, flag, from_file, items, text
+from rsltrace.job.part import Part, attach, check, flag, from_file, items, text
 from rsltrace.job.problems import Problem, describe
 from rsltrace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
@@ -22,8 +22,17 @@ def _module_glob(value: str) -> None:
 class SourceSpec(Part):
     """What is done about one source, and the modules (globs) that may use it all the same."""
 
-    mode: Annotated[str | None, check(text(), optional=True)] = None
-    allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = ()
+    mode: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="`virtual`: the run makes the answer; `record`: the real one is kept in the "
+        "trace; `warn`: the call is a finding; `error`: it ends the run; `allow`: nothing.",
+        examples=["warn"],
+    )
+    allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = Field(
+        default=(),
+        description="Modules, globs, that may use the source all the same.",
+        examples=[["my_robot.logging", "rerun.*"]],
+    )
 
     if TYPE_CHECKING:
 
@@ -50,13 +59,33 @@ def _source(source: Source) -> BeforeValidator:
             raise Problem(f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place)
         return {"mode": value} if isinstance(value, str) else value
 
+    mode = {"enum": valid}
+    allow = {"type": "array", "items": {"type": "string"}}
+    whole = {
+        "type": "object",
+        "properties": {"mode": mode, "allow": allow},
+        "additionalProperties": False,
+    }
+    attach(validate, schema={"anyOf": [mode, whole]})
     return BeforeValidator(validate)
+
+
+def _about(source: Source, what: str) -> Any:
+    default = DEFAULT_MODES[source].value
+    return Field(
+        default=None,
+        description=f"{what} Unless said otherwise: `{default}`.",
+        examples=[MODES[source][0].value, {"mode": "error", "allow": ["my_robot.logging"]}],
+    )
 
 
 def _state(value: object) -> object:
     if value is True or value is False or value == "record":
         return value
     raise Problem(f"expected true, false or record, got {describe(value)}")
+
+
+attach(_state, schema={"enum": [True, False, "record"]})
 
 
 class GuardSpec(Part):
@@ -67,18 +96,45 @@ class GuardSpec(Part):
     job says, or the default.
     """
 
-    enabled: Annotated[bool, check(flag)] = True
-    state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = None
-    clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = None
-    random: Annotated[SourceSpec | None, _source(Source.RANDOM)] = None
-    directory: Annotated[SourceSpec | None, _source(Source.DIRECTORY)] = None
-    file: Annotated[SourceSpec | None, _source(Source.FILE)] = None
-    environment: Annotated[SourceSpec | None, _source(Source.ENVIRONMENT)] = None
-    thread: Annotated[SourceSpec | None, _source(Source.THREAD)] = None
-    process: Annotated[SourceSpec | None, _source(Source.PROCESS)] = None
-    socket: Annotated[SourceSpec | None, _source(Source.SOCKET)] = None
-    address: Annotated[SourceSpec | None, _source(Source.ADDRESS)] = None
-    order: Annotated[SourceSpec | None, _source(Source.ORDER)] = None
+    enabled: Annotated[bool, check(flag)] = Field(
+        default=True,
+        description="`false` leaves every source as it is; `guard: false` is short for it.",
+        examples=[False],
+    )
+    state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
+        default=None,
+        description="Whether a node's state is hashed after each of its callbacks; `record` keeps "
+        "its attributes in the trace, too.",
+        examples=[True, "record"],
+    )
+    clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = _about(
+        Source.CLOCK, "Wall clocks: `time.time`, `datetime.now` and the like."
+    )
+    random: Annotated[SourceSpec | None, _source(Source.RANDOM)] = _about(
+        Source.RANDOM, "Random numbers: `random`, `numpy.random`, `os.urandom`, `uuid4`, `secrets`."
+    )
+    directory: Annotated[SourceSpec | None, _source(Source.DIRECTORY)] = _about(
+        Source.DIRECTORY, "The order of directory listings."
+    )
+    file: Annotated[SourceSpec | None, _source(Source.FILE)] = _about(
+        Source.FILE, "What files hold."
+    )
+    environment: Annotated[SourceSpec | None, _source(Source.ENVIRONMENT)] = _about(
+        Source.ENVIRONMENT, "Environment variables."
+    )
+    thread: Annotated[SourceSpec | None, _source(Source.THREAD)] = _about(
+        Source.THREAD, "Threads that are started."
+    )
+    process: Annotated[SourceSpec | None, _source(Source.PROCESS)] = _about(
+        Source.PROCESS, "Processes that are started."
+    )
+    socket: Annotated[SourceSpec | None, _source(Source.SOCKET)] = _about(Source.SOCKET, "Sockets.")
+    address: Annotated[SourceSpec | None, _source(Source.ADDRESS)] = _about(
+        Source.ADDRESS, "Addresses of objects: `id`, the default `hash` and `repr`."
+    )
+    order: Annotated[SourceSpec | None, _source(Source.ORDER)] = _about(
+        Source.ORDER, "The order of sets, which depends on hash seeds."
+    )
 
     if TYPE_CHECKING:
 
@@ -108,6 +164,7 @@ def guard_part() -> BeforeValidator:
             raise Problem("no value is given: give one, or leave the key out")
         return {"enabled": value} if isinstance(value, bool) else value
 
+    attach(validate, shorthand="enabled")
     return BeforeValidator(validate)
 
 

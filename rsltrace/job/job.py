@@ -34,23 +34,71 @@ class Job(Part):
 
     TIMES: ClassVar[dict[str, str]] = {"start": "start_ns", "construct_time": "construct_time_ns"}
 
-    nodes: Annotated[tuple[NodeSpec, ...], parts()] = ()
-    search_path: Annotated[tuple[str, ...], check(items(check_path))] = (".",)
+    nodes: Annotated[tuple[NodeSpec, ...], parts()] = Field(
+        default=(),
+        description="The nodes to run, constructed in this order.",
+        examples=[[{"node": "my_robot.ekf:EkfNode", "parameters": {"frequency": 50.0}}]],
+    )
+    search_path: Annotated[tuple[str, ...], check(items(check_path))] = Field(
+        default=(".",),
+        description="Folders in which the nodes' modules are, before Python's own path.",
+        examples=[[".", "../src"]],
+    )
     start_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None, alias="start"
+        default=None,
+        alias="start",
+        description="Simulated time at which the run starts. Without it, the time of the first "
+        "message of the bags, else 0.",
+        examples=["10s"],
     )
     construct_time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None, alias="construct_time"
+        default=None,
+        alias="construct_time",
+        description="Simulated time at which the nodes are constructed; the clock then jumps to "
+        "the start. Without it, the start.",
+        examples=["0s"],
     )
-    stop: StopSpec = StopSpec()
-    seed: Annotated[int, check(whole(0, SEED_MAX))] = 0
-    timer_ties: Annotated[Literal["creation", "heap"], check(one_of("creation", "heap"))] = (
-        "creation"
+    stop: StopSpec = Field(
+        default=StopSpec(),
+        description="What ends the run; the first condition that holds does. Without any, the end "
+        "of the bags, or that nothing is left to do.",
+        examples=[{"duration": "60s"}],
     )
-    livelock_limit: Annotated[int, check(whole(1))] = LIVELOCK_LIMIT
-    bags: Annotated[tuple[BagSpec, ...], parts("path")] = ()
-    record: RecordSpec = RecordSpec()
-    guard: Annotated[GuardSpec, guard_part()] = GuardSpec()
+    seed: Annotated[int, check(whole(0, SEED_MAX))] = Field(
+        default=0,
+        description="Seed of everything that is random in a run, each in a stream of its own.",
+        examples=[7],
+    )
+    timer_ties: Annotated[Literal["creation", "heap"], check(one_of("creation", "heap"))] = Field(
+        default="creation",
+        description="Which of the timers due at one instant comes first: in the order of "
+        "`creation`, or as in the `heap` of RSLCPP's C++ library.",
+        examples=["heap"],
+    )
+    livelock_limit: Annotated[int, check(whole(1))] = Field(
+        default=LIVELOCK_LIMIT,
+        description="How many events may follow each other without simulated time moving on "
+        "before the run ends with an error that names them.",
+        examples=[1000000],
+    )
+    bags: Annotated[tuple[BagSpec, ...], parts("path")] = Field(
+        default=(),
+        description="rosbag2 recordings (MCAP or sqlite3) to play in; a path stands for "
+        "`{path: ...}`. Messages of equal time play in the order of this list, those of one bag "
+        "in the order of the recording.",
+        examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
+    )
+    record: RecordSpec = Field(
+        default=RecordSpec(),
+        description="Which payloads the trace keeps.",
+        examples=[{"exclude": ["/camera/*"]}],
+    )
+    guard: Annotated[GuardSpec, guard_part()] = Field(
+        default=GuardSpec(),
+        description="What is done about sources of nondeterminism outside of ROS; `false` leaves "
+        "them all as they are.",
+        examples=[{"clock": "virtual", "thread": "warn"}, False],
+    )
 
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(

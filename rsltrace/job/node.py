@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
@@ -130,6 +130,25 @@ def _plain_floats(value: object) -> object:
 
 
 _KINDS = ("node", "main", "executable")
+"""What an entry may be."""
+
+_NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
+attach(
+    _check_remappings,
+    schema={
+        "type": "object",
+        "propertyNames": _NAME,
+        "additionalProperties": {"type": "string", "pattern": check_remap_to.pattern},  # type: ignore[attr-defined]
+    },
+)
+attach(
+    flatten_parameters,
+    schema={
+        "type": "object",
+        "propertyNames": {"not": {"const": "ros__parameters"}},
+        "additionalProperties": {"$ref": "#/$defs/Parameter"},
+    },
+)
 
 
 class NodeSpec(Part):
@@ -142,21 +161,69 @@ class NodeSpec(Part):
     folder.
     """
 
-    node: Annotated[Target | None, check(check_callable_target, optional=True)] = None
-    main: Annotated[Target | None, check(check_callable_target, optional=True)] = None
-    executable: Annotated[str | None, check(_check_executable, optional=True)] = None
-    name: Annotated[str | None, check(text(check_node_name), optional=True)] = None
-    namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = None
+    ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
+
+    node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="What to construct: `module:Class`, a Node subclass, or `module:function`, "
+        "which returns a node or a list of nodes. Looked for in `search_path`.",
+        examples=["my_robot.ekf:EkfNode"],
+    )
+    main: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a function that initializes rclpy, makes nodes and spins, "
+        "as `module:function`.",
+        examples=["my_robot.talker:main"],
+    )
+    executable: Annotated[str | None, check(_check_executable, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: an installed Python executable, as `ros2 run` would start "
+        "it, as `package/name`.",
+        examples=["demo_nodes_py/talker"],
+    )
+    name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
+        default=None,
+        description="Name of the node, in place of the one it gives itself.",
+        examples=["ekf"],
+    )
+    namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = Field(
+        default=None, description="Namespace of the node.", examples=["/robot1"]
+    )
     parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
-        default_factory=dict
+        default_factory=dict,
+        description="Its ROS parameters; `a: {b: 1}` and `a.b: 1` are the same. They win over "
+        "`parameter_files`.",
+        examples=[{"frequency": 50.0, "noise": {"x": 0.1, "y": 0.1}}],
     )
-    parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = ()
-    remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(default_factory=dict)
+    parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = Field(
+        default=(),
+        description="ROS parameter files, wildcards and all; later ones win.",
+        examples=[["ekf.yaml"]],
+    )
+    remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(
+        default_factory=dict,
+        description="Names of topics and services that become others, as in `--ros-args -r`.",
+        examples=[{"odom": "/husky/odom"}],
+    )
     arguments: Annotated[dict[str, Any] | tuple[str, ...], check(_check_arguments)] = Field(
-        default_factory=dict
+        default_factory=dict,
+        description="Keyword arguments of a `node`; a list of command-line words of a `main` or "
+        "an `executable`.",
+        examples=[{"robots": 3}, ["--rate", 10]],
     )
-    on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = "stop"
-    guard: Annotated[GuardSpec | None, guard_part()] = None
+    on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
+        default="stop",
+        description="What happens when a callback raises: `stop` ends the run (exit status 3); "
+        "`log` writes exception and traceback to the trace, logs an error, and goes on. A "
+        "constructor that raises always ends the run.",
+        examples=["log"],
+    )
+    guard: Annotated[GuardSpec | None, guard_part()] = Field(
+        default=None,
+        description="What is done about sources of nondeterminism in this node, where that differs "
+        "from the job's `guard`.",
+        examples=[{"random": "allow"}],
+    )
 
     if TYPE_CHECKING:
 

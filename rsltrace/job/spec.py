@@ -29,10 +29,24 @@ class BagSpec(Part):
 
     TIMES: ClassVar[dict[str, str]] = {"start_offset": "start_offset_ns"}
 
-    path: Annotated[str, check(check_path)]
-    topics: Globs = ()
-    exclude: Globs = ()
-    start_offset_ns: Annotated[int, check(parse_time)] = Field(default=0, alias="start_offset")
+    path: Annotated[str, check(check_path)] = Field(
+        description="The bag: its folder, or one `.mcap` or `.db3` file.",
+        examples=["../bags/outdoor"],
+    )
+    topics: Globs = Field(
+        default=(),
+        description="Play only these, globs in which `*` matches `/` too. Without it, all.",
+        examples=[["/imu/*", "/odom"]],
+    )
+    exclude: Globs = Field(
+        default=(), description="Do not play these, globs.", examples=[["/tf", "/camera/*"]]
+    )
+    start_offset_ns: Annotated[int, check(parse_time)] = Field(
+        default=0,
+        alias="start_offset",
+        description="Leave out so much of the beginning, from the bag's first message on.",
+        examples=["5s"],
+    )
 
     if TYPE_CHECKING:
 
@@ -57,8 +71,15 @@ class BagSpec(Part):
 class TopicStop(Part):
     """A message on topic ``name`` ends the run; its field ``exit_code`` is the exit status."""
 
-    name: Annotated[str, check(text(check_topic))]
-    exit_code: Annotated[str | None, check(text(check_field_path), optional=True)] = None
+    name: Annotated[str, check(text(check_topic))] = Field(
+        description="The topic, in full.", examples=["/done"]
+    )
+    exit_code: Annotated[str | None, check(text(check_field_path), optional=True)] = Field(
+        default=None,
+        description="Field of the message that is the exit status of `rsltrace record`. Without "
+        "it the status is 0.",
+        examples=["data"],
+    )
 
 
 class StopSpec(Part):
@@ -71,16 +92,33 @@ class StopSpec(Part):
     }
 
     duration_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None, alias="duration"
+        default=None,
+        alias="duration",
+        description="After so much simulated time, what is due then included.",
+        examples=["60s"],
     )
     time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None, alias="time"
+        default=None, alias="time", description="At this simulated time.", examples=["110s"]
     )
-    events: Annotated[int | None, check(whole(1), optional=True)] = None
-    topic: Annotated[TopicStop | None, part("name")] = None
-    function: Annotated[Target | None, check(check_callable_target, optional=True)] = None
+    events: Annotated[int | None, check(whole(1), optional=True)] = Field(
+        default=None, description="After so many events.", examples=[100000]
+    )
+    topic: Annotated[TopicStop | None, part("name")] = Field(
+        default=None,
+        description="When a message is published on a topic; its name stands for `{name: ...}`.",
+        examples=["/done", {"name": "/done", "exit_code": "data"}],
+    )
+    function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="When this function, asked between time steps with a `Progress`, returns "
+        "`True` or an integer, which is the exit status.",
+        examples=["my_robot.checks:finished"],
+    )
     quiescence_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
-        default=None, alias="quiescence"
+        default=None,
+        alias="quiescence",
+        description="When nothing has been published for so long.",
+        examples=["2s"],
     )
 
     if TYPE_CHECKING:
@@ -103,9 +141,21 @@ class StopSpec(Part):
 class RecordSpec(Part):
     """Which payloads the trace keeps. Hashes are kept in any case."""
 
-    payloads: Annotated[bool, check(flag)] = True
-    topics: Globs = ("*",)
-    exclude: Globs = ()
+    payloads: Annotated[bool, check(flag)] = Field(
+        default=True,
+        description="Whether messages are kept at all; their hashes are in any case.",
+        examples=[False],
+    )
+    topics: Globs = Field(
+        default=("*",),
+        description="Topics and services whose messages are kept, globs.",
+        examples=[["/odom", "/robot1/*"]],
+    )
+    exclude: Globs = Field(
+        default=(),
+        description="Topics and services whose messages are not kept, globs.",
+        examples=[["/camera/*"]],
+    )
 
     if TYPE_CHECKING:
 

@@ -205,7 +205,7 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
         "share": str(Path(sys.prefix, "share", "std_msgs")),
     }
     assert job.seed == 4
-    assert "$(" not in job.source_text.replace("plain: $(dirname)", "")
+    assert "$(" not in job.source_text.replace("plain: \\$(dirname)", "")
 
 
 @pytest.mark.parametrize(

@@ -8,10 +8,13 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+import jsonschema
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from ruamel.yaml import YAML
 
 from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
+from rsltrace.job.schema import job_schema
 
 names = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,8}", fullmatch=True)
 plain_names = st.from_regex(r"[A-Za-z][A-Za-z0-9]{0,8}", fullmatch=True)
@@ -82,6 +85,7 @@ jobs = st.fixed_dictionaries(
 @given(jobs)
 @settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=60)
 @example({"nodes": [NodeSpec(node="m:N", arguments={"a": {"\x85": "\u2028 \ufeff\n"}})]})
+@example({"nodes": [NodeSpec(node="m:N", parameters={"a": "$(x) \\$(y) $($(", "b": ["$(z)"]})]})
 def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "bag").touch()
@@ -92,6 +96,7 @@ def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
         assert loaded.resolved() == job.resolved()
         assert repr(loaded) == repr(job)  # also tells 1 from 1.0 and True
         assert loaded.to_yaml() == job.to_yaml()
+        jsonschema.validate(YAML(typ="safe", pure=True).load(job.to_yaml()), job_schema())
 
 
 def test_the_yaml_of_a_job_is_short_and_readable() -> None:

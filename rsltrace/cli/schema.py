@@ -1,0 +1,22 @@
+"""``rsltrace schema``: what editors need to complete and check a job file."""
+
+from __future__ import annotations
+
+import json
+
+import click
+
+
+@click.command()
+def schema() -> None:
+    """Print the JSON Schema (draft 2020-12) of a job file.
+
+    \b
+    Completion and checks in VS Code (with the YAML extension by Red Hat) and other editors:
+      rsltrace schema > job.schema.json
+    and as the first line of the job file:
+      # yaml-language-server: $schema=job.schema.json
+    """
+    from rsltrace.job.schema import job_schema
+
+    click.echo(json.dumps(job_schema(), indent=2))
