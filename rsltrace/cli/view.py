@@ -99,7 +99,7 @@ def _choose(*, exporting: bool) -> tuple[Path, ...]:
         raise TraceError(
             "there is no trace in this folder; name one, or make one with `rsltrace record`"
         )
-    if exporting or not sys.stdout.isatty():
+    if exporting or not _has_terminal():
         names = ", ".join(str(entry.path) for entry in found[:8])
         raise TraceError(f"name a trace; this folder has {names}")
     chosen = ChooseApp(found).run()
@@ -150,13 +150,19 @@ def _export(app: ViewerApp, path: Path, size: tuple[int, int], keys: list[str]) 
         raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
 
 
+def _has_terminal() -> bool:
+    """Return whether the viewer can draw: into a terminal, or into the browser that started it."""
+    return "TEXTUAL_DRIVER" in os.environ or (sys.stdin.isatty() and sys.stdout.isatty())
+
+
 def _run(app: ViewerApp) -> None:
-    if not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not _has_terminal():
         raise SetupError(
             "the viewer needs a terminal; --export writes a screen to a file, `rsltrace cat` prints"
         )
-    for name in ("COLUMNS", "LINES"):
-        os.environ.pop(name, None)  # exported by some shells; they would be believed over the tty
+    if sys.stdout.isatty():
+        for name in ("COLUMNS", "LINES"):
+            os.environ.pop(name, None)  # some shells export them; they would freeze the size
     app.run()
     if app.return_code:
         sys.exit(app.return_code)
@@ -165,9 +171,13 @@ def _run(app: ViewerApp) -> None:
 def _serve(port: int) -> None:
     """Serve this very command, without --serve, in a browser. Only this machine can reach it."""
     _check_installed("textual_serve")
-    from textual_serve.server import Server
+    from rsltrace_viewer.serve import LocalServer
 
     arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
     command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])
     click.echo(f"rsltrace view: http://127.0.0.1:{port}/ (Ctrl-C ends it)", err=True)
-    Server(command, host="127.0.0.1", port=port, title="rsltrace view").serve()
+    try:
+        LocalServer(command, port).serve()
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise OutputError(f"port {port} cannot be used: {reason}; try --port") from error

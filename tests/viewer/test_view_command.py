@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
+import json
 import shutil
 import socket
 import subprocess
 import sys
 import time
-import urllib.request
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -169,21 +170,48 @@ def test_in_a_browser_on_this_machine_only(made: Path) -> None:
     command = [sys.executable, "-m", "rsltrace", "view", str(made), "--serve", "--port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        page = ""
         for _ in range(200):
-            try:
-                with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=2) as answer:
-                    page = answer.read().decode()
+            with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
                 break
-            except OSError:
-                time.sleep(0.1)
-        assert "rsltrace view" in page
+            time.sleep(0.1)
+        asyncio.run(_browse(port))
         bound = [line for line in _listening() if f":{port:04X}" in line]
         assert bound
         assert all("0100007F" in line for line in bound)
+        second = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        assert second.returncode != 0
+        assert f"port {port} cannot be used" in second.stderr
     finally:
         server.terminate()
         server.wait(10)
+
+
+async def _browse(port: int) -> None:
+    """Do what the page does: draw what comes through the socket, send keys."""
+    import aiohttp
+
+    url = f"http://127.0.0.1:{port}/"
+    async with aiohttp.ClientSession() as browser:
+        async with browser.get(url) as answer:
+            assert "rsltrace view" in await answer.text()
+            policy = answer.headers["Content-Security-Policy"]
+            assert "default-src http://127.0.0.1" in policy  # no fonts from elsewhere
+        for stranger in ({"Origin": "http://example.org"}, {"Host": "example.org"}):
+            async with browser.get(f"{url}ws", headers=stranger) as answer:
+                assert answer.status == 403
+        async with browser.ws_connect(f"{url}ws?width=100&height=30") as page:
+            await _until(page, "/talker")
+            await page.send_str(json.dumps(["stdin", "x"]))
+            await _until(page, "too many")
+            await page.send_str(json.dumps(["stdin", "q"]))
+
+
+async def _until(page: Any, wanted: str) -> None:
+    seen = b""
+    while wanted.encode() not in seen:
+        message = await asyncio.wait_for(page.receive(), 30)
+        assert isinstance(message.data, bytes | str), message
+        seen += message.data if isinstance(message.data, bytes) else b""
 
 
 def _listening() -> list[str]:

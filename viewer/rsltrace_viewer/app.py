@@ -112,7 +112,7 @@ class ViewerApp(App[None]):
         self.timeline.focus()
         if self._start is not None:
             session.go(self._start, remember=False)
-        self.timeline.empty = _NO_EVENTS
+        self.timeline.empty = _NO_EVENTS if session.empty else ""
         self._show_header()
         self.call_after_refresh(self._after_first)
 
