@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from rsltrace.diff.report.line import Line
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
-_WIDTH = 100
+_WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 140
+_HEIGHT_MIN = 21
+_PROMPTS = 3
+"""Lines a terminal shows beside the report: the command, perhaps on two lines, and the prompt."""
 _ASCII = {ord("└"): "`-", ord("…"): "..."}
 
 
@@ -104,6 +107,11 @@ class _Tolerance(_Type):
     help="Match the messages of recordings by their order or by their log time.",
 )
 @click.option(
+    "--check",
+    is_flag=True,
+    help="First read all of both traces and check every checksum and hash.",
+)
+@click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -122,6 +130,7 @@ def diff(
     absolute: tuple[tuple[str, float], ...],
     relative: tuple[tuple[str, float], ...],
     by: str,
+    check: bool,
     output: Path | None,
 ) -> int:
     """Find where A and B first part, and why.
@@ -147,7 +156,7 @@ def diff(
         by=by,
     )
     try:
-        return _diff(golden, others, form, options, output)
+        return _diff(golden, others, form, options, output, check=check)
     except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
         raise
     except Exception:
@@ -157,13 +166,20 @@ def diff(
 
 
 def _diff(
-    golden: str, others: Sequence[str], form: str, options: DiffOptions, output: Path | None
+    golden: str,
+    others: Sequence[str],
+    form: str,
+    options: DiffOptions,
+    output: Path | None,
+    *,
+    check: bool,
 ) -> int:
     done: list[Diff | BagDiff] = []
     trouble = False
     for other in others:
         try:
-            done.append(_compare(golden, other, options))
+            # The golden trace is not checked again for each of the others.
+            done.append(_compare(golden, other, options, check=check, check_a=check and not done))
         except RsltraceError as error:
             if len(others) == 1:
                 raise
@@ -175,12 +191,14 @@ def _diff(
     return EXIT_USAGE if trouble else max(one.exit_code for one in done)
 
 
-def _compare(a: str, b: str, options: DiffOptions) -> Diff | BagDiff:
+def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool) -> Diff | BagDiff:
     from rsltrace.diff.kinds import is_recording
 
     if is_recording(a) or is_recording(b):
         if options.nodes:
             raise click.UsageError("--node needs two traces; a recording does not know the nodes")
+        if check:
+            raise click.UsageError("--check needs two traces; a recording has no hashes")
         from rsltrace.diff.bags import diff_bags
 
         return diff_bags(a, b, options)
@@ -190,6 +208,10 @@ def _compare(a: str, b: str, options: DiffOptions) -> Diff | BagDiff:
     from rsltrace.trace.reader import Trace
 
     with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
+        if check_a:
+            trace_a.check()
+        if check:
+            trace_b.check()
         return diff_traces(trace_a, trace_b, options)
 
 
@@ -205,13 +227,19 @@ def _print(
     elif form != "text":
         click.echo(render(one_or_all, form, options), nl=False)
     elif sys.stdout.isatty():
-        _show(report_lines(one_or_all, options, width=_terminal_width()))
+        width, height = _screen()
+        _show(report_lines(one_or_all, options, width=width, height=height))
     else:
         click.echo(_encodable(render(one_or_all, "text", options)), nl=False)
 
 
-def _terminal_width() -> int:
-    return min(max(shutil.get_terminal_size((_WIDTH, 40)).columns, 60), 140)
+def _screen() -> tuple[int, int]:
+    """Return width and height for a report on a terminal, with room for the prompts around it."""
+    from rsltrace.diff.report.line import HEIGHT
+
+    size = shutil.get_terminal_size((_WIDTH, HEIGHT + _PROMPTS))
+    width = min(max(size.columns, _WIDTH_MIN), _WIDTH_MAX)
+    return width, min(max(size.lines - _PROMPTS, _HEIGHT_MIN), HEIGHT)
 
 
 def _encodable(text: str) -> str:

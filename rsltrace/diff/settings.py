@@ -29,7 +29,7 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
     shown = " ".join(f"{setting.a} {setting.b}" for setting in found)
     for path, value_a, value_b in _differences("", resolved_a, resolved_b):
         key = path.rpartition(".")[2].partition("[")[0]
-        if key not in shown:
+        if key.removesuffix("_ns") not in shown:
             found.append(Setting(f"job: {path}", value_a, value_b))
     return tuple(found)
 

@@ -183,6 +183,23 @@ def test_a_corrupted_chunk_is_named(diff: Callable[..., Done], tmp_path: Path) -
     assert "Traceback" not in done.stderr
 
 
+def test_check_finds_damage_where_a_diff_does_not_look(
+    diff: Callable[..., Done], tmp_path: Path
+) -> None:
+    """Runs of the same digest are not read; who wants to know more says --check."""
+    data = bytearray(A.read_bytes())
+    data[len(data) // 2] ^= 0x10
+    (tmp_path / "bad.mcap").write_bytes(data)
+    assert diff(A, "bad.mcap").returncode == 0
+    for arguments in ((A, "bad.mcap"), ("bad.mcap", A), (A, A, "bad.mcap")):
+        done = diff(*arguments, "--check")
+        assert done.returncode == 2
+        assert "bad.mcap" in done.stderr
+        assert "damaged" in done.stderr
+    assert diff(A, B, "--check").returncode == 1
+    assert diff(A, A, "--check").returncode == 0
+
+
 def test_traces_of_different_jobs_are_said_first_and_compared(diff: Callable[..., Done]) -> None:
     done = diff(A, SAMPLES / "missing_event" / "a.mcap")
     assert done.returncode == 1
@@ -282,6 +299,18 @@ def test_colour_on_a_terminal_only() -> None:
     lines = re.sub(r"\x1b\[[0-9;]*m|\r", "", plain).splitlines()
     assert len(lines) <= 40
     assert max(len(line) for line in lines if not line.startswith(("  a ", "  b ", "next"))) <= 90
+
+
+@pytest.mark.parametrize("sample", sorted(p.parent.name for p in SAMPLES.glob("*/a.mcap")))
+def test_a_small_terminal_is_enough(sample: str) -> None:
+    pair = [str(SAMPLES / sample / f"{name}.mcap") for name in "ab"]
+    shown = on_terminal(["diff", *pair], NO_COLOR="1", COLUMNS="80", LINES="24")
+    lines = re.sub(r"\x1b\[[0-9;]*m|\r", "", shown).splitlines()
+    assert len(lines) <= 28  # what must not be left out
+    assert all(len(row) <= 80 for row in lines if not row.startswith("next: ")), lines
+    text = "\n".join(lines)
+    for needed in ("verdict: ", "cause: ", "before it", "reaches ", "next: rsltrace "):
+        assert needed in text
 
 
 def test_a_terminal_without_unicode(diff: Callable[..., Done]) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rsltrace.diff.bag_model import BagDiff
 from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.line import Line, plain_text
+from rsltrace.diff.report.line import HEIGHT, Line, plain_text
 from rsltrace.errors import TraceError
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
@@ -55,19 +55,26 @@ def render(
 
 
 def report_lines(
-    diff: Diff | BagDiff | Sequence[Diff | BagDiff], options: DiffOptions, *, width: int = 100
+    diff: Diff | BagDiff | Sequence[Diff | BagDiff],
+    options: DiffOptions,
+    *,
+    width: int = 100,
+    height: int = HEIGHT,
 ) -> list[Line]:
-    """Return the report for people as lines of styled pieces (see ``report.line``)."""
+    """Return the report for people as lines of styled pieces (see ``report.line``).
+
+    ``width`` and ``height`` are those of the screen it is to fit.
+    """
     if isinstance(diff, Diff):
         from rsltrace.diff.report.text import trace_report
 
-        return trace_report(diff, options, width)
+        return trace_report(diff, options, width, height)
     if isinstance(diff, BagDiff):
         from rsltrace.diff.report.bag_text import bag_report
 
-        return bag_report(diff, options, width)
+        return bag_report(diff, options, width, height)
     if len(diff) == 1:
-        return report_lines(diff[0], options, width=width)
+        return report_lines(diff[0], options, width=width, height=height)
     from rsltrace.diff.report.several import several_report
 
     return several_report(diff)

@@ -18,6 +18,7 @@ from rsltrace.diff.report.line import (
     COMMAND,
     FAINT,
     GOOD,
+    HEIGHT,
     NOTHING,
     SIDE_A,
     SIDE_B,
@@ -25,26 +26,28 @@ from rsltrace.diff.report.line import (
     Line,
     Piece,
     Section,
+    cut,
     fitted,
     in_columns,
     line,
+    side_lines,
     wrapped,
 )
-from rsltrace.diff.report.words import cut, field_lines, sentence_text
+from rsltrace.diff.report.words import field_lines, sentence_text
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 
-HEIGHT = 40
+_UP_TO_TIME = 5
 
 
-def bag_report(diff: BagDiff, options: DiffOptions, width: int = 100) -> list[Line]:
-    """Return the report of two recordings, at most ``HEIGHT`` lines unless all is asked for."""
+def bag_report(
+    diff: BagDiff, options: DiffOptions, width: int = 100, height: int = HEIGHT
+) -> list[Line]:
+    """Return the report of two recordings, at most ``height`` lines unless all is asked for."""
     style = BAD if diff.verdict is BagVerdict.DIFFERENT else GOOD
     head = wrapped(sentence_text(diff.sentence), width, style=style)
     sides = (("a", SIDE_A, diff.a), ("b", SIDE_B, diff.b))
-    head += [
-        cut(row, width) for row in in_columns([_side_cells(*side) for side in sides], widest=60)
-    ]
+    head += side_lines([_side_cells(*side) for side in sides], width, kept=_UP_TO_TIME)
     head.append(line(f"  verdict: {diff.verdict.value}; messages matched by {diff.by}"))
     sections = [_notes(diff, width)]
     if diff.first is not None:
@@ -58,7 +61,7 @@ def bag_report(diff: BagDiff, options: DiffOptions, width: int = 100) -> list[Li
     if diff.next_step:
         row = line(("next: ", TITLE), (printable(diff.next_step), COMMAND))
         sections.append(Section((), [row], 1, ""))
-    return fitted(head, sections, None if options.everything else HEIGHT)
+    return fitted(head, sections, None if options.everything else height)
 
 
 def _side_cells(name: str, style: str, side: Recording) -> list[Piece]:

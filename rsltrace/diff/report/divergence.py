@@ -17,12 +17,12 @@ from rsltrace.diff.report.line import (
     Line,
     Piece,
     Section,
+    cut,
     in_columns,
     line,
     wrapped,
 )
 from rsltrace.diff.report.words import (
-    cut,
     event_cells,
     event_key,
     event_text,

@@ -9,6 +9,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 
+from rsltrace.model.printable import shortened
+
 PLAIN = ""
 TITLE = "title"
 GOOD = "good"
@@ -17,6 +19,12 @@ SIDE_A = "a"
 SIDE_B = "b"
 FAINT = "faint"
 COMMAND = "command"
+
+HEIGHT = 40
+"""Lines of a report unless more is asked for, or the terminal says otherwise."""
+
+_PATH_LEAST = 20
+"""Characters of a path that stay: enough to tell the files of one folder apart."""
 
 Piece = tuple[str, str]
 """(text, style)"""
@@ -69,6 +77,57 @@ def in_columns(
     return lines
 
 
+def side_lines(rows: Sequence[Sequence[Piece]], width: int, *, kept: int) -> list[Line]:
+    """Return what is said of the two files, one line each: name, path, then facts.
+
+    Where that is wider than ``width``, first what both end with goes, then the beginning of the
+    paths, then what is behind the first ``kept`` cells.
+    """
+
+    def columns(cells: Sequence[Sequence[Piece]]) -> tuple[list[Line], int]:
+        lines = in_columns(cells, widest=60)
+        return lines, max(map(_length, lines)) - width
+
+    lines, over = columns(rows)
+    if over > 0 and rows[0][-1] == rows[-1][-1]:
+        rows = [row[:-1] for row in rows]
+        lines, over = columns(rows)
+    if over > 0:
+        room = max(max(len(row[1][0]) for row in rows) - over, _PATH_LEAST)
+        rows = [[row[0], (_ending(row[1][0], room), row[1][1]), *row[2:]] for row in rows]
+        lines, over = columns(rows)
+    least = max(map(_length, in_columns([row[:kept] for row in rows], widest=60)))
+    return [cut(row, max(width, least)) for row in lines]
+
+
+def _length(row: Line) -> int:
+    return len("".join(text for text, _ in row).rstrip())
+
+
+def _ending(path: str, room: int) -> str:
+    return path if len(path) <= room else "…" + path[len(path) - room + 1 :]
+
+
+def cut(row: Line, width: int) -> Line:
+    """Return a line without what is beyond ``width``; an ellipsis marks the cut."""
+    length = sum(len(text) for text, _ in row)
+    if length <= width:
+        return row
+    pieces: list[Piece] = []
+    room = width
+    for text, style in row:
+        if len(text) >= room:
+            pieces.append((shortened(text, room) if len(text) > room else text, style))
+            if len(text) > room:
+                break
+        else:
+            pieces.append((text, style))
+        room -= len(text)
+        if room <= 0:
+            break
+    return line(*pieces)
+
+
 @dataclass(slots=True)
 class Section:
     """Some lines under a title that may be shortened when space is short.
@@ -97,7 +156,8 @@ class Section:
         """Return the lines, a blank one first."""
         if not self.height:
             return []
-        more = [line((f"  … {self.hidden} more {self.noun}", FAINT))] if self.hidden else []
+        noun = self.noun if self.hidden != 1 else _singular(self.noun)
+        more = [line((f"  … {self.hidden} more {noun}", FAINT))] if self.hidden else []
         gap = {"first": 0, "middle": (len(self.rows) + 1) // 2}.get(self.drop, len(self.rows))
         rows = [*self.rows[:gap], *more, *self.rows[gap:]]
         return [BLANK, *([self.title] if self.title else []), *rows]
@@ -110,6 +170,10 @@ class Section:
         """Leave out the row that matters least."""
         self.rows.pop({"first": 0, "middle": len(self.rows) // 2}.get(self.drop, -1))
         self.hidden += 1
+
+
+def _singular(noun: str) -> str:
+    return noun[:-3] + "y" if noun.endswith("ies") else noun.removesuffix("s")
 
 
 NOTHING = Section((), [], 0, "")

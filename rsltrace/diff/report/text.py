@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.model import Diff, Divergence, Side
+from itertools import takewhile
+
+from rsltrace.diff.model import Diff, Divergence, Setting, Side
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 from rsltrace.diff.report.line import (
@@ -11,6 +13,7 @@ from rsltrace.diff.report.line import (
     COMMAND,
     FAINT,
     GOOD,
+    HEIGHT,
     NOTHING,
     SIDE_A,
     SIDE_B,
@@ -18,23 +21,27 @@ from rsltrace.diff.report.line import (
     Line,
     Piece,
     Section,
+    cut,
     fitted,
     in_columns,
     line,
+    side_lines,
     wrapped,
 )
-from rsltrace.diff.report.words import cut, sentence_text
+from rsltrace.diff.report.words import sentence_text
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 
-HEIGHT = 40
-"""Lines of a report unless more is asked for: what fits a screen."""
+_UP_TO_DIGEST = 5
 _SENTENCE_LINES = 3
+_ALIKE_SHOWN = 12
 _ALL_HINT = "--all shows them"
 
 
-def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Line]:
-    """Return the report of two traces, at most ``HEIGHT`` lines unless ``options.everything``."""
+def trace_report(
+    diff: Diff, options: DiffOptions, width: int = 100, height: int = HEIGHT
+) -> list[Line]:
+    """Return the report of two traces, at most ``height`` lines unless ``options.everything``."""
     head = _head(diff, width)
     hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
     # First what else to know of the comparison: that the jobs are different ones, or a file cut.
@@ -50,7 +57,7 @@ def trace_report(diff: Diff, options: DiffOptions, width: int = 100) -> list[Lin
     ]
     if not options.everything:
         # Whoever asks for a longer context wants to see it.
-        height = HEIGHT + 2 * max(options.context - CONTEXT, 0)
+        height += 2 * max(options.context - CONTEXT, 0)
         return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
     lines = fitted(head, [*sections, _next(first, 0)], None)
     for number, other in enumerate(others, start=2):
@@ -82,7 +89,7 @@ def _head(diff: Diff, width: int) -> list[Line]:
         lines = lines[:_SENTENCE_LINES]
         lines[-1] = line((lines[-1][0][0][: width - 1] + "…", style))
     sides = [("a", SIDE_A, diff.a), ("b", SIDE_B, diff.b)]
-    lines += in_columns([_side_cells(*side) for side in sides], widest=60)
+    lines += side_lines([_side_cells(*side) for side in sides], width, kept=_UP_TO_DIGEST)
     if not diff.identical:
         agree = f"the first {diff.agreeing} events agree"
         if diff.agreeing < 2:
@@ -142,19 +149,25 @@ def _settings(diff: Diff, width: int) -> Section:
         [
             [
                 (printable(setting.place), ""),
-                (_value(setting.a, room), SIDE_A),
+                (a, SIDE_A),
                 ("|", FAINT),
-                (_value(setting.b, room), SIDE_B),
+                (b, SIDE_B),
             ]
             for setting in diff.settings
+            for a, b in [_values(setting, room)]
         ],
         widest=max(room, 34),
     )
     return Section(line(("job and environment differ", TITLE)), rows, 2, "settings")
 
 
-def _value(text: str | None, room: int) -> str:
-    return "-" if text is None else shortened(printable(text.strip()), room)
+def _values(setting: Setting, room: int) -> tuple[str, str]:
+    """Return both values in ``room`` characters each: of long ones, what differs."""
+    a, b = ("-" if v is None else printable(v.strip()) for v in (setting.a, setting.b))
+    alike = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
+    if max(len(a), len(b)) > room and alike > _ALIKE_SHOWN:
+        a, b = (f"…{text[alike - _ALIKE_SHOWN :]}" for text in (a, b))
+    return shortened(a, room), shortened(b, room)
 
 
 def _notes(notes: list[str], width: int) -> Section:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rsltrace.diff.model import EntityKey, EventView, FieldDifference, MessageDifference
-from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, in_columns, line
+from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, cut, in_columns
 from rsltrace.model.event import EventFlag, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
@@ -137,23 +137,3 @@ def _element_rows(found: FieldDifference) -> list[list[Piece]]:
         return rows
     texts = [f"[{place}] {a} | {b}" for place, a, b in found.first]
     return [[(f"  {',  '.join(texts)}", "")]]
-
-
-def cut(row: Line, width: int) -> Line:
-    """Return a line without what is beyond ``width``; an ellipsis marks the cut."""
-    length = sum(len(text) for text, _ in row)
-    if length <= width:
-        return row
-    pieces: list[Piece] = []
-    room = width
-    for text, style in row:
-        if len(text) >= room:
-            pieces.append((shortened(text, room) if len(text) > room else text, style))
-            if len(text) > room:
-                break
-        else:
-            pieces.append((text, style))
-        room -= len(text)
-        if room <= 0:
-            break
-    return line(*pieces)
