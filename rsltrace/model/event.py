@@ -57,6 +57,7 @@ class OutputKind(IntEnum):
     GUARD = 8
     TASK = 9
     SHUTDOWN = 10
+    DRAW = 11
 
     @property
     def label(self) -> str:

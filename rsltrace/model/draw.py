@@ -1,0 +1,50 @@
+"""What chance decided, as one number that a trace holds in place of an output's hash.
+
+The upper 8 bits say what, the lower 56 how many nanoseconds. It is no hash: a reader gets the
+value back, so that a diff can name it.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from rsltrace.model.stamp import format_duration
+
+_SHIFT = 56
+_VALUE_MAX = (1 << _SHIFT) - 1
+
+
+class Draw(IntEnum):
+    """What was decided. The numbers are part of the trace format."""
+
+    DELAY = 1
+    DROP = 2
+    BURST = 3
+    OUTAGE = 4
+    DUPLICATE = 5
+    EXECUTION = 6
+
+
+_WORDS = {
+    Draw.DROP: "lost",
+    Draw.BURST: "lost in a burst",
+    Draw.OUTAGE: "lost in an outage",
+}
+
+
+def encode_draw(kind: int, value_ns: int = 0) -> int:
+    """Return the number for a decision."""
+    return (kind << _SHIFT) | min(value_ns, _VALUE_MAX)
+
+
+def draw_text(number: int) -> str:
+    """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
+    kind, value_ns = number >> _SHIFT, number & _VALUE_MAX
+    try:
+        draw = Draw(kind)
+    except ValueError:
+        return f"draw of kind {kind}: {value_ns}"
+    if draw in _WORDS:
+        return _WORDS[draw]
+    names = {Draw.DELAY: "delay", Draw.DUPLICATE: "second copy after", Draw.EXECUTION: "takes"}
+    return f"{names[draw]} {format_duration(value_ns)}"
