@@ -179,9 +179,12 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
     return measured
 
 
-def run_rsltrace(graph: Graph, callbacks: int, folder: Path, *, record: bool) -> dict[str, Any]:
+def run_rsltrace(
+    graph: Graph, callbacks: int, folder: Path, *, record: bool, delayed: bool = False
+) -> dict[str, Any]:
     """Run ``graph`` for about ``callbacks`` events under rsltrace, in ``folder``.
 
+    ``delayed`` gives every link a random delay, shorter than any period.
     Returns ``{"callbacks": n, "wall_s": s, "cpu_s": s, "digest": d, "bytes": size}``; the times
     are those of the whole run, with construction. Raises ImportError if rsltrace cannot record.
     """
@@ -190,7 +193,10 @@ def run_rsltrace(graph: Graph, callbacks: int, folder: Path, *, record: bool) ->
     from rsltrace import record as record_job
 
     job_path = folder / "job.yaml"
-    job_path.write_text(json.dumps(graph.job(callbacks)))  # JSON is YAML
+    job = graph.job(callbacks)
+    if delayed:
+        job["delay"] = {"default": {"uniform": {"min": "10us", "max": "90us"}}}
+    job_path.write_text(json.dumps(job))  # JSON is YAML
     output = folder / "run.mcap" if record else None
     start, cpu_start = perf_counter(), process_time()
     result = record_job(load_job(job_path), output=output, force=True)

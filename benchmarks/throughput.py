@@ -30,13 +30,23 @@ from typing import Any
 
 from graphs import EXECUTORS, GRAPHS, run_native, run_rsltrace
 
-RSLTRACE_MODES = {"rsltrace": False, "rsltrace_recorded": True}
+# Mode: whether the run is recorded, and whether every link has a delay.
+RSLTRACE_MODES = {
+    "rsltrace": (False, False),
+    "rsltrace_delayed": (False, True),
+    "rsltrace_recorded": (True, False),
+    "rsltrace_recorded_delayed": (True, True),
+}
+DELAYED = {plain: f"{plain}_delayed" for plain in ("rsltrace", "rsltrace_recorded")}
+DELAYED_AIM = 1.3
 TITLES = {
     "single_threaded": "SingleThreadedExecutor over DDS",
     "multi_threaded": "MultiThreadedExecutor over DDS",
     "events_executor": "EventsExecutor over DDS",
     "rsltrace": "rsltrace, nothing recorded",
     "rsltrace_recorded": "rsltrace, everything recorded",
+    "rsltrace_delayed": "same, a random delay on every link",
+    "rsltrace_recorded_delayed": "same, a random delay on every link",
 }
 AIMS = (
     # (slower case, faster case, how many times faster it is meant to be)
@@ -117,7 +127,8 @@ def work(name: str, amount: float, folder: Path) -> dict[str, Any]:
     graph = GRAPHS[graph_name]
     try:
         if mode in RSLTRACE_MODES:
-            return run_rsltrace(graph, int(amount), folder, record=RSLTRACE_MODES[mode])
+            record, delayed = RSLTRACE_MODES[mode]
+            return run_rsltrace(graph, int(amount), folder, record=record, delayed=delayed)
         return run_native(graph, mode, amount)
     except ImportError as error:
         return {"problem": f"not available: {error}", UNAVAILABLE: True}
@@ -161,6 +172,11 @@ def ratios(cases: list[Case]) -> list[dict[str, Any]]:
             if all(name in medians for name in names):
                 pair = {"graph": graph, "slow": slow, "fast": fast, "aim": aim}
                 found.append(pair | compare(*names))
+        for plain, delayed in DELAYED.items():
+            names = f"{graph}/{delayed}", f"{graph}/{plain}"
+            if all(name in medians for name in names):
+                pair = {"graph": graph, "slow": delayed, "fast": plain, "most": DELAYED_AIM}
+                found.append(pair | compare(*names))
     for mode in RSLTRACE_MODES:
         few, many = f"graph8/{mode}", f"graph200/{mode}"
         if few in medians and many in medians:
@@ -199,6 +215,12 @@ def print_table(cases: list[Case]) -> None:
                 f"{each['graph']}: {TITLES[each['fast']]} is {each['x']:.1f} times as fast as "
                 f"{TITLES[each['slow']]} (aim {each['aim']:g}: {verdict}; "
                 f"by CPU time {each['cpu_x']:.1f})"
+            )
+        elif "most" in each:
+            verdict = "kept" if each["x"] <= each["most"] else "missed"
+            print(
+                f"{each['graph']}: delays cost {each['x']:.2f} of {TITLES[each['fast']]} "
+                f"(at most {each['most']:g}: {verdict}; by CPU time {each['cpu_x']:.2f})"
             )
         else:
             print(

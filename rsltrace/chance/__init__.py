@@ -1,4 +1,4 @@
-"""Everything that is random in a simulation, reproducible to the bit: streams, distributions, links.
+"""Everything random in a simulation, reproducible to the bit: streams, distributions, links.
 
 No numpy and no ``math`` functions whose last bit differs between platforms: uniform numbers come
 from a counter-based stream, and everything else from them by additions, multiplications, divisions

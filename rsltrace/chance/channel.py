@@ -1,7 +1,8 @@
 """One way from a sender to a receiver: how long a message takes, whether it arrives, in what order.
 
 ``Model`` describes, ``Channel`` is one link's state in a run. Each purpose (delay, drop, burst,
-duplicate, the delay of the copy) has a stream of its own, so that switching one on does not change what others draw.
+duplicate, the delay of the copy) has a stream of its own, so that switching one on does not change
+what others draw.
 """
 
 from __future__ import annotations

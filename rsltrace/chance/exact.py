@@ -31,7 +31,7 @@ def log(x: float) -> float:
 
 
 def exp(x: float) -> float:
-    """Return e to the power of ``x`` (|x| up to 700), by Taylor's series of the reduced argument."""
+    """Return e to the power of ``x`` (|x| up to 700), by Taylor's series of what is left of it."""
     exponent = int(x * _LOG2_E + (0.5 if x >= 0.0 else -0.5))
     rest = (x - exponent * _LN2_HIGH) - exponent * _LN2_LOW
     total = 1.0

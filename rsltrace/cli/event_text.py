@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.errors import TraceError
+from rsltrace.model.draw import draw_text
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, EventFlag, Output, OutputKind
 from rsltrace.model.printable import printable
@@ -63,6 +64,8 @@ class EventText:
         if kind is OutputKind.EXCEPTION:
             lines = (self._trace.detail(output) or "").strip().splitlines()
             return printable(f"exception {lines[-1] if lines else ''}").rstrip()
+        if kind is OutputKind.DRAW:
+            return f"{draw_text(output.hash)} ({self._nodes.get(output.entity, name)})"
         if kind is OutputKind.ENTITY:
             entity = self._trace.entities.get(output.entity)
             return f"new {entity.kind.label} {name}" if entity else f"new {name}"
@@ -116,6 +119,8 @@ class EventJson:
             "hash": f"{output.hash:016x}",
             "sequence": output.sequence if kept else None,
         }
+        if output.kind is OutputKind.DRAW:
+            result["text"] = draw_text(output.hash)
         if output.kind is OutputKind.LOG and kept:
             result["level"], result["text"] = _log(self._trace, output)
         found = self._trace.payload(output) if kept and self._wants_payload(output) else None

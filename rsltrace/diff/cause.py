@@ -21,6 +21,7 @@ NODE = "node"
 REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
 
 UNDECIDED = -1
+_DRAW = int(OutputKind.DRAW)
 
 _REMEMBERED_MAX = 50_000
 _DEPTH_MAX = 100
@@ -243,7 +244,10 @@ class Cone:
         return (NODE, by_node) if by_node is not None else (None, None)
 
     def _passes_on(self, mark: Mark, rows: Rows, at: int, item: Item) -> bool:
-        """Whether the difference of a cause is one that the event it caused can have got."""
+        """Whether the difference of a cause is one that the event it caused can have got.
+
+        A message that is the same may still have had another delay.
+        """
         cause = mark.item
         if cause.a < 0 or cause.b < 0:
             return True
@@ -259,6 +263,9 @@ class Cone:
         other = b if rows is a else a
         outputs = rows.outputs(mine)
         if nth >= len(outputs):
+            return True
+        receiver = rows.number[at - rows.first]
+        if any(o[:2] == (_DRAW, receiver) for o in self._different_outputs(cause)):
             return True
         # Of equal outputs, the second has a counterpart only if the other run sent two.
         sent = outputs[nth][:3]
@@ -278,10 +285,12 @@ class Cone:
             if self._inverted_in[owner] >= 2:
                 self._taint(owner, mark)
             return
-        self._taint(owner, mark)
+        outputs = self._different_outputs(item)
+        if not outputs or any(output[0] != _DRAW for output in outputs):
+            self._taint(owner, mark)  # what chance decides on the way leaves the sender as it was
         found = self.found[mark.root]
         stamp = self._stretch.stamp(item)
-        for kind, number, _, _ in self._different_outputs(item):
+        for kind, number, _, _ in outputs:
             if kind == OutputKind.ENTITY:  # the node may be one that only this run has
                 self._taint(rows.run.identity.nodes[number], mark)
             elif kind in REACHING:

@@ -65,6 +65,7 @@ ROOT_OF = {
     Verdict.MISSING: Root.MISSING,
     Verdict.EXTRA: Root.EXTRA,
     Verdict.EXCEPTION: Root.EXCEPTION,
+    Verdict.DRAW: Root.DRAW,
     Verdict.GRAPH: Root.JOB,
     Verdict.ENVIRONMENT: Root.JOB,
 }
@@ -89,6 +90,9 @@ def judge(case: Case) -> Judgement:
         return _different_input(case, a, b)
     if case.cause_only:
         return _another_cause(case, a, b)
+    draws = [m for m in case.messages if m.kind is OutputKind.DRAW]
+    if draws and all(m.kind is OutputKind.DRAW for m in case.messages):
+        return _draw(case, a, b, draws)
     return _same_input(case, a, b)
 
 
@@ -234,6 +238,22 @@ def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
     )
     why = "two equal messages were delivered in another order"
     return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, why, a, b)
+
+
+def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDifference]) -> Judgement:
+    first = draws[0]
+    was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("", "")
+    sentence = (
+        f"{phrase(a)} {at(a.stamp_ns)} did the same in both runs, but chance decided otherwise: "
+        f"{first.topic}: {was_a or 'nothing'} in a, {was_b or 'nothing'} in b"
+    )
+    if len(draws) > 1:
+        sentence += f" (and {len(draws) - 1} more)"
+    why = _because_of_settings(case.settings) or (
+        "job and seed are the same as far as the traces tell, so the stream of this link had been "
+        "drawn from a different number of times before"
+    )
+    return Judgement(Verdict.DRAW, Root.DRAW, sentence, why, a, b)
 
 
 def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from rsltrace.diff.fields import diff_messages, preview
-from rsltrace.diff.model import EventView, MessageDifference
+from rsltrace.diff.model import EventView, FieldDifference, MessageDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.outputs import matched_outputs
 from rsltrace.diff.rows import OutputRow, Run, outputs_of
 from rsltrace.diff.views import output_text
 from rsltrace.errors import TraceError
+from rsltrace.model.draw import draw_text
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable, shortened
@@ -113,6 +114,9 @@ class _Evidence:
         )
         if reason or kind == OutputKind.ENTITY:
             return base
+        if kind == OutputKind.DRAW:
+            text_a, text_b = (draw_text(output[2]) if output else "" for output in (a, b))
+            return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
         values: list[object] = []
         for run, output in ((self._run_a, a), (self._run_b, b)):
             if output is None:

@@ -25,6 +25,8 @@ class Verdict(Enum):
     ENDED_EARLY = "ended-early"
     RAN_LONGER = "ran-longer"
     EXCEPTION = "exception"
+    DRAW = "draw"
+    """What chance decided about a message: its delay, whether it is lost."""
     GRAPH = "graph"
     ENVIRONMENT = "environment"
 
@@ -41,6 +43,8 @@ class Root(Enum):
     MISSING = "missing"
     EXTRA = "extra"
     EXCEPTION = "exception"
+    DRAW = "draw"
+    """A delay, a loss or an execution time was drawn differently."""
     JOB = "job"
     """Parameters, seed, code: the constructor already behaved differently."""
     UNKNOWN = "unknown"

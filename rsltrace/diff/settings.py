@@ -42,7 +42,8 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         of_b = b.environment if record is None else b.metadata(record)
         for name in sorted({*of_a, *of_b}):
             if of_a.get(name) != of_b.get(name):
-                found.append(Setting(f"{label} {name}", of_a.get(name), of_b.get(name)))
+                place = name.replace("file:", "file ") if name[:5] == "file:" else f"{label} {name}"
+                found.append(Setting(place, of_a.get(name), of_b.get(name)))
     return tuple(found)
 
 

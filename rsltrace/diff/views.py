@@ -18,6 +18,7 @@ COUNTED_MAX = 8192
 """Events up to here are told which of their entity's events they are. Counting takes reading."""
 
 _SUMMARY_OUTPUTS_MAX = 4
+_DRAW = int(OutputKind.DRAW)
 _SEGMENTS_BACK = 2
 
 
@@ -74,7 +75,8 @@ class Viewer:
 
     def summary(self, outputs: list[OutputRow]) -> str:
         """Return outputs as a short text: ``/t1, call /s1``."""
-        texts = [output_text(self._run.identity.keys[n], kind) for kind, n, _, _ in outputs]
+        keys = self._run.identity.keys
+        texts = [output_text(keys[n], kind) for kind, n, _, _ in outputs if kind != _DRAW]
         if len(texts) > _SUMMARY_OUTPUTS_MAX:
             texts[_SUMMARY_OUTPUTS_MAX:] = [f"{len(texts) - _SUMMARY_OUTPUTS_MAX} more"]
         return ", ".join(texts)
@@ -119,6 +121,8 @@ def output_text(key: EntityKey, kind: int) -> str:
         return f"reply {key.name}"
     if kind == OutputKind.ENTITY:
         return f"new {key.kind} {key.name}"
+    if kind == OutputKind.DRAW:
+        return f"{key.kind} {key.name} of {key.node}"
     if kind in (OutputKind.LOG, OutputKind.EXCEPTION, OutputKind.SHUTDOWN):
         return OutputKind(kind).label
     return f"{OutputKind(kind).label} {key.name}"

@@ -9,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from rsltrace.job.delay import DelaysSpec
+from rsltrace.job.distribution import files_of
 from rsltrace.job.guard import GuardSpec, guard_part
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, check, items, one_of, parts, text, whole
-from rsltrace.job.problems import Problem, Problems
+from rsltrace.job.problems import Loc, Problem, Problems
 from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TimeLike
 from rsltrace.job.times import format_time, parse_time
 
@@ -99,6 +101,15 @@ class Job(Part):
         "them all as they are.",
         examples=[{"clock": "virtual", "thread": "warn"}, False],
     )
+    livelock_limit: Annotated[int, check(whole(1))] = LIVELOCK_LIMIT
+    bags: Annotated[tuple[BagSpec, ...], parts("path")] = ()
+    record: RecordSpec = RecordSpec()
+    guard: Annotated[GuardSpec, guard_part()] = GuardSpec()
+    delay: DelaysSpec | None = Field(
+        default=None,
+        description="How long messages take, which are lost, and who is cut off when.",
+        examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
+    )
 
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(
@@ -128,6 +139,7 @@ class Job(Part):
             bags: Sequence[BagSpec | dict[str, Any] | str] = (),
             record: RecordSpec | dict[str, Any] = ...,
             guard: GuardSpec | dict[str, Any] | bool = ...,
+            delay: DelaysSpec | dict[str, Any] | None = None,
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,
@@ -164,6 +176,10 @@ class Job(Part):
         from rsltrace.job.dump import job_resolved
 
         return job_resolved(self)
+
+    def model_files(self) -> Iterator[tuple[Loc, str]]:
+        """Yield (place in the job, path) of the files that its delays come from."""
+        yield from files_of(self.delay, ("delay",))
 
     @model_validator(mode="after")
     def _check_whole(self) -> Job:
@@ -225,6 +241,11 @@ class Job(Part):
                 if not path.is_file():
                     what = "is not a file" if path.exists() else "there is no such parameter file"
                     yield Problem(f"{file!r}: {what}", ("nodes", index, "parameter_files", number))
+        for place, file in self.model_files():
+            path = self.resolve(file)
+            if not path.is_file():
+                what = "is not a file" if path.exists() else "there is no such file"
+                yield Problem(f"{file!r}: {what}", place)
         for index, bag in enumerate(self.bags):
             if not self.resolve(bag.path).exists():
                 yield Problem(f"{bag.path!r}: there is no such bag", ("bags", index, "path"))

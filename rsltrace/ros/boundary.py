@@ -28,7 +28,13 @@ from rsltrace.ros.interfaces import type_hash
 from rsltrace.ros.lifecycle import StateMachineHandle
 from rsltrace.ros.node import NodeHandle
 from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.ros.qos_events import EventHandle, IncompatibleQosStatus, MatchedStatus
+from rsltrace.ros.qos_events import EventHandle
+from rsltrace.ros.qos_status import (
+    CountStatus,
+    IncompatibleQosStatus,
+    LivelinessChangedStatus,
+    MatchedStatus,
+)
 from rsltrace.ros.services import (
     ClientHandle,
     RequestId,
@@ -46,9 +52,7 @@ _PASSED_THROUGH = (
     "ClockChange ClockType GoalEvent QoSCheckCompatibleResult QoSCompatibility "
     "RCUTILS_LOG_SEVERITY SignalHandlerOptions TransitionCallbackReturnType rcl_duration_t "
     "rcl_publisher_event_type_t rcl_subscription_event_type_t rcl_time_point_t "
-    "rmw_incompatible_type_status_t rmw_liveliness_changed_status_t rmw_liveliness_lost_status_t "
-    "rmw_message_lost_status_t rmw_offered_deadline_missed_status_t rmw_qos_policy_kind_t "
-    "rmw_qos_profile_t rmw_requested_deadline_missed_status_t service_introspection "
+    "rmw_incompatible_type_status_t rmw_qos_policy_kind_t rmw_qos_profile_t service_introspection "
     "RCL_DEFAULT_DOMAIN_ID RMW_DURATION_INFINITE RMW_QOS_DEADLINE_BEST_AVAILABLE "
     "RMW_QOS_LIVELINESS_LEASE_DURATION_BEST_AVAILABLE "
     # exceptions
@@ -91,6 +95,10 @@ class Boundary:
         self.rmw_service_info_t = ServiceInfo
         self.rmw_matched_status_t = MatchedStatus
         self.rmw_requested_qos_incompatible_event_status_t = IncompatibleQosStatus
+        self.rmw_liveliness_changed_status_t = LivelinessChangedStatus
+        for name in ("liveliness_lost", "message_lost", "offered_deadline_missed"):
+            setattr(self, f"rmw_{name}_status_t", CountStatus)
+        self.rmw_requested_deadline_missed_status_t = CountStatus
         for name, feature in _LATER.items():
             setattr(self, name, partial(_unsupported, feature))
 

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.entity_handle import EntityHandle
     from rsltrace.ros.executor import SimExecutor
     from rsltrace.ros.graph import Graph
+    from rsltrace.ros.links import Network
     from rsltrace.ros.logs import Logs
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.tasks import TaskRun
@@ -50,7 +51,8 @@ _pack_value = struct.Struct("<Bq").pack
 class Core:
     """The state of one simulated ROS world.
 
-    ``recorder`` is None in a run that records nothing. ``current_*`` describe the event under way.
+    ``recorder`` is None in a run that records nothing, ``network`` in one without delay models.
+    ``current_*`` describe the event under way; what it sends leaves ``busy_ns`` later.
     """
 
     def __init__(self, loop: EventLoop, *, base_dir: Path, seed: int = 0) -> None:
@@ -62,6 +64,8 @@ class Core:
         self.base_dir = base_dir
         self.graph: Graph
         self.executor: SimExecutor
+        self.network: Network | None = None
+        self.busy_ns = 0
         self.current_node: NodeHandle | None = None
         self.current_entity = 0
         self.current_handle: Dispatchable | None = None

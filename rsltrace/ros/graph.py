@@ -78,12 +78,14 @@ class Graph:
             subscription.publishers.remove(publisher)
             subscription.events.matched(-1)
         publisher.subscriptions = []
+        if publisher.links is not None:
+            publisher.links.clear()
 
     def remove_subscription(self, subscription: SubscriptionHandle) -> None:
         """Disconnect a subscription."""
         self._subscriptions[subscription.topic].remove(subscription)
         for publisher in subscription.publishers:
-            publisher.subscriptions.remove(subscription)
+            publisher.disconnect(subscription)
             publisher.events.matched(-1)
         subscription.publishers = []
 
@@ -109,9 +111,7 @@ class Graph:
             publisher.events.incompatible(policy)
             subscription.events.incompatible(policy)
             return
-        # Keep fan-out in the creation order of the subscriptions.
-        publisher.subscriptions.append(subscription)
-        publisher.subscriptions.sort(key=lambda s: s.entity_id)
+        publisher.connect(subscription)
         subscription.publishers.append(publisher)
         publisher.events.matched(+1)
         subscription.events.matched(+1)

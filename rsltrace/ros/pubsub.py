@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import EntityKind
@@ -12,12 +13,13 @@ from rsltrace.ros.entity_handle import EntityHandle, Receiver, callback_name
 from rsltrace.ros.groups import begin
 from rsltrace.ros.interfaces import schema_text, type_hash
 from rsltrace.ros.qos import Durability, Qos
-from rsltrace.ros.qos_events import EndpointEvents
+from rsltrace.ros.qos_status import EndpointEvents
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
 from rsltrace.trace.chain import hash64
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
+    from rsltrace.ros.links import Link
     from rsltrace.ros.node import NodeHandle
 
 _SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
@@ -31,7 +33,8 @@ Delivery = tuple[bytes, int, int, int, int, int, int]
 class PublisherHandle(EntityHandle):
     """Stands in for ``_rclpy.Publisher``.
 
-    ``subscriptions`` are the connected ones in creation order.
+    ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job
+    with delay models, and are None in others.
     """
 
     kind = EntityKind.PUBLISHER
@@ -50,7 +53,8 @@ class PublisherHandle(EntityHandle):
         self.qos: Qos = profile.resolved(publisher=True, peers=peers)
         super().__init__(core, node)
         self.subscriptions: list[SubscriptionHandle] = []
-        self.events: EndpointEvents = EndpointEvents(core, self)
+        self.links: list[Link] | None = None if core.network is None else []
+        self.events: EndpointEvents = EndpointEvents()
         self._count = 0
         self._channel: int | None = None
         self._watcher = core.watchers.get(self.topic)
@@ -89,13 +93,17 @@ class PublisherHandle(EntityHandle):
             )
         delivery = (data, loop.events, position, digest, now_ns, self._count, now_ns)
         loop.activity_ns = now_ns
-        ready = loop.ready
-        for subscription in self.subscriptions:
-            subscription.queue.append(delivery)
-            if subscription.wrapper is not None:
-                ready.append(subscription)
-            else:
-                subscription.find_wrapper()
+        if self.links is not None:
+            for link in self.links:
+                link.send(delivery)
+        else:
+            ready = loop.ready
+            for subscription in self.subscriptions:
+                subscription.queue.append(delivery)
+                if subscription.wrapper is not None:
+                    ready.append(subscription)
+                else:
+                    subscription.find_wrapper()
         if self._history is not None:
             self._history.append(delivery)
         if self._watcher is not None:
@@ -105,8 +113,26 @@ class PublisherHandle(EntityHandle):
         """Give a late joiner what it asks for and this publisher kept."""
         if self._history and subscription.qos.durability is Durability.TRANSIENT_LOCAL:
             kept = list(self._history)
+            give: Callable[[Delivery], None] = subscription.deliver
+            if self.links is not None:
+                give = next(link for link in self.links if link.subscription is subscription).send
             for delivery in kept[-subscription.qos.keep :] if subscription.qos.keep else kept:
-                subscription.deliver(delivery)
+                give(delivery)
+
+    def connect(self, subscription: SubscriptionHandle) -> None:
+        """Send to this subscription, too; fan-out is in the creation order of subscriptions."""
+        self.subscriptions.append(subscription)
+        self.subscriptions.sort(key=_by_age)
+        if self.links is not None:
+            assert self.core.network is not None
+            self.links.append(self.core.network.link(self, subscription))
+            self.links.sort(key=lambda link: link.subscription.entity_id)
+
+    def disconnect(self, subscription: SubscriptionHandle) -> None:
+        """Send to this subscription no longer."""
+        self.subscriptions.remove(subscription)
+        if self.links is not None:
+            self.links = [link for link in self.links if link.subscription is not subscription]
 
     def _open_channel(self) -> int:
         self._channel = self.core.channel(
@@ -162,7 +188,7 @@ class SubscriptionHandle(Receiver):
         super().__init__(core, node)
         self.queue: deque[Delivery] = deque(maxlen=self.qos.keep)
         self.publishers: list[PublisherHandle] = []
-        self.events: EndpointEvents = EndpointEvents(core, self)
+        self.events: EndpointEvents = EndpointEvents()
         self._callback: Any = None
         self._coroutine = False
         self._with_info = False
@@ -224,6 +250,10 @@ class SubscriptionHandle(Receiver):
     def _destroy(self) -> None:
         self.core.graph.remove_subscription(self)
         self.queue.clear()
+
+
+def _by_age(endpoint: SubscriptionHandle) -> int:
+    return endpoint.entity_id
 
 
 def _message_info(delivery: Delivery) -> dict[str, int | None]:

@@ -1,104 +1,46 @@
-"""QoS events of publishers and subscriptions: matched, and incompatible QoS.
-
-Deadline, liveliness, lifespan and lost messages depend on time; their handles exist and never
-become ready.
-"""
+"""The handles of QoS events: callbacks that run when a status of an endpoint has news."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.ros.entity_handle import EntityHandle, callback_name
 from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.qos_status import (
+    DEADLINE_MISSED,
+    INCOMPATIBLE,
+    LIVELINESS_CHANGED,
+    LIVELINESS_LOST,
+    MATCHED,
+    MESSAGE_LOST,
+    EndpointEvents,
+)
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
-    from rsltrace.ros.qos import PolicyKind
 
 _QOS_EVENT = int(EventKind.QOS_EVENT)
 
 
-@dataclass
-class MatchedStatus:
-    """Stands in for ``rmw_matched_status_t``."""
-
-    total_count: int = 0
-    total_count_change: int = 0
-    current_count: int = 0
-    current_count_change: int = 0
-
-
-@dataclass
-class IncompatibleQosStatus:
-    """Stands in for ``rmw_requested_qos_incompatible_event_status_t``."""
-
-    total_count: int = 0
-    total_count_change: int = 0
-    last_policy_kind: int = 1
-
-
-@dataclass
-class EndpointEvents:
-    """The statuses of one endpoint, and the event handles that want to hear of them."""
-
-    core: Core
-    endpoint: PublisherHandle | SubscriptionHandle
-    handles: dict[str, EventHandle] = field(default_factory=dict)
-    match: MatchedStatus = field(default_factory=MatchedStatus)
-    mismatch: IncompatibleQosStatus = field(default_factory=IncompatibleQosStatus)
-
-    def matched(self, change: int) -> None:
-        """Count a peer that came (+1) or went (-1)."""
-        self.match.current_count += change
-        self.match.current_count_change += change
-        if change > 0:
-            self.match.total_count += change
-            self.match.total_count_change += change
-        self._notify("matched")
-
-    def incompatible(self, policy: PolicyKind) -> None:
-        """Count a peer whose QoS does not fit."""
-        self.mismatch.total_count += 1
-        self.mismatch.total_count_change += 1
-        self.mismatch.last_policy_kind = int(policy)
-        self._notify("incompatible")
-
-    def _notify(self, name: str) -> None:
-        handle = self.handles.get(name)
-        if handle is not None:
-            handle.trigger()
-
-    def news(self, name: str) -> bool:
-        """Return whether there is something to take."""
-        if name == "matched":
-            return bool(self.match.total_count_change or self.match.current_count_change)
-        return name == "incompatible" and bool(self.mismatch.total_count_change)
-
-    def take(self, name: str) -> Any:
-        """Return the status and forget its changes; None if there is nothing new."""
-        if not self.news(name):
-            return None
-        if name == "matched":
-            match = self.match
-            taken = MatchedStatus(**vars(match))
-            match.total_count_change = match.current_count_change = 0
-            return taken
-        taken_mismatch = IncompatibleQosStatus(**vars(self.mismatch))
-        self.mismatch.total_count_change = 0
-        return taken_mismatch
+_NAMES = {
+    "MATCHED": MATCHED,
+    "INCOMPATIBLE_QOS": INCOMPATIBLE,
+    "DEADLINE_MISSED": DEADLINE_MISSED,
+    "LIVELINESS_CHANGED": LIVELINESS_CHANGED,
+    "LIVELINESS_LOST": LIVELINESS_LOST,
+    "MESSAGE_LOST": MESSAGE_LOST,
+}
 
 
 def _event_name(event_type: Any) -> str:
     name: str = event_type.name
-    if name.endswith("_MATCHED"):
-        return "matched"
-    if name.endswith("_INCOMPATIBLE_QOS"):
-        return "incompatible"
+    for ending, ours in _NAMES.items():
+        if name.endswith(ending):
+            return ours
     return name.lower()
 
 

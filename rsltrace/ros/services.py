@@ -191,7 +191,11 @@ class ServiceHandle(_End):
         client = request_id.client
         if not client._destroyed:
             info = ServiceInfo(request_id, self.core.loop.now_ns)
-            client.deliver((data, self.core.loop.events, position, digest, info))
+            exchange = (data, self.core.loop.events, position, digest, info)
+            if self.core.network is None:
+                client.deliver(exchange)
+            else:
+                self.core.network.exchange(client, self, "response", exchange)
         if self._events is not None:
             self._tell(RESPONSE_SENT, request_id, response)
 
@@ -231,8 +235,13 @@ class ClientHandle(_End):
             _REQUEST, PREFIX_REQUEST, self._request, self._srv_type.Request, data
         )
         header = ServiceInfo(RequestId(self, self._sequence), self.core.loop.now_ns)
+        exchange = (data, self.core.loop.events, position, digest, header)
+        network = self.core.network
         for server in self.core.graph.services(self.service):
-            server.deliver((data, self.core.loop.events, position, digest, header))
+            if network is None:
+                server.deliver(exchange)
+            else:
+                network.exchange(self, server, "request", exchange)
         if self._events is not None:
             self._tell(REQUEST_SENT, header.request_id, request)
         return self._sequence

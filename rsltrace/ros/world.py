@@ -14,6 +14,7 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.chance.network import NetworkPlan
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.model.event import EventKind
@@ -23,6 +24,7 @@ from rsltrace.ros.blocking import end_blocked, simulated_waiting
 from rsltrace.ros.boundary import Boundary, installed
 from rsltrace.ros.core import Core
 from rsltrace.ros.graph import Graph
+from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.tasks import poll
 
@@ -99,6 +101,10 @@ class World:
             traceback.clear_frames(self.core.error.__cause__.__traceback__)
         self.nodes.clear()
         gc.collect()
+
+    def use_network(self, plan: NetworkPlan) -> None:
+        """Give what nodes send delays and losses. Before the first node is made."""
+        self.core.network = Network(self.core, plan)
 
     # -- the stages of a run ---------------------------------------------------------------------
 

@@ -45,9 +45,11 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 
 def sources(job: Job) -> dict[str, str]:
-    """Return a hash of the code of every module loaded from the job's search path, by name."""
+    """Return a hash of the code of every module loaded from the job's search path, by name; and of
+    the files that its models come from (``file:`` and the path in the job)."""
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     modules = user_modules(folders)
+    modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in modules.items()
     }

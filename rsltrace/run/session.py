@@ -22,6 +22,7 @@ from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.bags import check_bag_types, open_bag_of, start_ns_of, start_players
 from rsltrace.run.guarding import entry_key, guarding
+from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
 from rsltrace.run.stopping import end_ns_of, stop_conditions
@@ -126,6 +127,9 @@ class Session:
         self.world = world = stack.enter_context(
             World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
+        plan = network_plan(job, self.start_ns)
+        if plan is not None:
+            world.use_network(plan)
         self._guarded.begin(world.core)
         with self._guarded.engaged():
             loop.stop_conditions = tuple(
