@@ -105,7 +105,8 @@ def test_a_worker_that_dies_is_reported_by_its_last_words(
 def test_the_command_lists_and_filters_its_cases() -> None:
     command = [sys.executable, str(BENCHMARKS / "throughput.py"), "--list", "--only", "graph200"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == ["graph200/rsltrace", "graph200/rsltrace_recorded"]
+    modes = ("rsltrace", "rsltrace_delayed", "rsltrace_recorded", "rsltrace_recorded_delayed")
+    assert done.stdout.split() == [f"graph200/{mode}" for mode in modes]
     nothing = subprocess.run(
         [*command[:-1], "no such case"], capture_output=True, text=True, check=False
     )
