@@ -8,9 +8,9 @@ from typing import Annotated, Any, ClassVar
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from rsltrace.job.node import check_path
-from rsltrace.job.part import Part, check, from_file, items, one_of, positive_time
+from rsltrace.job.part import Part, attach, check, from_file, items, one_of, positive_time
 from rsltrace.job.problems import Loc, Problem, Problems, describe
-from rsltrace.job.times import UNITS_NS, parse_time
+from rsltrace.job.times import TIME_SCHEMA, UNITS_NS, parse_time
 
 SAMPLE_UNITS = tuple(UNITS_NS)
 
@@ -29,7 +29,11 @@ def number(least: float, most: float | None = None, *, open_below: bool = False)
             )
         return float(value)
 
-    return function
+    schema: dict[str, object] = {"type": "number"}
+    schema["exclusiveMinimum" if open_below else "minimum"] = least
+    if most is not None:
+        schema["maximum"] = most
+    return attach(function, schema=schema)
 
 
 def shorthand(key: str) -> BeforeValidator:
@@ -40,7 +44,7 @@ def shorthand(key: str) -> BeforeValidator:
             raise Problem("no value is given: give one, or leave the key out")
         return expand(value, key)
 
-    return BeforeValidator(validate)
+    return BeforeValidator(attach(validate, shorthand=key))
 
 
 def expand(value: object, key: str) -> object:
@@ -67,7 +71,7 @@ def named(key: str, rule: Callable[[str], None]) -> BeforeValidator:
             raise Problems(problems)
         return {name: expand(value, key) for name, value in values.items()}
 
-    return BeforeValidator(validate)
+    return BeforeValidator(attach(validate, value_shorthand=key))
 
 
 class UniformSpec(Part):
@@ -182,6 +186,9 @@ def _check_point(value: object) -> tuple[int, int]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
         raise Problem("expected a pair: [time since the start, value]")
     return parse_time(value[0]), parse_time(value[1])
+
+
+attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 2, "maxItems": 2})
 
 
 class SeriesSpec(Part):

@@ -101,10 +101,6 @@ class Job(Part):
         "them all as they are.",
         examples=[{"clock": "virtual", "thread": "warn"}, False],
     )
-    livelock_limit: Annotated[int, check(whole(1))] = LIVELOCK_LIMIT
-    bags: Annotated[tuple[BagSpec, ...], parts("path")] = ()
-    record: RecordSpec = RecordSpec()
-    guard: Annotated[GuardSpec, guard_part()] = GuardSpec()
     delay: DelaysSpec | None = Field(
         default=None,
         description="How long messages take, which are lost, and who is cut off when.",

@@ -164,6 +164,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "livelock_limit": 100_000,
         "bags": [],
         "record": {"payloads": True, "topics": ["*"], "exclude": []},
+        "delay": None,
         "guard": {
             "enabled": True,
             "state": "false",
