@@ -15,7 +15,6 @@ files are in the page cache. They are kept in the temporary folder for the next 
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
 import tempfile
@@ -55,22 +54,31 @@ def traces(count: int) -> list[tuple[str, Path, Path]]:
     return [(name, paths["same"], path) for name, path in paths.items()]
 
 
+LAUNCHER = """
+import os, sys, time
+for _ in range(int(sys.argv[1])):
+    start = time.perf_counter()
+    process = os.posix_spawn(sys.executable, [sys.executable, *sys.argv[2:]], os.environ,
+        file_actions=[(os.POSIX_SPAWN_OPEN, 1, os.devnull, os.O_WRONLY, 0)])
+    _, status, usage = os.wait4(process, 0)
+    seconds = time.perf_counter() - start
+    cpu = usage.ru_utime + usage.ru_stime
+    print(os.waitstatus_to_exitcode(status), seconds, cpu, usage.ru_maxrss / 1024)
+"""
+"""Starts a command some times. It is small: a process counts the memory of the one it came from."""
+
+
 def run_diff(a: Path, b: Path) -> tuple[float, float, float]:
     """Return the seconds of ``rsltrace diff`` as a process, its CPU seconds (the best of some
     tries each) and its peak in MB."""
-    command = [sys.executable, "-m", "rsltrace", "diff", str(a), str(b)]
-    best, cpu, peak = float("inf"), float("inf"), 0.0
-    for _ in range(_TRIES):
-        start = time.perf_counter()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-        _, status, usage = os.wait4(process.pid, 0)
-        best = min(best, time.perf_counter() - start)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        cpu = min(cpu, usage.ru_utime + usage.ru_stime)
-        peak = max(peak, usage.ru_maxrss / 1024)
-        if process.returncode not in (0, 1):
-            raise SystemExit(f"{' '.join(command)} failed")
-    return best, cpu, peak
+    command = ["-m", "rsltrace", "diff", str(a), str(b)]
+    launch = [sys.executable, "-S", "-c", LAUNCHER, str(_TRIES), *command]
+    done = subprocess.run(launch, stdout=subprocess.PIPE, text=True, check=True)
+    tries = [[float(cell) for cell in row.split()] for row in done.stdout.splitlines()]
+    if any(status not in (0, 1) for status, *_ in tries):
+        raise SystemExit(f"rsltrace diff {a} {b} failed")
+    _, seconds, cpu, peak = zip(*tries, strict=True)
+    return min(seconds), min(cpu), max(peak)
 
 
 def read_linearly(a: Path, b: Path, topics: list[str] | None) -> float:

@@ -142,8 +142,8 @@ def diff(
     FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
     topics and a colon. A tolerance never makes two traces identical.
 
-    The exit status is 0 if nothing differs (recordings: also within tolerance), 1 if the runs part,
-    2 for trouble.
+    The exit status is 0 if nothing differs, 1 if the runs part, 2 for trouble, 3 if they are equal
+    within tolerance and not identical.
     """
     options = DiffOptions(
         context=context,
@@ -188,7 +188,9 @@ def _diff(
             trouble = True
     if done:
         _print(done, form, options, output)
-    return EXIT_USAGE if trouble else max(one.exit_code for one in done)
+    from rsltrace.diff.model import exit_code_of_several
+
+    return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
 
 
 def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool) -> Diff | BagDiff:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from rsltrace.diff.model import FieldDifference
+from rsltrace.diff.model import EXIT_PARTED, EXIT_WITHIN_TOLERANCE, FieldDifference
 
 
 class BagVerdict(Enum):
@@ -110,7 +110,7 @@ class LoneTopic:
 
 @dataclass(frozen=True, slots=True)
 class BagDiff:
-    """The answer for two recordings. ``exit_code``: 0 equal (also within tolerance), 1 different.
+    """The answer for two recordings. ``exit_code``: 0 equal, 1 different, 3 within tolerance.
 
     ``topics`` are those that both sides have, in the order of a; ``first`` is the earliest
     divergence of all of them, counted from the start of each recording (with ``--by stamp``: by
@@ -135,6 +135,18 @@ class BagDiff:
         return self.verdict is BagVerdict.EQUAL
 
     @property
+    def within_tolerance(self) -> bool:
+        """Whether messages differ, but none by more than is tolerated."""
+        return self.verdict is BagVerdict.WITHIN_TOLERANCE
+
+    @property
+    def parted(self) -> bool:
+        """Whether some message differs by more than is tolerated, is missing or is extra."""
+        return self.verdict is BagVerdict.DIFFERENT
+
+    @property
     def exit_code(self) -> int:
-        """0 equal, also within tolerance; 1 different; trouble is raised instead."""
-        return 1 if self.verdict is BagVerdict.DIFFERENT else 0
+        """0 equal, 1 different, 3 equal within tolerance; trouble is raised instead."""
+        if self.parted:
+            return EXIT_PARTED
+        return EXIT_WITHIN_TOLERANCE if self.within_tolerance else 0

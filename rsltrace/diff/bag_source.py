@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +17,12 @@ from rsltrace.bag import open_bag
 from rsltrace.diff.cut_off import CutOffFile, is_cut_off
 from rsltrace.diff.kinds import is_trace
 from rsltrace.errors import RsltraceError, TraceError
-from rsltrace.trace.format import PREFIX_OWN, SCHEMA_ENCODING
+from rsltrace.trace.format import (
+    PREFIX_OWN,
+    PREFIX_REQUEST,
+    PREFIX_RESPONSE,
+    SCHEMA_ENCODING,
+)
 
 if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
@@ -92,9 +97,16 @@ def _trace_source(path: str | os.PathLike[str]) -> Source:
     from rsltrace.trace.reader import Trace
 
     trace = Trace.open(os.fspath(path))
+    return replace(source_of(trace, services=False), close=trace.close)
+
+
+def source_of(trace: Trace, *, services: bool) -> Source:
+    """Return the messages of an open trace, with or without requests and responses."""
     topics_by_name: dict[str, SourceTopic] = {}
     for channel in trace.channels.values():
-        if not channel.topic.startswith(PREFIX_OWN):
+        own = channel.topic.startswith(PREFIX_OWN)
+        service = channel.topic.startswith((PREFIX_REQUEST, PREFIX_RESPONSE))
+        if not own or (services and service):
             topic = SourceTopic(channel.topic, channel.type, channel.schema_text)
             topics_by_name.setdefault(channel.topic, topic)
     topics = tuple(topics_by_name.values())
@@ -105,11 +117,11 @@ def _trace_source(path: str | os.PathLike[str]) -> Source:
                 yield stamp_ns, number, data
 
     return Source(
-        path=os.fspath(path),
+        path=trace.name,
         kind="trace",
         topics=topics,
         read=read,
-        close=trace.close,
+        close=lambda: None,
         complete=trace.complete,
         notes=_payload_notes(trace),
     )

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import shlex
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -26,13 +26,14 @@ from rsltrace.diff.bag_model import (
     Recording,
     TopicDiff,
 )
-from rsltrace.diff.bag_source import Source, SourceTopic, open_source
+from rsltrace.diff.bag_source import Source, SourceTopic, open_source, source_of
 from rsltrace.diff.content import ContentKeys
 from rsltrace.diff.globs import FieldRules
 from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
 from rsltrace.errors import TraceError
 from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.reader import Trace
 
 
 @dataclass(slots=True)
@@ -57,6 +58,13 @@ def diff_bags(
     options = options or DiffOptions()
     with open_source(a) as source_a, open_source(b) as source_b:
         return _Comparison(source_a, source_b, options).run()
+
+
+def compare_messages(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
+    """Compare all messages, requests and responses of two traces; those of one time belong
+    together. Reads all of both. Raises TraceError where they are damaged."""
+    options = replace(options, by=BY_STAMP, topics=(), nodes=())
+    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
 class _Comparison:

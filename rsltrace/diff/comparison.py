@@ -15,6 +15,7 @@ from rsltrace.diff.rows import Run
 from rsltrace.diff.settings import entity_settings, environment_settings, job_settings
 from rsltrace.diff.stretches import EqualRun, Item, Stretch, Stretches
 from rsltrace.diff.tally import Tally
+from rsltrace.diff.tolerance import messages_within
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10
@@ -66,6 +67,7 @@ class _Comparison:
             aligned_to=self._aligned_to,
             bytes_read=self._a.bytes_read + self._b.bytes_read,
             notes=tuple(self._notes),
+            tolerance=messages_within(self._a, self._b, self._start, self._options),
         )
 
     def _sentence(self, first: Divergence) -> str:

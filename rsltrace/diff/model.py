@@ -6,10 +6,19 @@ unsigned 64-bit. A report must be able to print a ``Diff`` without opening the f
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
+from typing import TYPE_CHECKING
 
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
+
+if TYPE_CHECKING:
+    from rsltrace.diff.bag_model import BagDiff
+
+EXIT_PARTED = 1
+EXIT_WITHIN_TOLERANCE = 3
+"""Neither identical (0) nor parted (1), and not what others use for trouble (2)."""
 
 
 class Verdict(Enum):
@@ -228,12 +237,14 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Diff:
-    """The answer. ``exit_code``: 0 identical, 1 diverged (also "equal within tolerance").
+    """The answer. ``exit_code``: 0 identical, 1 diverged, 3 equal within tolerance.
 
     ``verdict`` and ``sentence`` are those of the first divergence. ``agreeing`` is how many events
     are the same before it. ``settings`` lists what differs in job and environment. ``counts`` and
     ``resync_index`` (indexes in a and b from which on the runs agree again, if they do) cover the
     events from the divergence to ``aligned_to`` (indexes in a and b; all of both with ``--all``).
+    ``tolerance`` compares all messages of both runs, if tolerances were given and no event is
+    missing, extra or at another time; else it is None.
     """
 
     a: Side
@@ -248,6 +259,7 @@ class Diff:
     aligned_to: tuple[int, int] = (0, 0)
     bytes_read: int = 0
     notes: tuple[str, ...] = field(default=())
+    tolerance: BagDiff | None = None
 
     @property
     def identical(self) -> bool:
@@ -255,6 +267,24 @@ class Diff:
         return self.verdict is Verdict.IDENTICAL
 
     @property
+    def within_tolerance(self) -> bool:
+        """Whether the runs are not identical, but every message is within what is tolerated."""
+        return self.tolerance is not None and not self.tolerance.parted
+
+    @property
+    def parted(self) -> bool:
+        """Whether the runs did not do the same, and not even within tolerance."""
+        return self.exit_code == EXIT_PARTED
+
+    @property
     def exit_code(self) -> int:
-        """0 identical, 1 diverged; trouble is raised instead."""
-        return 0 if self.identical else 1
+        """0 identical, 1 diverged, 3 equal within tolerance; trouble is raised instead."""
+        if self.identical:
+            return 0
+        return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_PARTED
+
+
+def exit_code_of_several(codes: Iterable[int]) -> int:
+    """Return the worst: parted, then within tolerance, then identical."""
+    found = set(codes)
+    return next((code for code in (EXIT_PARTED, EXIT_WITHIN_TOLERANCE) if code in found), 0)

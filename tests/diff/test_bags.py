@@ -208,7 +208,7 @@ def test_tolerances(compare: Any) -> None:
     b = points(30, **{f"x{i}": i + 1e-6 for i in range(10, 30)})
     diff = compare(a, b, DiffOptions(absolute=(("point.*", 1e-5),)))
     assert diff.verdict is BagVerdict.WITHIN_TOLERANCE
-    assert diff.exit_code == 0
+    assert diff.exit_code == 3
     assert not diff.identical
     assert diff.first is None
     assert counts(diff) == (10, 20, 0, 0, 0)

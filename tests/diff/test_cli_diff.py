@@ -56,10 +56,24 @@ def test_exit_status_1_for_runs_that_part(diff: Callable[..., Done]) -> None:
 
 def test_a_tolerance_never_makes_traces_identical(diff: Callable[..., Done]) -> None:
     done = diff(A, B, "--abs", "*=1e-9")
-    assert done.returncode == 1
+    assert done.returncode == 3
     assert "equal within tolerance, not identical: the digests differ" in done.stdout
     assert json.loads(diff(A, B, "--abs", "*=1e-9", "--format", "json").stdout)["within_tolerance"]
-    assert "equal within" not in diff(A, B, "--abs", "*=1e-30").stdout
+    done = diff(A, B, "--abs", "*=1e-30")
+    assert done.returncode == 1
+    assert "equal within" not in done.stdout
+    assert diff(A, A, "--abs", "*=1e-9").returncode == 0
+    assert diff(A, A, B, "--abs", "*=1e-9").returncode == 3
+
+
+def test_tolerance_at_the_divergence_is_not_enough(diff: Callable[..., Done]) -> None:
+    done = diff(A, B, "--abs", "/push:*=1e-9")
+    assert done.returncode == 1
+    assert "not within tolerance: the messages first part on /cmd_vel" in done.stdout
+    other = SAMPLES / "missing_event"
+    done = diff(other / "a.mcap", other / "b.mcap", "--abs", "*=1e9", "--ignore", "*")
+    assert done.returncode == 1, "an event that is missing is covered by nothing"
+    assert "tolera" not in done.stdout
 
 
 def test_formats(diff: Callable[..., Done], tmp_path: Path) -> None:
@@ -240,7 +254,7 @@ def test_a_trace_and_a_recording(diff: Callable[..., Done], tmp_path: Path, stor
     assert content["first"]["topic"] == "/push"
     assert [one["path"] for one in content["first"]["fields"]] == ["x"]
     done = diff(B, bag, "--abs", "*=1e-9")
-    assert done.returncode == 0
+    assert done.returncode == 3
     assert "equal within tolerance, not identical" in done.stdout
     dropped = bag_of(A, tmp_path / "dropped", storage, drop=10)
     done = diff(bag, dropped, "--topic", "/scan")

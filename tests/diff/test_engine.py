@@ -316,10 +316,32 @@ def test_a_dropped_message_names_where_it_came_from(tmp_path: Path) -> None:
 def test_ignored_fields_leave_the_verdict(tmp_path: Path) -> None:
     """Two digests are never made identical."""
     diff = compare(tmp_path, Fault("bit", step(20, 1)), ignore=("data",))
-    assert diff.exit_code == 1
+    assert diff.exit_code == 3
+    assert not diff.identical
+    assert diff.within_tolerance
+    assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     (message,) = diff.divergences[0].messages
     assert message.fields == ()
     assert "ignored" in message.reason
+
+
+@pytest.mark.parametrize("kind", ["drop", "extra", "swap", "late", "raise", "state"])
+def test_a_tolerance_covers_messages_and_nothing_else(tmp_path: Path, kind: str) -> None:
+    fault = {
+        "late": Fault("late", step(20, 0), delay_ns=MS),
+        "swap": Fault("swap", step(20, 1), 1),
+    }.get(kind, Fault(kind, step(20, 1)))
+    diff = compare(tmp_path, fault, ignore=("*",), absolute=(("*", 1e30),))
+    if kind == "state":  # only what is published is another number
+        assert diff.within_tolerance
+    else:
+        assert (diff.exit_code, diff.tolerance) == (1, None), diff.sentence
+
+
+def test_what_was_not_recorded_is_within_no_tolerance(tmp_path: Path) -> None:
+    storage = Storage(payloads=False)
+    diff = compare(tmp_path, Fault("bit", step(20, 1)), storage=storage, ignore=("*",))
+    assert (diff.exit_code, diff.tolerance) == (1, None)
 
 
 def test_equal_messages_from_other_senders(tmp_path: Path) -> None:

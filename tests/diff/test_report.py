@@ -222,7 +222,9 @@ def tolerated() -> Diff:
         OutputKind.MESSAGE, "/points", SCAN_TYPE, 0, "both", 1, 2, close, more_fields=4
     )
     found = dataclasses.replace(base.divergences[0], messages=(message,))
-    return dataclasses.replace(base, divergences=(found,), notes=(), settings=())
+    return dataclasses.replace(
+        base, divergences=(found,), notes=(), settings=(), tolerance=equal_within_tolerance()
+    )
 
 
 def recordings() -> BagDiff:
@@ -482,18 +484,35 @@ def test_verdicts_are_documented() -> None:
         assert f"`{verdict.value}`" in text, verdict
 
 
-def test_tolerance_is_said_but_does_not_change_the_exit_status() -> None:
+def test_tolerance_is_said_and_has_its_own_exit_status() -> None:
     text = render(tolerated(), "text")
     assert "equal within tolerance, not identical" in text
-    assert tolerated().exit_code == 1
+    assert tolerated().exit_code == equal_within_tolerance().exit_code == 3
     assert "equal within tolerance" not in render(nondeterministic(), "text")
-    found = tolerated().divergences[0]
-    coarse = dataclasses.replace(found.messages[0], fields=ALL_FIELDS[:1])
-    both = dataclasses.replace(found, messages=(*found.messages, coarse))
-    partly = dataclasses.replace(tolerated(), divergences=(both,))
-    assert "equal within tolerance" not in render(partly, "text")
+    # what is tolerated where the runs part may have grown later
+    partly = dataclasses.replace(tolerated(), tolerance=recordings())
+    assert partly.exit_code == 1
+    text = render(partly, "text")
+    assert "equal within tolerance" not in text
+    assert "not within tolerance: the messages first part on /odom" in " ".join(text.split())
     assert json.loads(render(tolerated(), "json"))["within_tolerance"] is True
-    assert "::notice" in render(equal_within_tolerance(), "github")
+    for near in (tolerated(), equal_within_tolerance()):
+        assert "::notice" in render(near, "github")
+        assert "<failure" not in render(near, "junit")
+
+
+def test_the_exit_status_of_several_is_the_worst() -> None:
+    def status(*runs: Diff | BagDiff) -> int:
+        content = json.loads(render(list(runs), "json"))
+        assert isinstance(content["exit_code"], int)
+        return content["exit_code"]
+
+    assert status(identical(), tolerated(), nondeterministic()) == 1
+    assert status(identical(), tolerated()) == 3
+    assert status(identical(), identical()) == 0
+    assert "All 2 runs agree with runs/run1.mcap, 1 of them within tolerance." in render(
+        [identical(), tolerated()]
+    )
 
 
 def test_unknown_format_and_nothing_to_report() -> None:

@@ -13,8 +13,7 @@ from enum import Enum
 from typing import Any
 
 from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import Diff, EntityKey, EventView
-from rsltrace.diff.report.text import within_tolerance
+from rsltrace.diff.model import Diff, EntityKey, EventView, exit_code_of_several
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 
@@ -29,12 +28,11 @@ def as_json(diff: Diff | BagDiff) -> dict[str, Any]:
     result = {"format": FORMAT, "version": VERSION, "kind": kind, **_fields(diff)}
     result["identical"] = diff.identical
     result["exit_code"] = diff.exit_code
+    result["within_tolerance"] = diff.within_tolerance
     if isinstance(diff, Diff):
-        result["within_tolerance"] = within_tolerance(diff)
+        result["tolerance"] = None if diff.tolerance is None else as_json(diff.tolerance)
         result["resync_index"] = _sides(diff.resync_index)
         result["aligned_to"] = _sides(diff.aligned_to)
-    else:
-        result["within_tolerance"] = diff.verdict.value == "equal-within-tolerance"
     return result
 
 
@@ -45,7 +43,7 @@ def several_as_json(diffs: Sequence[Diff | BagDiff]) -> dict[str, Any]:
         "version": VERSION,
         "kind": "several",
         "golden": diffs[0].a.path,
-        "exit_code": max(diff.exit_code for diff in diffs),
+        "exit_code": exit_code_of_several(diff.exit_code for diff in diffs),
         "runs": [as_json(diff) for diff in diffs],
     }
 

@@ -11,7 +11,7 @@ from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
-from rsltrace.diff.report.text import trace_report, within_tolerance
+from rsltrace.diff.report.text import trace_report
 from rsltrace.diff.report.words import sentence_text
 from rsltrace.model.printable import printable
 
@@ -20,7 +20,7 @@ _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 
 def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a JUnit test suite with one test case per comparison."""
-    failures = sum(diff.exit_code != 0 for diff in diffs)
+    failures = sum(diff.parted for diff in diffs)
     counts = f'tests="{len(diffs)}" failures="{failures}" errors="0" skipped="0"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites {counts}>"]
     lines.append(f'  <testsuite name="rsltrace diff" {counts}>')
@@ -28,7 +28,7 @@ def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         name = _attribute(f"{diff.b.path} agrees with {diff.a.path}")
         lines.append(f'    <testcase classname="rsltrace.diff" name={name}>')
         report = _xml(plain_text(_report(diff, options)))
-        if diff.exit_code:
+        if diff.parted:
             lines.append(
                 f"      <failure type={_attribute(diff.verdict.value)} "
                 f"message={_attribute(_message(diff))}>{report}</failure>"
@@ -44,9 +44,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return workflow commands: an error per comparison that failed, a notice per other one."""
     lines = []
     for diff in diffs:
-        level = "error" if diff.exit_code else "notice"
+        level = "error" if diff.parted else "notice"
         title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
-        text = plain_text(_report(diff, options)) if diff.exit_code else _message(diff)
+        text = plain_text(_report(diff, options)) if diff.parted else _message(diff)
         file = _property(printable(diff.a.path))
         lines.append(f"::{level} file={file},title={_property(printable(title))}::{_data(text)}")
         if isinstance(diff, Diff):
@@ -64,7 +64,7 @@ def _report(diff: Diff | BagDiff, options: DiffOptions) -> list[tuple[tuple[str,
 
 
 def _message(diff: Diff | BagDiff) -> str:
-    tolerated = isinstance(diff, Diff) and within_tolerance(diff)
+    tolerated = isinstance(diff, Diff) and diff.within_tolerance
     return sentence_text(diff.sentence) + (
         " Equal within tolerance, not identical." if tolerated else ""
     )

@@ -11,7 +11,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, several_cells
-from rsltrace.diff.report.text import trace_report, within_tolerance
+from rsltrace.diff.report.text import trace_report
 from rsltrace.diff.report.words import distance_text, message_title, sentence_text
 from rsltrace.model.printable import printable, shortened
 
@@ -27,7 +27,7 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
     lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(sentence_text(diff.sentence)), ""]
     lines += _sides(diff)
     lines += _fields(diff)
-    if diff.exit_code or not diff.identical:
+    if not diff.identical:
         report = (
             trace_report(diff, options) if isinstance(diff, Diff) else bag_report(diff, options)
         )
@@ -38,7 +38,7 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
 
 def several_markdown(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a table of all runs, and below it those that part."""
-    parted = [diff for diff in diffs if diff.exit_code]
+    parted = [diff for diff in diffs if diff.parted]
     verdict = f"{len(parted)} of {len(diffs)} runs part" if parted else "all runs agree"
     lines = [f"### rsltrace: {verdict}", "", f"Golden: {_code_span(diffs[0].a.path)}", ""]
     lines += _table(COLUMNS, [several_cells(diff) for diff in diffs])
@@ -53,7 +53,7 @@ def _heading(diff: Diff | BagDiff) -> str:
         return "identical" if isinstance(diff, Diff) else "equal"
     if isinstance(diff, BagDiff):
         return diff.verdict.value
-    tolerated = " (equal within tolerance, not identical)" if within_tolerance(diff) else ""
+    tolerated = " (equal within tolerance, not identical)" if diff.within_tolerance else ""
     return f"the runs part: {diff.verdict.value}{tolerated}"
 
 

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from rsltrace.diff.bag_model import BagDiff
 from rsltrace.diff.model import Diff
 from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
-from rsltrace.diff.report.text import within_tolerance
 from rsltrace.diff.report.words import event_text
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
@@ -32,7 +31,7 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
         return path, diff.verdict.value, "", "", ""
     found = diff.divergences[0]
     event = found.b or found.a
-    verdict = f"{diff.verdict.value}{' (within tolerance)' if within_tolerance(diff) else ''}"
+    verdict = f"{diff.verdict.value}{' (within tolerance)' if diff.within_tolerance else ''}"
     if event is None:
         return path, verdict, str(diff.agreeing), "", ""
     return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
@@ -43,20 +42,22 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
 
     Nothing in it is cut: it is made to be read by ``grep`` and ``awk``, too.
     """
-    parted = sum(diff.exit_code != 0 for diff in diffs)
+    parted = sum(diff.parted for diff in diffs)
     golden = printable(diffs[0].a.path)
     if parted:
         sentence = f"{parted} of {len(diffs)} runs part from {golden}."
     else:
-        sentence = f"All {len(diffs)} runs agree with {golden}."
+        near = sum(diff.within_tolerance for diff in diffs)
+        within = f", {near} of them within tolerance" if near else ""
+        sentence = f"All {len(diffs)} runs agree with {golden}{within}."
     rows: list[list[Piece]] = [[(name, FAINT) for name in COLUMNS]]
     for diff in diffs:
         path, *rest = several_cells(diff)
-        style = BAD if diff.exit_code else GOOD
+        style = BAD if diff.parted else GOOD
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
     lines = [line((sentence, BAD if parted else GOOD)), line()]
     lines += in_columns(rows, indent="", widest=60)
-    first = next((diff for diff in diffs if diff.exit_code), None)
+    first = next((diff for diff in diffs if diff.parted), None)
     if first is not None:
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
         lines += [line(), line(("next: ", TITLE), printable(command))]

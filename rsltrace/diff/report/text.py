@@ -67,21 +67,6 @@ def trace_report(
     return lines
 
 
-def within_tolerance(diff: Diff) -> bool:
-    """Whether tolerances cover every difference of values that is known of every divergence.
-
-    The digests differ all the same.
-    """
-    messages = [message for found in diff.divergences for message in found.messages]
-    return bool(messages) and all(
-        message.presence == "both"
-        and message.fields
-        # What no tolerance covers comes first, so what is not listed is covered if these are.
-        and all(one.within_tolerance for one in message.fields)
-        for message in messages
-    )
-
-
 def _head(diff: Diff, width: int) -> list[Line]:
     style = GOOD if diff.identical else BAD
     lines = wrapped(sentence_text(diff.sentence), width, style=style)
@@ -96,11 +81,20 @@ def _head(diff: Diff, width: int) -> list[Line]:
             agree = "the first event agrees" if diff.agreeing else "no event before agrees"
         verdict = f"  verdict: {diff.verdict.value}; {agree}"
         lines += wrapped(verdict, width, indent="  ")
-        if within_tolerance(diff):
-            lines.append(
-                line(("  equal within tolerance, not identical: the digests differ", TITLE))
-            )
+        lines += _tolerance(diff, width)
     return lines
+
+
+def _tolerance(diff: Diff, width: int) -> list[Line]:
+    if diff.tolerance is None:
+        return []
+    if diff.within_tolerance:
+        how = "but for what is ignored" if diff.tolerance.identical else "within tolerance"
+        text = f"equal {how}, not identical: the digests differ"
+    else:
+        said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)
+        text = f"not within tolerance: {said}"
+    return wrapped(f"  {text}", width, style=TITLE, indent="    ")
 
 
 def _side_cells(name: str, style: str, side: Side) -> list[Piece]:
