@@ -12,6 +12,7 @@ from rsltrace.bag.mcap_records import MAGIC as MCAP_MAGIC
 from rsltrace.bag.metadata import NAME, read_metadata
 from rsltrace.bag.sqlite_file import MAGIC as SQLITE_MAGIC
 from rsltrace.bag.sqlite_file import SqliteFile
+from rsltrace.bag.sqlite_recover import recover_database
 from rsltrace.bag.storage import Storage
 from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
@@ -31,6 +32,8 @@ class BagFiles:
     storages: list[Storage] = field(default_factory=list)
     compressed_messages: bool | None = None
     topics: dict[tuple[str, str], tuple[tuple[BagQos, ...], str]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    """What is missing from a bag that is read all the same."""
     _stack: ExitStack = field(default_factory=ExitStack)
 
     def close(self) -> None:
@@ -38,21 +41,29 @@ class BagFiles:
         self._stack.close()
 
 
-def open_files(path: Path) -> BagFiles:
-    """Open a bag's folder, or a single storage file. Raises ``BagError`` saying what to do."""
+def open_files(path: Path, *, recover: bool = False) -> BagFiles:
+    """Open a bag's folder, or a single storage file. Raises ``BagError`` saying what to do.
+
+    ``recover`` takes what is there of a bag that is incomplete, and ``notes`` say what is not.
+    """
     files = BagFiles()
     try:
         if path.is_dir():
-            metadata = read_metadata(path)
+            metadata = read_metadata(path, recover=recover)
             files.storage_id = metadata.storage_id
             files.topics = metadata.topics
-            files.compressed_messages = metadata.compression == "message"
+            files.notes += metadata.notes
+            if metadata.compression is not None:
+                files.compressed_messages = metadata.compression == "message"
             for file in metadata.files:
-                _open_file(file, files, expected=metadata.storage_id)
+                if recover and len(metadata.files) > 1 and file.stat().st_size == 0:
+                    files.notes.append(f"{file}: the file is empty: left out")
+                    continue
+                _open_file(file, files, metadata.storage_id or None, recover=recover)
         elif path.is_file():
             if path.name == NAME:
                 raise BagError(f"{path}: name the bag's folder, {path.parent}")
-            _open_file(path, files, expected=None)
+            _open_file(path, files, None, recover=recover)
         else:
             raise BagError(f"{path}: there is no such bag")
     except OSError as error:
@@ -64,7 +75,7 @@ def open_files(path: Path) -> BagFiles:
     return files
 
 
-def _open_file(path: Path, files: BagFiles, expected: str | None) -> None:
+def _open_file(path: Path, files: BagFiles, expected: str | None, *, recover: bool) -> None:
     with path.open("rb") as file:
         magic = file.read(16)
     if not magic:
@@ -76,9 +87,9 @@ def _open_file(path: Path, files: BagFiles, expected: str | None) -> None:
             magic = file.read(16)
     storage: Storage
     if magic.startswith(MCAP_MAGIC):
-        storage_id, storage = "mcap", McapFile(readable)
+        storage_id, storage = "mcap", McapFile(readable, recover=recover)
     elif magic.startswith(SQLITE_MAGIC):
-        storage_id, storage = "sqlite3", SqliteFile(readable)
+        storage_id, storage = "sqlite3", _sqlite(readable, files, recover=recover)
     elif magic.startswith(b"#ROSBAG"):
         raise BagError(f"{path}: a ROS 1 bag; convert it with 'rosbags-convert'")
     else:
@@ -91,6 +102,25 @@ def _open_file(path: Path, files: BagFiles, expected: str | None) -> None:
         raise BagError(f"{path}: {storage_id}, but {NAME} says {expected}; run 'ros2 bag reindex'")
     files.storage_id = storage_id
     files.storages.append(storage)
+    if storage.cut_off:
+        files.notes.append(f"{path}: the recording was cut off: {storage.cut_off} play")
+
+
+def _sqlite(path: Path, files: BagFiles, *, recover: bool) -> SqliteFile:
+    """Open a database, or what can be read of it."""
+    try:
+        return SqliteFile(path)
+    except BagError:
+        if not recover:
+            raise
+        folder = files._stack.enter_context(TemporaryDirectory(prefix="rsltrace-bag-"))
+        target = Path(folder, path.name)
+        found = recover_database(path, target)
+        if not found:
+            raise
+        storage = SqliteFile(target)
+        storage.cut_off = found
+        return storage
 
 
 def _decompressed(path: Path, files: BagFiles) -> Path:

@@ -20,6 +20,8 @@ from rsltrace.bag.merge import Message
 CHUNK_BYTES_MAX = 1 << 30
 """No writer makes chunks of this size; a larger number is a damaged or hostile one."""
 
+PUBLISH_TIME_BYTES = 8
+
 _HEAD_BYTES = RECORD_HEAD.size
 _DATA_AT = 1 + MESSAGE_HEAD.size
 
@@ -81,11 +83,16 @@ def _unlz4(raw: bytes, size: int) -> bytes:
         raise ValueError(f"the chunk cannot be decompressed ({error})") from None
 
 
-def cut_messages(data: bytes, wanted: Mapping[int, int], first_ns: int) -> list[Message]:
+def cut_messages(
+    data: bytes, wanted: Mapping[int, int], first_ns: int, *, with_publish_time: bool = False
+) -> list[Message]:
     """Return the wanted messages among records, by time, equal times as they stand.
 
-    ``wanted`` maps channel ids to topic indices. Raises ``ValueError`` when a record is cut off.
+    ``wanted`` maps channel ids to topic indices; ``with_publish_time`` puts it in front of the
+    bytes, 8 of them, little-endian. Raises ``ValueError`` when a record is cut off.
     """
+    # The publish time is the last field before the data.
+    data_at = _DATA_AT - PUBLISH_TIME_BYTES if with_publish_time else _DATA_AT
     messages: list[Message] = []
     unpack, topic_of = MESSAGE_HEAD.unpack_from, wanted.get
     at, end, previous_ns, ordered = 0, len(data), first_ns, True
@@ -99,7 +106,7 @@ def cut_messages(data: bytes, wanted: Mapping[int, int], first_ns: int) -> list[
             raise ValueError("a message runs past the end of its chunk")
         topic = topic_of(channel)
         if topic is not None and stamp_ns >= first_ns:
-            messages.append((stamp_ns, topic, data[at + _DATA_AT : following]))
+            messages.append((stamp_ns, topic, data[at + data_at : following]))
             if stamp_ns < previous_ns:
                 ordered = False
             previous_ns = stamp_ns

@@ -24,8 +24,11 @@ from rsltrace.model.stamp import format_seconds
 class McapFile:
     """One open ``.mcap`` file. Raises ``BagError`` when it is no ROS 2 recording or damaged."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, recover: bool = False) -> None:
+        """Open ``path``; with ``recover``, what is whole of a file that was cut off."""
         self.path = path
+        self._recover = recover
+        self.with_publish_time = False
         self._file = path.open("rb")
         try:
             self._index = self._read_index()
@@ -37,6 +40,7 @@ class McapFile:
             raise
         self.message_count = self._index.counts.total()
         self.start_ns, self.end_ns = self._index.start_ns, self._index.end_ns
+        self.cut_off = self._index.cut_off
 
     def close(self) -> None:
         """Close the file."""
@@ -87,7 +91,9 @@ class McapFile:
             else:
                 self._file.seek(span.offset)
                 data = self._file.read(span.length)
-            messages = cut_messages(data, wanted, first_ns)
+            messages = cut_messages(
+                data, wanted, first_ns, with_publish_time=self.with_publish_time
+            )
             # The order of the whole stream rests on these two times.
             if messages and not (span.start_ns <= messages[0][0] <= messages[-1][0] <= span.end_ns):
                 raise ValueError("messages lie outside the times the index promises")
@@ -105,7 +111,7 @@ class McapFile:
             raise BagError(f"{self.path}: not an MCAP file")
         size = self._file.seek(0, 2)
         try:
-            index = read_index(self._file, size)
+            index = read_index(self._file, size, recover=self._recover)
         except CutOffError as error:
             raise BagError(
                 f"{self.path}: the recording was cut off, its footer and index are missing: "

@@ -37,17 +37,23 @@ class CutOffError(ValueError):
     """The file has no footer. ``str`` says how far it is good."""
 
 
-def read_index(file: BinaryIO, size: int) -> McapIndex:
+def read_index(file: BinaryIO, size: int, *, recover: bool = False) -> McapIndex:
     """Return the index of an MCAP file of ``size`` bytes.
 
     Raises ``ValueError`` saying what is damaged and at which byte, ``CutOffError`` when the end is
-    missing.
+    missing; with ``recover`` the index is then that of what is whole.
     """
     footer_at = size - FOOTER_BYTES
     file.seek(max(0, footer_at))
     footer = file.read(FOOTER_BYTES)
     if footer_at < len(MAGIC) or not footer.endswith(MAGIC):
-        raise CutOffError(how_far(file, size))
+        end, text = how_far(file, size)
+        if not recover:
+            raise CutOffError(text)
+        profile, data_start = _header(file, end)
+        index = McapIndex(profile, cut_off=text)
+        scan_file(file, data_start, end, index)
+        return index
     profile, data_start = _header(file, footer_at)
     index = McapIndex(profile)
     opcode, length = RECORD_HEAD.unpack_from(footer)

@@ -64,6 +64,8 @@ class McapIndex:
     end_ns: int = 0
     data_size: int = 0
     data_crc: int = 0
+    cut_off: str = ""
+    """How much of a file without an end is whole; empty for a complete one."""
 
 
 def scan_file(file: BinaryIO, start: int, end: int, index: McapIndex) -> None:
@@ -187,8 +189,8 @@ def walk_records(file: BinaryIO, start: int, end: int) -> Iterator[tuple[int, in
         at = after
 
 
-def how_far(file: BinaryIO, size: int) -> str:
-    """Say how much of a file without an end is good."""
+def how_far(file: BinaryIO, size: int) -> tuple[int, str]:
+    """Return where the whole part of a file without an end ends, and say what is in it."""
     chunks, messages, good, end_ns = 0, 0, len(MAGIC), 0
     try:
         for opcode, at, after in walk_records(file, len(MAGIC), size):
@@ -203,4 +205,6 @@ def how_far(file: BinaryIO, size: int) -> str:
     text = f"the first {good} of {size} bytes are whole, with {chunks} chunks"
     if messages:
         text += f" and {messages} messages outside chunks"
-    return f"{text}, up to log time {format_seconds(end_ns)}" if chunks or messages else text
+    if chunks or messages:
+        text += f", up to log time {format_seconds(end_ns)}"
+    return good, text

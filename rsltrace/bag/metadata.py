@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -11,6 +12,7 @@ from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
 
 NAME = "metadata.yaml"
+_RECORDING = re.compile(r"\.(mcap|db3)(\.zstd)?$")
 STORAGE_IDS = ("mcap", "sqlite3")
 
 
@@ -18,18 +20,23 @@ STORAGE_IDS = ("mcap", "sqlite3")
 class BagMetadata:
     """What has to be known before the storage files are opened.
 
-    ``compression`` is ``""``, ``"file"`` or ``"message"`` (always zstd). ``topics`` has the QoS and
-    the type's hash by (topic, type), for storage files that do not keep them.
+    ``compression`` is ``""``, ``"file"`` or ``"message"`` (always zstd), ``None`` if unknown, as is
+    an empty ``storage_id``. ``topics`` has the QoS and the type's hash by (topic, type), for
+    storage files that do not keep them. ``notes`` say what is missing.
     """
 
     storage_id: str
     files: tuple[Path, ...]
-    compression: str
+    compression: str | None
     topics: dict[tuple[str, str], tuple[tuple[BagQos, ...], str]]
+    notes: tuple[str, ...] = ()
 
 
-def read_metadata(folder: Path) -> BagMetadata:
-    """Return the metadata of the bag in ``folder``. Raises ``BagError`` saying what to do."""
+def read_metadata(folder: Path, *, recover: bool = False) -> BagMetadata:
+    """Return the metadata of the bag in ``folder``. Raises ``BagError`` saying what to do.
+
+    ``recover`` does without metadata.yaml, and without some of the files it lists.
+    """
     path = folder / NAME
     if not path.is_file():
         recordings = sorted(
@@ -37,6 +44,8 @@ def read_metadata(folder: Path) -> BagMetadata:
         )
         if not recordings:
             raise BagError(f"{folder}: not a bag: there is no {NAME} and no recording in it")
+        if recover:
+            return _without_metadata(folder)
         raise BagError(
             f"{folder}: there is no {NAME}; make one with 'ros2 bag reindex {folder.name}', or "
             f"name a file in it ({', '.join(recordings)})"
@@ -70,12 +79,28 @@ def read_metadata(folder: Path) -> BagMetadata:
     if not files:
         raise BagError(f"{path}: no storage files are listed: the bag is empty")
     missing = [file.name for file in files if not file.is_file()]
-    if missing:
+    notes: tuple[str, ...] = ()
+    if missing and recover and len(missing) < len(files):
+        notes = (f"{path}: {', '.join(missing)} is listed but not there: left out",)
+        files = tuple(file for file in files if file.is_file())
+    elif missing:
         raise BagError(
             f"{path}: {', '.join(missing)} is listed but not there; put it back, or run "
             "'ros2 bag reindex' to do without"
         )
-    return BagMetadata(storage_id, files, compression, topics)
+    return BagMetadata(storage_id, files, compression, topics, notes)
+
+
+def _without_metadata(folder: Path) -> BagMetadata:
+    """Return what the storage files in a folder without metadata.yaml tell by themselves."""
+    names = [path.name for path in folder.iterdir() if _RECORDING.search(path.name)]
+    # Of a file and its compressed form one is enough.
+    names = [name for name in names if name.removesuffix(".zstd") == name or name[:-5] not in names]
+    names.sort(key=lambda name: [int(p) if p.isdigit() else p for p in re.split(r"(\d+)", name)])
+    if not names:
+        raise BagError(f"{folder}: not a bag: there is no {NAME} and no recording in it")
+    note = f"{folder}: there is no {NAME}: {', '.join(names)} play, without it"
+    return BagMetadata("", tuple(folder / name for name in names), None, {}, (note,))
 
 
 def _topic(item: Any) -> tuple[tuple[str, str], tuple[tuple[BagQos, ...], str]]:

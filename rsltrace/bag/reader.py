@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
+from itertools import takewhile
 from pathlib import Path
 from types import TracebackType
 
 from rsltrace.bag.files import ZSTD_MAGIC, BagFiles, open_files
+from rsltrace.bag.mcap_chunk import PUBLISH_TIME_BYTES
 from rsltrace.bag.merge import Message, Piece, merge
 from rsltrace.bag.select import select_topics
 from rsltrace.bag.storage import Extent, Storage, StoredTopic
@@ -26,10 +28,13 @@ class Bag:
     ``path`` is what was opened, ``storage_id`` ``"mcap"`` or ``"sqlite3"``, ``topics`` the selected
     topics in the order of the recording. ``recording_start_ns`` and ``recording_end_ns`` are the
     log times of the first and last message of the whole recording; ``start_ns`` is that of the
-    first message that plays. Log times are integer nanoseconds.
+    first message that plays. Log times are integer nanoseconds. ``notes`` say what is missing from
+    the recording, ``skipped`` are the topics that never play.
     """
 
     path: Path
+    notes: tuple[str, ...]
+    skipped: tuple[str, ...]
     storage_id: str
     topics: tuple[BagTopic, ...]
     recording_start_ns: int
@@ -43,13 +48,18 @@ class Bag:
         topics: Sequence[str],
         exclude: Sequence[str],
         start_offset_ns: int,
+        duration_ns: int | None,
+        skip: Callable[[StoredTopic], bool] | None,
     ) -> None:
         self.path = path
+        self.notes = tuple(files.notes)
+        self._skip = skip
         self.storage_id = files.storage_id
         self._files = files
         filled = [storage for storage in files.storages if storage.message_count]
         if not filled:
-            raise BagError(f"{path}: the bag is empty: it holds no messages")
+            cut = "".join(f"\n  {note}" for note in files.notes)
+            raise BagError(f"{path}: the bag is empty: it holds no messages{cut}")
         self.recording_start_ns = min(storage.start_ns for storage in filled)
         self.recording_end_ns = max(storage.end_ns for storage in filled)
         if self.recording_start_ns < 0 or self.recording_end_ns > STAMP_NS_MAX:
@@ -58,6 +68,7 @@ class Bag:
                 "or the file is broken"
             )
         self._first_ns = self.recording_start_ns + start_offset_ns
+        self._last_ns = None if duration_ns is None else self._first_ns + duration_ns
         self._select(topics, exclude)
         self._zstd = files.compressed_messages
         if self._zstd is None:
@@ -89,11 +100,33 @@ class Bag:
             for extent in storage.extents(wanted, self._first_ns):
                 read = partial(self._read, storage, extent, wanted)
                 pieces.append(Piece(extent.start_ns, len(pieces), read))
-        return merge(pieces)
+        messages = merge(pieces)
+        last_ns = self._last_ns
+        if last_ns is None:
+            return messages
+        return takewhile(lambda message: message[0] <= last_ns, messages)
+
+    def with_publish_time(self) -> Iterator[Message]:
+        """Yield what ``messages`` does, with the publish time in front of the bytes (8 of them,
+        little-endian). Raises ``BagError`` if the recording does not keep it."""
+        if self.storage_id != "mcap":
+            raise BagError(
+                f"{self.path}: a {self.storage_id} recording does not keep when messages were "
+                "published: play it by log_time or header_stamp"
+            )
+        for storage in self._files.storages:
+            storage.with_publish_time = True
+        try:
+            yield from self.messages()
+        finally:
+            for storage in self._files.storages:
+                storage.with_publish_time = False
 
     @cached_property
     def end_ns(self) -> int:
         """Log time of the last message that plays, in nanoseconds."""
+        if self._last_ns is not None:
+            return max(stamp_ns for stamp_ns, _, _ in self.messages())
         ends = [
             storage.last_ns(wanted, self._first_ns)
             for storage, wanted in zip(self._files.storages, self._wanted, strict=True)
@@ -125,7 +158,10 @@ class Bag:
 
     def _select(self, globs: Sequence[str], exclude: Sequence[str]) -> None:
         """Make ``topics`` and, per storage file, the map from its topic ids to their indices."""
-        names = [topic.name for storage in self._files.storages for topic in storage.topics]
+        everything = [topic for storage in self._files.storages for topic in storage.topics]
+        skipped = [topic for topic in everything if self._skip is not None and self._skip(topic)]
+        self.skipped = tuple(dict.fromkeys(topic.name for topic in skipped))
+        names = [topic.name for topic in everything if topic.name not in self.skipped]
         selected = select_topics(names, globs, exclude, str(self.path))
         merged: dict[tuple[str, str, str], BagTopic] = {}
         ids: list[dict[int, tuple[str, str, str]]] = []
@@ -163,15 +199,21 @@ class Bag:
 
     def _read(self, storage: Storage, extent: Extent, wanted: dict[int, int]) -> Iterator[Message]:
         messages = storage.read(extent, wanted, self._first_ns)
-        return self._decompressed(messages) if self._zstd else messages
+        if not self._zstd:
+            return messages
+        return self._decompressed(messages, PUBLISH_TIME_BYTES * storage.with_publish_time)
 
-    def _decompressed(self, messages: Iterator[Message]) -> Iterator[Message]:
+    def _decompressed(self, messages: Iterator[Message], head: int) -> Iterator[Message]:
+        """Yield messages with what follows the first ``head`` bytes decompressed."""
         import zstandard
 
         decompressor = zstandard.ZstdDecompressor()
         for stamp_ns, topic, data in messages:
             try:
-                yield stamp_ns, topic, decompressor.decompress(data)
+                if head:
+                    yield stamp_ns, topic, data[:head] + decompressor.decompress(data[head:])
+                else:
+                    yield stamp_ns, topic, decompressor.decompress(data)
             except zstandard.ZstdError as error:
                 raise BagError(
                     f"{self.path}: a message on {self.topics[topic].name} at {stamp_ns} ns cannot "
@@ -199,19 +241,24 @@ def open_bag(
     topics: Sequence[str] = (),
     exclude: Sequence[str] = (),
     start_offset_ns: int = 0,
+    duration_ns: int | None = None,
+    recover: bool = False,
+    skip: Callable[[StoredTopic], bool] | None = None,
 ) -> Bag:
     """Open a rosbag2 recording: a folder with metadata.yaml, or one ``.mcap`` or ``.db3`` file.
 
     ``topics`` and ``exclude`` are globs (``*`` matches ``/`` too; no ``topics`` means all);
-    ``start_offset_ns`` counts from the first message of the whole recording. Raises ``BagError``
-    naming the file and what to do: nothing there, not a bag, empty, cut off, damaged, of another
-    encoding, or nothing selected.
+    ``start_offset_ns`` counts from the first message of the whole recording, ``duration_ns`` from
+    there. ``recover`` takes what is there of an incomplete recording (cut off, without
+    metadata.yaml) and says in ``notes`` what is not. ``skip`` picks topics that never play; their
+    names are in ``skipped``. Raises ``BagError`` naming the file and what to do: nothing there, not
+    a bag, empty, cut off, damaged, of another encoding, or nothing selected.
     """
     if start_offset_ns < 0:
         raise BagError(f"{path}: the start offset must not be negative, got {start_offset_ns} ns")
-    files = open_files(Path(path))
+    files = open_files(Path(path), recover=recover)
     try:
-        return Bag(Path(path), files, topics, exclude, start_offset_ns)
+        return Bag(Path(path), files, topics, exclude, start_offset_ns, duration_ns, skip)
     except BaseException:
         files.close()
         raise

@@ -30,6 +30,8 @@ class SqliteFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self.cut_off = ""
+        self.with_publish_time = False
         self._check_size()
         # A log that was not merged back means messages outside the main file; only without one is
         # the file promised not to change, which also lets it be read from read-only media.

@@ -46,6 +46,10 @@ class Storage(Protocol):
     message_count: int
     start_ns: int
     end_ns: int
+    cut_off: str
+    """What is left of a file that was cut off, in words; empty for a whole one."""
+    with_publish_time: bool
+    """Set it to get the publish time in front of each message: 8 bytes, little-endian."""
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
         """Return the parts that may hold wanted messages, in file order."""

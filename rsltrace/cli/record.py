@@ -73,7 +73,7 @@ def record(
             path,
             force=force,
             echo=not quiet,
-            observer=Observer(progress=on_progress, interrupt=on_interrupt),
+            observer=Observer(progress=on_progress, interrupt=on_interrupt, note=_note),
         )
     _report(result, path, as_json=as_json)
     sys.exit(result.exit_code)
@@ -99,6 +99,10 @@ def _changed(job: Job, *, seed: int | None, until: str | None) -> Job:
             raise JobError(str(error).replace("StopSpec: time", "--until", 1)) from None
         changes["stop"] = job.stop.model_copy(update={"time_ns": given.time_ns})
     return job.model_copy(update=changes) if changes else job
+
+
+def _note(text: str) -> None:
+    click.echo(f"rsltrace: note: {text}", err=True)
 
 
 def _report(result: RunResult, path: Path, *, as_json: bool) -> None:

@@ -8,17 +8,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rsltrace.job.bag import BagSpec, QosSpec
     from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.job import Job
     from rsltrace.job.load import load_job, locate
     from rsltrace.job.node import NodeSpec
-    from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TopicStop
+    from rsltrace.job.spec import RecordSpec, StopSpec, TopicStop
 
 _HOMES = {
-    "BagSpec": "spec",
+    "BagSpec": "bag",
     "GuardSpec": "guard",
     "Job": "job",
     "NodeSpec": "node",
+    "QosSpec": "bag",
     "RecordSpec": "spec",
     "SourceSpec": "guard",
     "StopSpec": "spec",
@@ -33,6 +35,7 @@ __all__ = [
     "GuardSpec",
     "Job",
     "NodeSpec",
+    "QosSpec",
     "RecordSpec",
     "SourceSpec",
     "StopSpec",

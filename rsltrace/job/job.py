@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from rsltrace.job.bag import BagSpec
 from rsltrace.job.delay import DelaysSpec
 from rsltrace.job.distribution import files_of
 from rsltrace.job.guard import GuardSpec, guard_part
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, check, items, one_of, parts, text, whole
 from rsltrace.job.problems import Loc, Problem, Problems
-from rsltrace.job.spec import BagSpec, RecordSpec, StopSpec, TimeLike
+from rsltrace.job.spec import RecordSpec, StopSpec, TimeLike
 from rsltrace.job.times import format_time, parse_time
 
 SEED_MAX = 2**64 - 1
@@ -183,11 +184,23 @@ class Job(Part):
             *self._something_to_run(),
             *self._times_in_order(),
             *self._distinct_names(),
+            *self._bags_end(),
             *self._paths_exist(),
         ]
         if problems:
             raise Problems(problems)
         return self
+
+    def _bags_end(self) -> Iterator[Problem]:
+        if self.stop != StopSpec():
+            return
+        for index, bag in enumerate(self.bags):
+            if bag.loop is True:
+                yield Problem(
+                    "plays for ever, and nothing ends the run: give a 'stop:', or how often it "
+                    "plays",
+                    ("bags", index, "loop"),
+                )
 
     def _something_to_run(self) -> Iterator[Problem]:
         if not self.nodes and not self.bags:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, get_args
+from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -31,13 +31,16 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
 def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
     """Return the field that governs the value at ``loc``, or None below free-form values."""
     models, found = [model], None
+    in_mapping = False
     for part in loc:
-        if isinstance(part, int):
+        if isinstance(part, int) or in_mapping:
+            in_mapping = False  # a list's index, or a key that the author has chosen
             continue
         fields = [field for m in models for key, field in file_fields(m) if key == part]
         if fields:
             found = fields[0]
             models = models_in(found.annotation)
+            in_mapping = bool(models) and get_origin(found.annotation) is dict
         elif not models:
             return None
     return found

@@ -57,12 +57,15 @@ attach(check_path, schema={"type": "string", "minLength": 1})
 attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]
 
 
-def _check_remappings(value: object) -> dict[str, str]:
+def names_to_names(
+    value: object, rule_from: Callable[[str], None], rule_to: Callable[[str], None]
+) -> dict[str, str]:
+    """Check a mapping of names to names, each side by a rule of its own."""
     if not isinstance(value, dict):
         raise Problem(f"expected a mapping of names to names (from: to), got {describe(value)}")
     problems: list[Problem] = []
     for name, to in value.items():
-        for rule, side, at_key in ((check_remap_from, name, True), (check_remap_to, to, False)):
+        for rule, side, at_key in ((rule_from, name, True), (rule_to, to, False)):
             try:
                 text(rule)(side)
             except ValueError as error:
@@ -70,6 +73,10 @@ def _check_remappings(value: object) -> dict[str, str]:
     if problems:
         raise Problems(problems)
     return {str(name): str(to) for name, to in value.items()}
+
+
+def _check_remappings(value: object) -> dict[str, str]:
+    return names_to_names(value, check_remap_from, check_remap_to)
 
 
 def _check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:

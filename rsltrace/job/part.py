@@ -8,6 +8,7 @@ name (``duration_ns=``). The pydantic context tells the two apart.
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -159,6 +160,18 @@ def flag(value: object) -> bool:
 
 
 attach(flag, schema={"type": "boolean"})
+
+
+def positive_number(value: object) -> float:
+    """Check a finite number that must be more than nothing."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise Problem(f"expected a number, got {describe(value)}")
+    if not 0 < value < math.inf:
+        raise Problem(f"must be a number more than 0, got {getattr(value, 'text', value)}")
+    return float(value)
+
+
+attach(positive_number, schema={"type": "number", "exclusiveMinimum": 0})
 
 
 def positive_time(value: object) -> int:

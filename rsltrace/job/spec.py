@@ -1,16 +1,15 @@
-"""The smaller parts of a job: which bags play, when the run stops, what is recorded."""
+"""The smaller parts of a job: when the run stops, what is recorded."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import Field, ValidationInfo, field_validator
+from pydantic import Field, field_validator
 
 from rsltrace.job.names import check_field_path, check_glob, check_topic
-from rsltrace.job.node import Target, check_callable_target, check_path
-from rsltrace.job.part import Part, check, flag, from_file, items, part, positive_time, text, whole
+from rsltrace.job.node import Target, check_callable_target
+from rsltrace.job.part import Part, check, flag, items, part, positive_time, text, whole
 from rsltrace.job.problems import Problem
 from rsltrace.job.times import parse_time
 
@@ -18,54 +17,6 @@ TimeLike = str | int | float
 """A time in Python as in YAML: seconds as a number, or text with a unit."""
 
 Globs = Annotated[tuple[str, ...], check(items(text(check_glob)))]
-
-
-class BagSpec(Part):
-    """One entry of ``bags:``.
-
-    ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
-    ``start_offset_ns`` counts from the first message of the whole bag.
-    """
-
-    TIMES: ClassVar[dict[str, str]] = {"start_offset": "start_offset_ns"}
-
-    path: Annotated[str, check(check_path)] = Field(
-        description="The bag: its folder, or one `.mcap` or `.db3` file.",
-        examples=["../bags/outdoor"],
-    )
-    topics: Globs = Field(
-        default=(),
-        description="Play only these, globs in which `*` matches `/` too. Without it, all.",
-        examples=[["/imu/*", "/odom"]],
-    )
-    exclude: Globs = Field(
-        default=(), description="Do not play these, globs.", examples=[["/tf", "/camera/*"]]
-    )
-    start_offset_ns: Annotated[int, check(parse_time)] = Field(
-        default=0,
-        alias="start_offset",
-        description="Leave out so much of the beginning, from the bag's first message on.",
-        examples=["5s"],
-    )
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            *,
-            path: str | os.PathLike[str],
-            topics: Sequence[str] = (),
-            exclude: Sequence[str] = (),
-            start_offset: TimeLike = 0,
-            start_offset_ns: int = 0,
-        ) -> None: ...
-
-    @field_validator("topics")
-    @classmethod
-    def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if not value and from_file(info):
-            raise Problem("an empty list would play nothing: leave the key out to play all topics")
-        return value
 
 
 class TopicStop(Part):

@@ -64,7 +64,7 @@ class Player:
             publisher.node,
             _BAG,
             publisher.send,
-            (data,),
+            (data, digest),
             NO_EVENT,
             0,
             digest,
@@ -94,8 +94,20 @@ def check_type(*, bag: str, topic: str, type_name: str) -> type:
         ) from error
 
 
+def begins_with_header(message_class: Any) -> bool:
+    """Return whether the first field of a message is a ``std_msgs/Header``."""
+    fields = message_class.get_fields_and_field_types()
+    return next(iter(fields.values()), "") == "std_msgs/Header"
+
+
 def make_publisher(
-    core: Core, node: NodeHandle, *, bag: str, topic: str, type_name: str, qos: dict[str, Any]
+    core: Core,
+    node: NodeHandle,
+    *,
+    bag: str,
+    topic: str,
+    type_name: str,
+    qos: dict[str, Any],
 ) -> BagPublisher:
     """Create the publisher of a recorded topic."""
     message_class = check_type(bag=bag, topic=topic, type_name=type_name)

@@ -4,46 +4,133 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.job import BagSpec, Job
+from rsltrace.errors import BagError
+from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.stop import Stop
 from rsltrace.run.stopping import has_stop
 
 if TYPE_CHECKING:
     from rsltrace.bag import Bag
+    from rsltrace.bag.playback import Playback
+    from rsltrace.bag.storage import StoredTopic
+    from rsltrace.bag.topic import BagTopic
     from rsltrace.ros.world import World
 
+_ACTION = "/_action/"
+_SERVICE_EVENT = "/_service_event"
 
-def open_bag_of(job: Job, spec: BagSpec) -> Any:
-    """Open one bag of a job; a context manager. Raises BagError."""
+
+@dataclass(frozen=True)
+class BagInput:
+    """One entry of ``bags:`` with its open bag, and when its messages play."""
+
+    spec: BagSpec
+    bag: Bag
+    playback: Playback
+
+    def name_of(self, topic: BagTopic) -> str:
+        """Return the name under which a recorded topic plays."""
+        return self.spec.remappings.get(topic.name, topic.name)
+
+
+@contextmanager
+def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
+    """Open one bag of a job. Raises BagError."""
     from rsltrace.bag import open_bag
+    from rsltrace.bag.playback import Playback
 
-    return open_bag(
+    spec = job.bags[index]
+    with open_bag(
         job.resolve(spec.path),
         topics=spec.topics,
         exclude=spec.exclude,
         start_offset_ns=spec.start_offset_ns,
+        duration_ns=spec.duration_ns,
+        recover=True,
+        skip=_never_plays,
+    ) as bag:
+        _check_names(job, index, bag)
+        yield BagInput(
+            spec,
+            bag,
+            Playback(
+                bag,
+                by=spec.by,
+                headers=_with_headers(spec, bag) if spec.by == "header_stamp" else frozenset(),
+                rate=Fraction(repr(spec.rate)),
+                at_ns=spec.at_ns,
+                passes=None if spec.loop is True else int(spec.loop) or 1,
+            ),
+        )
+
+
+def _never_plays(topic: StoredTopic) -> bool:
+    """Services and actions are recorded as topics that only their own middleware may fill."""
+    return _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
+
+
+def _check_names(job: Job, index: int, bag: Bag) -> None:
+    """Raise BagError if a name in the job fits no topic that plays."""
+    spec, names = job.bags[index], sorted({topic.name for topic in bag.topics})
+    for key, globs in (("remappings", spec.remappings), ("qos", spec.qos)):
+        for glob in globs:
+            if not any(fnmatchcase(name, glob) for name in names):
+                raise BagError(
+                    f"{locate(job, ('bags', index, key, glob))}: {spec.path} plays no topic "
+                    f"{glob!r}: it plays {', '.join(names)}"
+                )
+
+
+def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
+    from rsltrace.ros.player import begins_with_header, check_type
+
+    return frozenset(
+        index
+        for index, topic in enumerate(bag.topics)
+        if begins_with_header(
+            check_type(bag=spec.path, topic=topic.name, type_name=topic.type_name)
+        )
     )
 
 
-def start_ns_of(job: Job, bags: list[Bag]) -> int:
+def notes_of(bags: list[BagInput]) -> Iterator[str]:
+    """Yield what somebody should know about the bags: what is missing, what does not play."""
+    for entry in bags:
+        yield from entry.bag.notes
+        services = [name for name in entry.bag.skipped if name.endswith(_SERVICE_EVENT)]
+        actions = sorted({n.partition(_ACTION)[0] for n in entry.bag.skipped if _ACTION in n})
+        services = [n.removesuffix(_SERVICE_EVENT) for n in services if _ACTION not in n]
+        for what, names in (("services", sorted(services)), ("actions", actions)):
+            if names:
+                yield (
+                    f"{entry.spec.path}: recorded {what} are not played: {', '.join(names)} (only "
+                    "topics play; what a server answers, its node must answer again)"
+                )
+
+
+def start_ns_of(job: Job, bags: list[BagInput]) -> int:
     """Return when the run starts: what the job says, else the first message of the bags, else 0."""
     if job.start_ns is not None:
         return job.start_ns
-    return min((bag.start_ns for bag in bags), default=0)
+    return min((entry.playback.start_ns for entry in bags), default=0)
 
 
-def check_bag_types(job: Job, bags: list[Bag]) -> None:
+def check_bag_types(bags: list[BagInput]) -> None:
     """Raise BagError if a recorded topic has a type that is not installed."""
     from rsltrace.ros.player import check_type
 
-    for spec, bag in zip(job.bags, bags, strict=True):
-        for topic in bag.topics:
-            check_type(bag=spec.path, topic=topic.name, type_name=topic.type_name)
+    for entry in bags:
+        for topic in entry.bag.topics:
+            check_type(bag=entry.spec.path, topic=topic.name, type_name=topic.type_name)
 
 
-def start_players(world: World, job: Job, bags: list[Bag]) -> None:
+def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
     """Make a publisher for every recorded topic and merge the bags by time, then by order."""
     if not bags:
         return
@@ -57,20 +144,22 @@ def start_players(world: World, job: Job, bags: list[Bag]) -> None:
 
     def build() -> None:
         player = Node("rosbag2_player", start_parameter_services=False, enable_rosout=False)
-        publishers: dict[str, Any] = {}
-        for spec, bag in zip(job.bags, bags, strict=True):
-            for topic in bag.topics:
-                if topic.name not in publishers:
-                    publishers[topic.name] = make_publisher(
+        publishers: dict[tuple[str, str], Any] = {}
+        for entry in bags:
+            ends = []
+            for topic in entry.bag.topics:
+                key = (entry.name_of(topic), topic.type_name)
+                if key not in publishers:
+                    publishers[key] = make_publisher(
                         core,
                         player.handle,
-                        bag=spec.path,
-                        topic=topic.name,
+                        bag=entry.spec.path,
+                        topic=key[0],
                         type_name=topic.type_name,
-                        qos=_qos_values(topic.qos),
+                        qos={**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)},
                     )
-            ends = [publishers[topic.name] for topic in bag.topics]
-            streams.append(_messages(bag, ends))
+                ends.append(publishers[key])
+            streams.append(_messages(entry.playback, ends))
         world.keep(player)
 
     core.run_outside(lambda: "the bag player", EventKind.CONSTRUCT, 0, None, build)
@@ -82,12 +171,22 @@ def start_players(world: World, job: Job, bags: list[Bag]) -> None:
         if ends_run:
             core.loop.stop_after_step(Stop("end of the bag"))
 
-    Player(core, heapq.merge(*streams, key=lambda message: message[0]), on_end).start()
+    merged = streams[0]
+    if len(streams) > 1:
+        merged = heapq.merge(*streams, key=lambda message: message[0])
+    Player(core, merged, on_end).start()
 
 
-def _messages(bag: Bag, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:
-    for stamp_ns, topic, data in bag.messages():
+def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:
+    for stamp_ns, topic, data in playback.messages():
         yield stamp_ns, publishers[topic], data
+
+
+def _qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
+    for glob, qos in spec.qos.items():
+        if fnmatchcase(topic, glob):
+            return qos.values()
+    return {}
 
 
 def _qos_values(qos: Any) -> dict[str, Any]:

@@ -23,10 +23,12 @@ _GC_EVERY_EVENTS = 10_000
 @dataclass(frozen=True, slots=True)
 class Observer:
     """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
-    about every thousand time steps; ``interrupt`` gets a function that ends the run properly."""
+    about every thousand time steps; ``interrupt`` gets a function that ends the run properly;
+    ``note`` gets what somebody should know before the run begins (a bag that was cut off)."""
 
     progress: Callable[[int, int | None, int], None] | None = None
     interrupt: Callable[[Callable[[Stop], None]], None] | None = None
+    note: Callable[[str], None] | None = None
 
 
 def housekeeping(

@@ -20,7 +20,14 @@ from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.stamp import format_seconds
-from rsltrace.run.bags import check_bag_types, open_bag_of, start_ns_of, start_players
+from rsltrace.run.bags import (
+    BagInput,
+    check_bag_types,
+    notes_of,
+    open_bag_of,
+    start_ns_of,
+    start_players,
+)
 from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
@@ -31,7 +38,6 @@ from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.bag import Bag
     from rsltrace.ros.world import Entry, World
 
 
@@ -88,7 +94,7 @@ class Session:
         self._observer = observer or Observer()
         self._stack = ExitStack()
         self._writer: TraceWriter | None = None
-        self._bags: list[Bag]
+        self._bags: list[BagInput]
         self._entries: list[Entry]
 
     def __enter__(self) -> Session:
@@ -113,7 +119,12 @@ class Session:
         from rsltrace.ros.world import World
 
         job, observer = self.job, self._observer
-        self._bags = [stack.enter_context(open_bag_of(job, bag)) for bag in job.bags]
+        self._bags = [
+            stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
+        ]
+        if observer.note is not None:
+            for note in notes_of(self._bags):
+                observer.note(note)
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
         stack.enter_context(search_path(job))
@@ -136,7 +147,7 @@ class Session:
                 stop_conditions(job, self.start_ns, world.core.outside_events)
             )
             self._entries = _prepare(job)
-        check_bag_types(job, self._bags)
+        check_bag_types(self._bags)
         if self._output is not None:
             self._writer = writer = stack.enter_context(
                 TraceWriter(self._output, force=self._force)

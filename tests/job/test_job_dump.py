@@ -16,6 +16,8 @@ from ruamel.yaml import YAML
 from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
 from rsltrace.job.schema import job_schema
 
+SCHEMA = jsonschema.Draft202012Validator(job_schema())
+
 names = st.from_regex(r"[A-Za-z_][A-Za-z0-9_]{0,8}", fullmatch=True)
 plain_names = st.from_regex(r"[A-Za-z][A-Za-z0-9]{0,8}", fullmatch=True)
 topics = st.lists(names, min_size=1, max_size=3).map(lambda parts: "/" + "/".join(parts))
@@ -96,7 +98,7 @@ def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
         assert loaded.resolved() == job.resolved()
         assert repr(loaded) == repr(job)  # also tells 1 from 1.0 and True
         assert loaded.to_yaml() == job.to_yaml()
-        jsonschema.validate(YAML(typ="safe", pure=True).load(job.to_yaml()), job_schema())
+        SCHEMA.validate(YAML(typ="safe", pure=True).load(job.to_yaml()))
 
 
 def test_the_yaml_of_a_job_is_short_and_readable() -> None:

@@ -116,14 +116,6 @@ def test_a_type_that_is_not_installed_is_named_before_a_file_is_made(
     assert record_job(job % "{path: bag, exclude: [/odd]}", HEARER).error is None
 
 
-def test_a_truncated_bag_is_refused_before_a_file_is_made(record_job: Any, tmp_path: Path) -> None:
-    bag = next(write_bag(tmp_path / "bag").glob("*.mcap"))
-    bag.write_bytes(bag.read_bytes()[:-200])
-    with pytest.raises(BagError, match=r"bag"):
-        record_job("nodes: [{node: nodes_under_test:Hearer}]\nbags: [bag]\n", HEARER)
-    assert not (tmp_path / "run.mcap").exists()
-
-
 def test_a_message_that_is_not_of_its_type_is_named(record_job: Any, tmp_path: Path) -> None:
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
