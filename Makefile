@@ -62,15 +62,20 @@ samples: $(INSTALLED)
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/throughput.py
 
-# The pictures of the documentation, drawn from the sample traces without a terminal.
+# The pictures of the documentation, drawn from the sample traces without a screen. That of Rerun
+# needs a graphics driver; one in software will do (Debian: mesa-vulkan-drivers).
+PICTURES := $(abspath docs/pictures)
+VIEW := $(abspath $(BIN))/rsltrace view a.mcap b.mcap
+
 pictures: $(INSTALLED)
-	@mkdir -p docs/pictures
+	@mkdir -p $(PICTURES) $(OUT)
+	cd $(SAMPLE) && $(VIEW) --export $(PICTURES)/view_two.svg
 	cd sample_traces/delayed_input && $(abspath $(BIN))/rsltrace view a.mcap --at 252 \
-		--export ../../docs/pictures/view.svg
-	cd sample_traces/nondeterministic_callback && $(abspath $(BIN))/rsltrace view a.mcap b.mcap \
-		--export ../../docs/pictures/view_two.svg
-	cd sample_traces/nondeterministic_callback && $(abspath $(BIN))/rsltrace view a.mcap b.mcap --light \
-		--keys "p down enter" --export ../../docs/pictures/view_plot.svg
+		--export $(PICTURES)/view.svg
+	cd sample_traces/schedule && $(VIEW) --light --keys p --export $(PICTURES)/view_plot.svg
+	cd $(SAMPLE) && $(abspath $(BIN))/rsltrace rerun a.mcap b.mcap -o $(abspath $(OUT))/pictures.rrd
+	$(BIN)/python -m rsltrace_viewer.rerun_export.picture $(OUT)/pictures.rrd \
+		$(PICTURES)/rerun_two.png sim_time 2.1
 
 clean:
 	rm -rf $(VENV) $(OUT)

@@ -29,6 +29,7 @@ CHAIN = "/divergence/chain"
 _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
 _VALUE_WIDTH = 18
+_LINE_WIDTH = 50
 _FIELDS_MAX = 20
 
 
@@ -193,19 +194,16 @@ def _message(message: MessageDifference) -> Iterator[str]:
         yield f" `{printable(shortened(message.preview, 3 * _VALUE_WIDTH))}`"
     if message.fields:
         yield ""
-        yield "| field | a | b | difference |"
-        yield "|---|---|---|---|"
+        yield "```"  # a table would cut off the digits that differ
         for field in message.fields[:_FIELDS_MAX]:
-            difference = f"{field.absolute:.6g}" if field.absolute is not None else ""
-            if field.note:
-                difference = f"{difference} {field.note}".strip()
-            yield (
-                f"| {_text(field.path)} | {_value(field.a)} | {_value(field.b)} "
-                f"| {_text(difference)} |"
-            )
+            difference = f"|a-b| {field.absolute:.6g}" if field.absolute is not None else ""
+            yield _code(f"{field.path}  {difference} {field.note}".rstrip())
+            for name, value in (("a", field.a), ("b", field.b)):
+                yield _code(f"  {name}  {'—' if value is None else shortened(value, _LINE_WIDTH)}")
         more = len(message.fields[_FIELDS_MAX:]) + message.more_fields
         if more:
-            yield f"| {more} more | | | |"
+            yield f"{more} more"
+        yield "```"
 
 
 def _step(step: CauseStep) -> str:
@@ -230,6 +228,11 @@ def _text(text: str) -> str:
     for character in "\\`*_{}[]<>|#":
         safe = safe.replace(character, f"\\{character}")
     return safe
+
+
+def _code(text: str) -> str:
+    """Return a text as a line of a block of code, which it cannot end."""
+    return printable(text).replace("`", "'")
 
 
 def _value(text: str | None) -> str:

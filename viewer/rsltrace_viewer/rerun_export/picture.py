@@ -25,6 +25,9 @@ _SOFTWARE_DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
 LOOPBACK = "127.0.0.1"
 WINDOW = "1600x1000"
 _SETTLE_S = 1.0
+_GREETING_S = 6.0
+"""How long the viewer shows that it runs headless."""
+_COLOURS = 256
 _LOADED_S_MAX = 20.0
 
 
@@ -33,7 +36,9 @@ def software_driver() -> Path | None:
     return _SOFTWARE_DRIVER if _SOFTWARE_DRIVER.exists() else None
 
 
-def take(recording: Path, picture: Path, timeline: str, value: float) -> list[str]:
+def take(
+    recording: Path, picture: Path, timeline: str, value: float, *, settle_s: float = _SETTLE_S
+) -> list[str]:
     """Write a PNG of ``recording`` with the cursor at a time (seconds) or event number.
 
     Returns what views report as wrong, which is nothing for a good recording.
@@ -68,7 +73,7 @@ def take(recording: Path, picture: Path, timeline: str, value: float) -> list[st
         else:
             stamp = np.timedelta64(int(value * 1e9), "ns")
             client.set_time(timeline, duration=stamp, play_state="paused")
-        time.sleep(_SETTLE_S)
+        time.sleep(settle_s)
         client.save_screenshot(str(picture.absolute()))
         return [
             f"{view.name}: {report.summary} {report.details or ''}".rstrip()
@@ -101,7 +106,17 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+def shrink(picture: Path) -> None:
+    """Make a PNG several times smaller, for a repository: with few colours."""
+    from PIL import Image  # Rerun brings it
+
+    with Image.open(picture) as image:
+        small = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
+    small.save(picture, optimize=True)
+
+
 if __name__ == "__main__":
     source, target, on_timeline, at = sys.argv[1:5]
-    for line in take(Path(source), Path(target), on_timeline, float(at)):
+    for line in take(Path(source), Path(target), on_timeline, float(at), settle_s=_GREETING_S):
         print(line)
+    shrink(Path(target))
