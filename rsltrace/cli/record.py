@@ -107,6 +107,8 @@ def _note(text: str) -> None:
 
 def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
     error = result.error
+    for note in result.notes:
+        click.echo(f"note: {note}", err=True)
     if error is not None:
         if isinstance(error, NodeError) and error.traceback_text:
             click.echo(error.traceback_text.rstrip(), err=True)
@@ -123,6 +125,7 @@ def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
                     "stop_reason": result.stop_reason,
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
+                    "notes": list(result.notes),
                 }
             )
         )

@@ -21,6 +21,8 @@ class EntityKind(IntEnum):
     QOS_EVENT = 9
     ACTION_CLIENT = 10
     ACTION_SERVER = 11
+    MAIN = 12
+    THREAD = 13
 
     @property
     def label(self) -> str:

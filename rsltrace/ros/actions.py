@@ -16,6 +16,7 @@ from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.ros.destroyable import Destroyable
 from rsltrace.ros.entity_handle import Receiver
 from rsltrace.ros.groups import begin
+from rsltrace.ros.mailbox import executor_of
 from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.ros.services import ClientHandle, RequestId, ServiceHandle
 from rsltrace.ros.tasks import start_coroutine
@@ -118,7 +119,7 @@ class _ActionHandle(Destroyable):
         data = waitable.take_data()
         self._ready = None
         for future in waitable._futures:
-            future._set_executor(self.core.executor)
+            future._set_executor(executor_of(self.core, part))
         await waitable.execute(data)
 
     def _destroy(self) -> None:
@@ -310,6 +311,9 @@ class _Expiry:
     def dispatch(self) -> None:
         """Expire goals, as one event."""
         server = self._server
+        mailbox = self.node.mailbox
+        if mailbox is not None and mailbox.keeps(self):
+            return
         self.wrapper = server.find_waitable()
         if self.wrapper is None:
             return

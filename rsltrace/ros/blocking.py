@@ -48,9 +48,16 @@ class RunEnded(BaseException):
 class Wait:
     """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
 
-    def __init__(self, core: Core, what: str, group: object) -> None:
+    def __init__(self, core: Core, what: str, group: object, *, quiet: bool, patient: bool) -> None:
         self.core = core
         self.what = what
+        self.patient = patient
+        """Whether it is in order to wait for ever: for more work, say."""
+        self.error: BaseException | None = None
+        """What to raise in the blocked call when it goes on."""
+        self.program = core.program
+        self.deadline_ns: int | None = None
+        self._quiet = quiet
         self._group = group
         self.stack = getcurrent()
         self.timed_out = False
@@ -69,6 +76,12 @@ class Wait:
             self._cause = (core.loop.events, core.note(OutputKind.TASK, self._event[1], 2))
             self._input_hash = core.input_hash
             core.loop.tasks.append(self)
+
+    def release(self) -> None:
+        """Let the call return, because of nothing that has an event."""
+        if not self._woken:
+            self._woken = True
+            self.core.loop.tasks.append(self)
 
     def time_out(self) -> None:
         """Let the call return: because its time is up."""
@@ -92,6 +105,9 @@ class Wait:
         core.input_hash = self._input_hash
         core.node_arguments = self._arguments
         core.on_end = self._end_group
+        core.quiet = self._quiet
+        if self.program is not core.program:
+            self.program.enter()
 
     def describe(self) -> str:
         """Name the callback that waits."""
@@ -113,12 +129,19 @@ class Wait:
 
 
 def wait(
-    core: Core, what: str, *, until: Callable[[Wait], None] | None = None, for_ns: int | None = None
+    core: Core,
+    what: str,
+    *,
+    until: Callable[[Wait], None] | None = None,
+    for_ns: int | None = None,
+    quiet: bool = False,
+    patient: bool = False,
 ) -> bool:
     """Block the present callback in simulated time; return whether it was woken (not timed out).
 
     ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
-    wait. ``what`` completes "… waits for".
+    wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
+    something comes of it. A ``patient`` one may last for ever.
 
     :raises RunEnded: when the run ends before the wait does.
     """
@@ -137,21 +160,53 @@ def wait(
             "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
         )
     group = _hold_group(core)
-    blocked = Wait(core, what, group)
-    core.flags |= _SUSPENDED
+    blocked = Wait(core, what, group, quiet=quiet, patient=patient)
     if until is not None:
         until(blocked)
     if for_ns is not None:
-        core.loop.schedule(core.loop.now_ns + max(for_ns, 0), blocked.time_out)
-    core.end_event()
+        blocked.deadline_ns = core.loop.now_ns + max(for_ns, 0)
+        core.loop.schedule(blocked.deadline_ns, blocked.time_out)
+    _end_stretch(core)
     core.blocked[blocked] = None
     core.on_end = None
+    if core.program is not core.host:
+        core.host.enter()
     core.next_runner().switch()
     core.blocked.pop(blocked, None)
     blocked.resumed()
     if core.ending:
         raise RunEnded
+    if blocked.error is not None:
+        error, blocked.error = blocked.error, None
+        raise error
     return not blocked.timed_out
+
+
+def _end_stretch(core: Core) -> None:
+    """Record the event under way as one that will go on, unless it is quiet and said nothing."""
+    if core.quiet and not core.said_anything():
+        core.quiet = False
+        core.flags = 0
+        return
+    core.flags |= _SUSPENDED
+    core.end_event()
+
+
+@contextmanager
+def set_aside(core: Core) -> Iterator[None]:
+    """Let other events run on this stack, between two parts of the event under way."""
+    handle, entity, node = core.current_handle, core.current_entity, core.current_node
+    arguments, on_end = core.node_arguments, core.on_end
+    _end_stretch(core)
+    core.on_end = None
+    try:
+        yield
+    finally:
+        core.current_handle, core.current_entity, core.current_node = handle, entity, node
+        core.kind, core.input_hash = _RESUME, 0
+        core.cause_event, core.cause_output = core.loop.events - 1, 0
+        core.node_arguments, core.on_end = arguments, on_end
+        core.quiet = True
 
 
 def _refuse(core: Core) -> NoReturn:
@@ -161,6 +216,7 @@ def _refuse(core: Core) -> NoReturn:
         core.refused = 0
         core.end_event()
         _abandoned.append(getcurrent())
+        core.host.enter()
         assert core.main is not None
         core.main.switch()
     raise RunEnded

@@ -1,4 +1,7 @@
-"""The handle of ``rclpy.Context``: init arguments, and a shutdown that ends the run."""
+"""The handle of ``rclpy.Context``: init arguments, and a shutdown.
+
+That of a node which the job constructs ends the run; a main shuts down only itself.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,9 @@ class ContextHandle(Destroyable):
         self.core = core
         for argument in arguments:
             argument.encode()  # raises what rclpy raises for what is not text
-        self.arguments = RosArguments(_only_ros(arguments))
+        self.program = core.program
+        self.program.contexts.append(self)
+        self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
         self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
         self._ok = True
 
@@ -42,10 +47,17 @@ class ContextHandle(Destroyable):
             raise RuntimeError("context has already been shut down")
         self._ok = False
         core = self.core
+        if self.program is not core.host:
+            core.note(OutputKind.SHUTDOWN, core.current_entity)
+            return
         if core.current_node is not None and self is core.main_context:
             core.note(OutputKind.SHUTDOWN, core.current_entity)
             name = core.current_node.fully_qualified_name
             core.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
+
+    def end(self) -> None:
+        """Shut down from outside, as a signal does."""
+        self._ok = False
 
 
 def _only_ros(arguments: Sequence[str]) -> list[str]:

@@ -26,6 +26,7 @@ from rsltrace.model.finding import Policy
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
 from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
+from rsltrace.ros.program import Program, failure_of
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
@@ -89,12 +90,22 @@ class Core:
         self.main_context: ContextHandle | None = None
         self.node_arguments: list[RosArguments] = []
         self.log_exceptions = False
+        self.host = Program(self)
+        self.program = self.host
+        self.programs: list[Program] = []
+        self.notes: list[str] = []
+        self.closing = False
+        self.fed = False
+        self.arrivals = 0
+        self.quiet = False
+        self.unrecorded = 0
+        self.raised: BaseException | None = None
         self.suspended: dict[TaskRun, None] = {}
         self.polled: list[TaskRun] = []
         self.polls = 0
         self.poll_stage: tuple[int, int] | None = None
-        self.pending: list[EntityHandle] = []
-        self.unowned: list[EntityHandle] = []
+        self.pending: list[EntityHandle | Program] = []
+        self.unowned: list[EntityHandle | Program] = []
         self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
         self._entity_count = 0
         self._parked: dict[object, list[Callable[[], None]]] = {}
@@ -138,7 +149,9 @@ class Core:
             self.settle()
         loop = self.loop
         recorder = self.recorder
-        if recorder is not None:
+        if recorder is None:
+            self.unrecorded = 0
+        else:
             recorder.end_event(
                 loop.now_ns,
                 self.kind,
@@ -150,6 +163,12 @@ class Core:
             )
         loop.events += 1
         self.flags = 0
+        self.quiet = False
+
+    def said_anything(self) -> bool:
+        """Return whether the event under way has had outputs."""
+        outputs = self.unrecorded if self.recorder is None else self.recorder.outputs
+        return bool(outputs or self.pending)
 
     @contextlib.contextmanager
     def outside_events(self) -> Iterator[None]:
@@ -210,7 +229,7 @@ class Core:
     def who_waits(self) -> list[str]:
         """Say of every suspended coroutine and blocked call what it waits for."""
         runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
-        return runs + [blocked.waits_for() for blocked in self.blocked]
+        return runs + [blocked.waits_for() for blocked in self.blocked if not blocked.patient]
 
     @property
     def entry(self) -> Entry | None:
@@ -294,6 +313,7 @@ class Core:
     def note(self, kind: OutputKind, entity: int, operation: int = 0, value: int = 0) -> int:
         """Add a small output (a timer changed, a task was made); return its position."""
         if self.recorder is None:
+            self.unrecorded += 1
             return 0
         return self.recorder.output(kind, entity, hash64(_pack_value(operation, value)))
 
@@ -350,6 +370,11 @@ class Core:
             self.recorder.detail(
                 OutputKind.EXCEPTION, self.current_entity, stamp_ns, text, hash64(content.encode())
             )
+        if self._belongs_to_executor(handle) and not self._goes_on(error):
+            # It comes out of the spin of whoever runs the callback; what becomes of it is theirs.
+            self.raised = error
+            self.program.failures.append((error, label, stamp_ns, text, name))
+            return
         if isinstance(error, SystemExit):
             reason = f"{label} raised SystemExit"
             if error.code is not None and not isinstance(error.code, int):
@@ -365,7 +390,10 @@ class Core:
             self.logs.log(_ERROR, self.current_node.logger_name(), message, "", "", 0)
             return
         where = f"{label}, at simulated time {format_seconds(stamp_ns)} s"
-        if isinstance(error, RsltraceError):
+        earlier = failure_of(self.program, error)
+        if earlier is not None:
+            self.error = earlier
+        elif isinstance(error, RsltraceError):
             # Raised by the middleware itself: the message says what to do, this says where.
             failure = type(error).__new__(type(error))
             Exception.__init__(failure, f"{said}\n  in {where}")
@@ -380,6 +408,19 @@ class Core:
             )
         self.error.__cause__ = error
         self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
+
+    def in_callback(self) -> bool:
+        """Return whether the event under way is a callback's, not a main's or a thread's."""
+        return not isinstance(self.current_handle, _Outside)
+
+    def _belongs_to_executor(self, handle: Any) -> bool:
+        """Say whether an event was run by an executor of the user's own."""
+        if isinstance(handle, _Outside):
+            return False
+        mailbox = getattr(handle, "mailbox", None)
+        if mailbox is None and getattr(handle, "node", None) is not None:
+            mailbox = handle.node.mailbox
+        return mailbox is not None
 
     def _goes_on(self, error: BaseException) -> bool:
         """Say whether an exception is only logged: of a callback whose job entry says so.

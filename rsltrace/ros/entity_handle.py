@@ -129,6 +129,9 @@ class Receiver(EntityHandle):
 
     def may_run(self) -> bool:
         """Return whether to take an arrival now; if the callback group is busy, try again later."""
+        mailbox = self.node.mailbox  # type: ignore[union-attr]  # a receiver is made by a node
+        if mailbox is not None and mailbox.keeps(self):
+            return False
         wrapper = self.wrapper
         if not self.queue or wrapper is None or self._destroyed:
             return False

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import Executor
 
 from rsltrace.errors import UnsupportedError
 from rsltrace.ros.blocking import FutureWake, SimEvent, wait
+from rsltrace.ros.own_executors import is_bookkeeping
 from rsltrace.ros.tasks import Resume, create_task
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
-
-_SPIN = (
-    "an executor of its own spins inside a simulation, where rsltrace's loop runs all callbacks: "
-    "use rclpy.spin_until_future_complete(node, future), or let the callback return and use "
-    "call_async with add_done_callback or await"
-)
 
 
 class SimExecutor(Executor):  # type: ignore[misc]
@@ -31,10 +25,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
 
     def create_task(self, callback: Any, *args: Any, **kwargs: Any) -> Any:
         """Run a callback or coroutine right after the present event."""
-        if type(callback) in (Resume, FutureWake):
-            callback(*args)
-            return None
-        if getattr(callback, "__func__", None) in _bookkeeping():
+        if type(callback) in (Resume, FutureWake) or is_bookkeeping(callback):
             callback(*args)  # rclpy's own, not an event
             return None
         return create_task(self._core, callback, args, kwargs)
@@ -46,8 +37,11 @@ class SimExecutor(Executor):  # type: ignore[misc]
         self._sim_nodes[node] = None
         node.executor = self
         handle = node.handle
+        mailbox, handle.mailbox = handle.mailbox, None
         handle.wrapper = node
         self._core.activate_node(handle)
+        if mailbox is not None:
+            self._core.loop.ready.extend(item for _, item in mailbox.entries)
         return True
 
     def remove_node(self, node: Any) -> None:
@@ -94,30 +88,17 @@ class SimExecutor(Executor):  # type: ignore[misc]
     def spin(self) -> None:
         """Let others run until the run ends."""
         while self._context.ok():
-            wait(self._core, "the run to end")
-
-
-@lru_cache(maxsize=1)
-def _bookkeeping() -> frozenset[Any]:
-    """Return the methods by which rclpy forgets requests that have been answered."""
-    from rclpy.action import ActionClient
-    from rclpy.client import Client
-
-    return frozenset(
-        {
-            Client.remove_pending_request,
-            ActionClient._remove_pending_goal_request,
-            ActionClient._remove_pending_cancel_request,
-            ActionClient._remove_pending_result_request,
-        }
-    )
+            wait(self._core, "the run to end", patient=True)
 
 
 class WaitSetHandle:
-    """Stands in for ``_rclpy.WaitSet``, by which other executors wait."""
+    """Stands in for ``_rclpy.WaitSet``; rclpy's executors do without one here."""
 
     def __init__(self, *args: Any) -> None:
-        raise UnsupportedError(_SPIN)
+        raise UnsupportedError(
+            "a wait set of ones own cannot be simulated: let an executor wait "
+            "(wait_for_ready_callbacks of rclpy.executors.Executor)"
+        )
 
 
 __all__ = ["SimExecutor", "WaitSetHandle"]

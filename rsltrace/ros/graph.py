@@ -142,6 +142,11 @@ class Graph:
                 yield from (end._srv_type for end in service_ends if end.node is node)
         yield from (action.action_type for action in node.actions)
 
+    def endpoints_of(self, node: NodeHandle) -> list[Any]:
+        """Return a node's publishers, subscriptions, services and clients."""
+        kinds = (self._publishers, self._subscriptions, self._services, self._clients)
+        return [end for kind in kinds for ends in kind.values() for end in ends if end.node is node]
+
     def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every topic with its type, sorted by name."""
         topics: dict[str, str] = {}

@@ -48,6 +48,9 @@ class GuardConditionHandle(EntityHandle):
 
     def dispatch(self) -> None:
         """Run the callback once for all triggers until now."""
+        mailbox = self.node.mailbox if self.node is not None else None
+        if mailbox is not None and mailbox.keeps(self):
+            return
         wrapper = self.wrapper
         if not self._triggered or wrapper is None or self._destroyed:
             return

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.boundary import Boundary
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.core import Core
+    from rsltrace.ros.mailbox import Mailbox
     from rsltrace.ros.pubsub import PublisherHandle
 
 
@@ -53,7 +54,11 @@ class NodeHandle(EntityHandle):
             message = f"Failed to parse ROS arguments: {error}"
             raise real.RCLInvalidROSArgsError(message) from error
         # The job's arguments for this node are the process's arguments of ``ros2 run``.
-        self._outer = [context.arguments, *core.node_arguments] if use_global_arguments else []
+        program = core.program
+        own = core.node_arguments if program is core.host else program.parameters
+        self._outer = [context.arguments, *own] if use_global_arguments else []
+        self.program = program
+        self.core = core
         self.boundary = boundary
         self._context = context
         name, namespace = self._renamed(node_name, namespace)
@@ -67,8 +72,9 @@ class NodeHandle(EntityHandle):
         super().__init__(core, None)
         self.node = self
         self.policy = core.policy
+        self.mailbox: Mailbox | None = None
         self.rosout: PublisherHandle | None = None
-        self.log_exceptions = core.log_exceptions
+        self.log_exceptions = core.log_exceptions or program.log_exceptions
         self.actions: list[Any] = []
         core.graph.nodes.append(self)
         core.current_node = self
@@ -82,7 +88,11 @@ class NodeHandle(EntityHandle):
 
     def _outer_names(self) -> RosArguments | None:
         """Return the process-wide arguments that rename things: the job's, or the context's."""
-        return self._outer[min(1, len(self._outer) - 1)] if self._outer else None
+        if not self._outer:
+            return None
+        if self.program is not self.core.host:
+            return self._outer[0]  # of a main, the job's arguments are among the context's
+        return self._outer[min(1, len(self._outer) - 1)]
 
     def resolve(self, name: str, *, service: bool, only_expand: bool = False) -> str:
         """Return a topic or service name fully qualified and remapped.

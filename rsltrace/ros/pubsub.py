@@ -82,6 +82,7 @@ class PublisherHandle(EntityHandle):
         self._count += 1
         recorder = core.recorder
         if recorder is None:
+            core.unrecorded += 1
             digest = position = 0
         else:
             digest = hash64(data) if content_hash is None else content_hash

@@ -90,6 +90,9 @@ class EventHandle(EntityHandle):
 
     def dispatch(self) -> None:
         """Run the callback with the status."""
+        mailbox = self.node.mailbox if self.node is not None else None
+        if mailbox is not None and mailbox.keeps(self):
+            return
         wrapper = self.wrapper
         if wrapper is None or self._destroyed:
             return

@@ -19,6 +19,7 @@ from rsltrace.ros.introspection import (
     ServiceEvents,
     reconfigured,
 )
+from rsltrace.ros.mailbox import executor_of
 from rsltrace.ros.qos import Qos
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
 from rsltrace.ros.type_descriptions import answer
@@ -81,6 +82,7 @@ class _End(Receiver):
         core.loop.activity_ns = core.loop.now_ns
         recorder = core.recorder
         if recorder is None:
+            core.unrecorded += 1
             return 0, 0
         digest = hash64(data)
         if self._channel is None:
@@ -280,13 +282,14 @@ class ClientHandle(_End):
             future = self.wrapper.get_pending_request(request_id.sequence_number)
         except KeyError:
             return  # cancelled, or another server was faster
-        future._set_executor(self.core.executor)
+        executor = executor_of(self.core, self)
+        future._set_executor(executor)
         with future._lock:
             callbacks, future._callbacks = future._callbacks, []
         future.set_result(response)
         for callback in callbacks:
             if is_coroutine_function(callback):
-                self.core.executor.create_task(callback, future)
+                executor.create_task(callback, future)
             else:
                 callback(future)
 

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
+from rsltrace.ros.mailbox import executor_of
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.entity_handle import EntityHandle
+    from rsltrace.ros.mailbox import Mailbox
     from rsltrace.ros.node import NodeHandle
 
 is_coroutine_function = inspect.iscoroutinefunction
@@ -42,8 +44,10 @@ class TaskRun:
         kind: int,
         label: Callable[[], str],
         on_end: Callable[[], None] | None = None,
+        mailbox: Mailbox | None = None,
     ) -> None:
         self.core = core
+        self.mailbox = mailbox
         self.task = task
         self.entity = entity
         self.node = node
@@ -57,6 +61,8 @@ class TaskRun:
 
     def dispatch(self) -> None:
         """Run the task's next stretch."""
+        if self.mailbox is not None and self.mailbox.keeps(self):
+            return
         if self.task.done() or self.task.cancelled():
             self._end()
             return
@@ -140,27 +146,48 @@ def start_coroutine(
     wrapper = handle.wrapper
     run = TaskRun(
         core,
-        Task(callback, args, None, executor=core.executor),
+        Task(callback, args, None, executor=executor_of(core, handle)),
         entity=handle.entity_id,
         node=handle.node,
         kind=kind,
         label=handle.describe,
         on_end=lambda: groups.end(core, wrapper.callback_group, wrapper),
+        mailbox=handle.node.mailbox if handle.node is not None else None,
     )
     run.cause_event, run.cause_output, run.input_hash = cause_event, cause_output, input_hash
-    run.dispatch()
+    if run.mailbox is None:
+        run.dispatch()
+    else:
+        run.mailbox.run(run)  # the executor has it under way already
 
 
-def create_task(core: Core, callback: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
-    """Make a Task that runs right after the present event; it belongs to that event's entity."""
+def create_task(
+    core: Core,
+    callback: Any,
+    args: tuple[Any, ...],
+    kwargs: dict[str, Any],
+    *,
+    executor: Any = None,
+    mailbox: Mailbox | None = None,
+) -> Any:
+    """Make a Task that runs right after the present event; it belongs to that event's entity.
+
+    ``executor`` runs it: one of the user's own takes it from ``mailbox``, None is the run's.
+    """
     from rclpy.task import Task
 
-    task = Task(callback, args, kwargs, executor=core.executor)
+    task = Task(callback, args, kwargs, executor=executor or core.executor)
     entity, node = core.current_entity, core.current_node
     name = getattr(callback, "__qualname__", type(callback).__qualname__)
     owner = node.fully_qualified_name if node is not None else "the run"
     run = TaskRun(
-        core, task, entity=entity, node=node, kind=_TASK, label=lambda: f"{owner}: task {name}"
+        core,
+        task,
+        entity=entity,
+        node=node,
+        kind=_TASK,
+        label=lambda: f"{owner}: task {name}",
+        mailbox=mailbox,
     )
     run.cause_output = core.note(OutputKind.TASK, entity)
     run.input_hash = core.input_hash

@@ -62,6 +62,14 @@ class TimerHandle(EntityHandle):
         wrapper = self.wrapper
         core = self.core
         state = self.state
+        mailbox = self.node.mailbox  # type: ignore[union-attr]  # it has been activated
+        if mailbox is not None:
+            if mailbox.keeps(self):
+                core.loop.timers.remove(state)
+                return
+            if wrapper is None or state.canceled or state.deadline_ns > core.loop.now_ns:
+                return
+            core.loop.timers.add(state)
         group = wrapper.callback_group
         if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             core.loop.timers.remove(state)

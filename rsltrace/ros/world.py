@@ -23,9 +23,12 @@ from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.blocking import end_blocked, simulated_waiting
 from rsltrace.ros.boundary import Boundary, installed
 from rsltrace.ros.core import Core
+from rsltrace.ros.ending import end_programs
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
+from rsltrace.ros.own_executors import own_executors
+from rsltrace.ros.program import Program
 from rsltrace.ros.tasks import poll
 
 
@@ -45,6 +48,8 @@ class Entry:
     """Whether a callback of its nodes that raises is logged instead of ending the run."""
     key: str = ""
     policy: Policy | None = None
+    argv: list[str] | None = None
+    """The command line, if ``make`` is a main to be run in a program of its own."""
 
 
 class World:
@@ -64,11 +69,13 @@ class World:
         self._boundary: Boundary
         self._stack = ExitStack()
         self.nodes: list[Any] = []
+        self._begun = 0
 
     def __enter__(self) -> World:
         with ExitStack() as stack:
             self._boundary = stack.enter_context(installed())
             stack.enter_context(_fresh_rclpy(self._boundary))
+            stack.callback(_leave_program, self.core)
             self._boundary.enter(self.core)
             stack.callback(self._boundary.leave)
             import rclpy
@@ -76,6 +83,7 @@ class World:
             from rsltrace.ros.executor import SimExecutor
 
             stack.enter_context(simulated_waiting(self.core))
+            stack.enter_context(own_executors(self.core))
             rclpy.init(args=[])
             self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
@@ -100,17 +108,29 @@ class World:
         if self.core.error is not None and self.core.error.__cause__ is not None:
             traceback.clear_frames(self.core.error.__cause__.__traceback__)
         self.nodes.clear()
+        for program in self.core.programs:
+            program.forget()
         gc.collect()
 
     def use_network(self, plan: NetworkPlan) -> None:
         """Give what nodes send delays and losses. Before the first node is made."""
         self.core.network = Network(self.core, plan)
 
+    def plan(self, entries: Sequence[Entry]) -> None:
+        """Say what will be constructed: a main that ends must know of those that begin later."""
+        self.core.programs = [
+            Program(self.core, entry) for entry in entries if entry.argv is not None
+        ]
+
     # -- the stages of a run ---------------------------------------------------------------------
 
     def construct(self, entry: Entry) -> bool:
         """Construct one entry of the job as one event; return False if that ended the run."""
         core = self.core
+        if entry.argv is not None:
+            core.programs[self._begun].begin()
+            self._begun += 1
+            return core.loop.stopped is None
 
         def build() -> None:
             made = entry.make()
@@ -170,6 +190,7 @@ class World:
         core.next_runner().switch()
         if core.loop.stopped is None and core.runner_error is None:
             return  # paused
+        end_programs(core)
         end_blocked(core)
         if core.runner_error is not None:
             raise core.runner_error
@@ -183,6 +204,7 @@ class World:
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
         core = self.core
+        end_programs(core)
         end_blocked(core)  # constructors that still wait, if the run never began
         for node in self.nodes:
             core.shutdown_ns = 0
@@ -194,6 +216,11 @@ class World:
             )
 
     @property
+    def exit_code(self) -> int:
+        """The first exit status other than 0 with which a main ended."""
+        return next((p.exit_code for p in self.core.programs if p.exit_code), 0)
+
+    @property
     def error(self) -> RunError | None:
         """What went wrong, if anything did."""
         return self.core.error
@@ -202,6 +229,11 @@ class World:
 def _deadlock(waits: list[str]) -> str:
     lines = "\n".join(f"  {text}" for text in waits[:20])
     return f"nothing can happen any more, but somebody waits:\n{lines}"
+
+
+def _leave_program(core: Core) -> None:
+    if core.program is not core.host:
+        core.host.enter()
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import TYPE_CHECKING
@@ -65,7 +66,7 @@ def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
 
 
 def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
-    return frozenset(spec.target.partition(":")[0].partition(".")[0] for spec in nodes) - {
+    return frozenset(re.split("[:./]", spec.target)[0] for spec in nodes) - {
         "rsltrace",
         "rclpy",
     }

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import BagError, JobError, RunError
+from rsltrace.errors import BagError, RunError
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
@@ -28,6 +28,7 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
+from rsltrace.run.executables import main_of
 from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
@@ -57,6 +58,8 @@ class RunResult:
     stop_reason: str
     exit_code: int
     error: RunError | None = field(default=None, compare=False)
+    notes: tuple[str, ...] = ()
+    """What is worth saying of a run that went well: how mains ended."""
 
     @property
     def sim_seconds(self) -> str:
@@ -184,6 +187,8 @@ class Session:
 
             core.watch(self.job.stop.topic.name, watch_exit_code(core, self.job.stop.topic))
         with self._failures(), self._guarded.engaged():
+            self.world.plan(self._entries)
+            core.fed = bool(self._bags)
             for entry in self._entries:
                 if not self.world.construct(entry):
                     break
@@ -218,7 +223,7 @@ class Session:
         with self._guarded.engaged():
             self.world.destroy()
         error = self.world.error
-        exit_code = error.exit_code if error is not None else stop.exit_code
+        exit_code = error.exit_code if error else stop.exit_code or self.world.exit_code
         if self._writer is not None:
             self._writer.close(
                 result={
@@ -239,6 +244,7 @@ class Session:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
+            notes=tuple(core.notes),
         )
 
 
@@ -249,9 +255,6 @@ def _prepare(job: Job) -> list[Entry]:
     entries = []
     for index, spec in enumerate(job.nodes):
         where = locate(job, ("nodes", index, spec.kind))
-        if spec.node is None or not isinstance(spec.arguments, dict):
-            raise JobError(f"'{spec.kind}:' is not run yet by this version", where=where)
-        make: Any = load_target(spec.node, where=where) if isinstance(spec.node, str) else spec.node
         arguments = ros_arguments(
             name=spec.name,
             namespace=spec.namespace,
@@ -260,11 +263,21 @@ def _prepare(job: Job) -> list[Entry]:
             remappings=spec.remappings,
             where=where,
         )
+        make: Any
+        argv = None
+        if isinstance(spec.arguments, tuple) or spec.node is None:
+            name, make = main_of(spec, where=where)
+            argv = [name, *spec.arguments]
+        else:
+            target = spec.node
+            found = load_target(target, where=where) if isinstance(target, str) else target
+            make = partial(found, **spec.arguments)
         entries.append(
             Entry(
                 spec.target,
-                partial(make, **spec.arguments),
+                make,
                 arguments,
+                argv=argv,
                 log_exceptions=spec.on_exception == "log",
                 key=entry_key(spec, job.nodes[:index]),
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
