@@ -18,6 +18,8 @@ from rsltrace._version import __version__
 
 if TYPE_CHECKING:
     from rsltrace.diff import diff_files as diff
+    from rsltrace.diff.bag_model import BagDiff
+    from rsltrace.diff.bags import diff_bags
     from rsltrace.diff.model import Diff, Verdict
     from rsltrace.diff.options import DiffOptions
     from rsltrace.errors import RsltraceError
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _HOMES = {
+    "BagDiff": "rsltrace.diff.bag_model",
     "BagSpec": "rsltrace.job",
     "Diff": "rsltrace.diff.model",
     "DiffOptions": "rsltrace.diff.options",
@@ -39,11 +42,13 @@ _HOMES = {
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
     "Verdict": "rsltrace.diff.model",
+    "diff_bags": "rsltrace.diff.bags",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",
 }
 
 __all__ = [
+    "BagDiff",
     "BagSpec",
     "Diff",
     "DiffOptions",
@@ -59,6 +64,7 @@ __all__ = [
     "Verdict",
     "__version__",
     "diff",
+    "diff_bags",
     "load_job",
     "record",
 ]

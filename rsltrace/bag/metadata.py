@@ -47,7 +47,7 @@ def read_metadata(folder: Path, *, recover: bool = False) -> BagMetadata:
         if recover:
             return _without_metadata(folder)
         raise BagError(
-            f"{folder}: there is no {NAME}; make one with 'ros2 bag reindex {folder.name}', or "
+            f"{folder}: there is no {NAME}; make one with 'ros2 bag reindex {folder}', or "
             f"name a file in it ({', '.join(recordings)})"
         )
     values = _load(path)

@@ -11,22 +11,43 @@ loads nothing but names.
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping, Sequence
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from rsltrace.diff.model import Diff
 
+    Tolerances = Mapping[str, float] | Sequence[tuple[str, float]]
 
-def diff_files(a: Path | str, b: Path | str, **options: Any) -> Diff:
+
+def diff_files(
+    a: Path | str,
+    b: Path | str,
+    *,
+    context: int = 5,
+    everything: bool = False,
+    nodes: str | Sequence[str] = (),
+    topics: str | Sequence[str] = (),
+    ignore: str | Sequence[str] = (),
+    absolute: Tolerances = (),
+    relative: Tolerances = (),
+    window: int = 2000,
+) -> Diff:
     """Compare two traces: paths, or addresses such as ``https://…`` given as strings.
 
-    ``options`` are the fields of ``rsltrace.DiffOptions``: ``context``, ``everything``, ``nodes``,
-    ``topics``, ``ignore``, ``absolute``, ``relative``, ``window``.
+    ``context`` is the number of events told before a divergence. ``everything`` looks at both runs
+    to their ends and tells every independent divergence; else ``window`` events after the first
+    one are aligned. ``nodes`` and ``topics`` are globs of what to tell about.
 
-    Returns a ``rsltrace.Diff``; ``identical``, ``verdict`` and ``sentence`` say the most.
+    ``ignore`` are globs of fields that are not compared (``header.stamp``, ``/odom:twist``).
+    ``absolute`` and ``relative`` give tolerances by such globs: ``{"pose.*": 1e-6}``, or pairs.
+
+    Returns a ``rsltrace.Diff``; ``identical``, ``verdict`` and ``sentence`` say the most, and
+    ``rsltrace.diff.report.render`` makes a report of it. For recordings that are no traces there
+    is ``rsltrace.diff_bags``.
 
     Raises TraceError if a file is missing, damaged or no trace, or if an option makes no sense,
     and SetupError for an address when fsspec is not installed.
@@ -35,17 +56,40 @@ def diff_files(a: Path | str, b: Path | str, **options: Any) -> Diff:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.trace.reader import Trace
 
-    chosen = DiffOptions(**options)
+    chosen = DiffOptions(
+        context=context,
+        everything=everything,
+        nodes=_globs(nodes),
+        topics=_globs(topics),
+        ignore=_globs(ignore),
+        absolute=_pairs(absolute),
+        relative=_pairs(relative),
+        window=window,
+    )
     with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
         return diff_traces(trace_a, trace_b, chosen)
+
+
+def _globs(globs: str | Sequence[str]) -> tuple[str, ...]:
+    return (globs,) if isinstance(globs, str) else tuple(globs)
+
+
+def _pairs(tolerances: Tolerances) -> tuple[tuple[str, float], ...]:
+    return tuple(tolerances.items() if isinstance(tolerances, Mapping) else tolerances)
+
+
+def __getattr__(name: str) -> object:
+    if name == "__signature__":  # what help and notebooks show of something that can be called
+        import inspect
+
+        return inspect.signature(diff_files)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 class _CallablePackage(ModuleType):
     """So that ``rsltrace.diff`` is one thing, whether a function or a package is meant."""
 
-    def __call__(self, a: Path | str, b: Path | str, **options: Any) -> Diff:
-        return diff_files(a, b, **options)
+    __call__ = staticmethod(diff_files)
 
 
-_CallablePackage.__call__.__doc__ = diff_files.__doc__
 sys.modules[__name__].__class__ = _CallablePackage

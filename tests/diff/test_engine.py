@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import subprocess
 import sys
@@ -388,6 +389,17 @@ def test_the_function_is_also_the_package(tmp_path: Path) -> None:
     assert len(diff.divergences[0].before_a) == 2
     assert diff.verdict is rsltrace.Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     assert rsltrace.diff.engine.diff_traces is not None
+    assert list(inspect.signature(rsltrace.diff).parameters)[:3] == ["a", "b", "context"]
+    with pytest.raises(AttributeError, match=r"rsltrace\.diff.*nothing_of_that_name"):
+        _ = rsltrace.diff.nothing_of_that_name
+
+
+def test_options_in_the_shapes_that_come_to_mind(tmp_path: Path) -> None:
+    fault = Fault("bit", step(20, 1))
+    pairs = compare(tmp_path, fault, topics=["/l"], absolute=[("data", 1.0)], ignore="none")
+    mapping = compare(tmp_path, fault, topics="/l", absolute={"data": 1.0}, ignore=("none",))
+    assert pairs == mapping
+    assert pairs.notes == ()
 
 
 def test_options_that_make_no_sense(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,6 +25,7 @@ from std_msgs.msg import Float64, UInt64
 from std_srvs.srv import Trigger
 
 MODE = os.environ.get("FAULTY_MODE", "")  # what no trace tells: a hidden input
+AT = int(os.environ.get("FAULTY_AT", "7"))
 
 
 class Sensor(Node):
@@ -37,19 +40,19 @@ class Sensor(Node):
 
     def tick(self):
         self.count += 1
-        if MODE == "late" and self.count == 6:
+        if MODE == "late" and self.count == AT - 1:
             self.timer.timer_period_ns = 130_000_000
-        elif MODE == "late" and self.count == 7:
+        elif MODE == "late" and self.count == AT:
             self.timer.timer_period_ns = 100_000_000
         value = self.count * self.get_parameter("gain").value
-        if MODE == "bit" and self.count == 7:
+        if MODE == "bit" and self.count == AT:
             value += 1e-12
-        if MODE == "drop" and self.count == 7:
+        if MODE == "drop" and self.count == AT:
             return
-        if MODE == "raise" and self.count == 7:
+        if MODE == "raise" and self.count == AT:
             raise ValueError("the sensor is unplugged")
         self.publisher.publish(Float64(data=value))
-        if MODE == "extra" and self.count == 7:
+        if MODE == "extra" and self.count == AT:
             self.publisher.publish(Float64(data=value))
         if MODE == "random":
             self.publisher.publish(Float64(data=random.random()))
@@ -69,6 +72,10 @@ class Filter(Node):
     def got(self, message):
         self.heard += 1
         self.value = 0.5 * self.value + 0.5 * message.data
+        if MODE == "state" and self.heard == AT:
+            self.value += 1.0  # and in all it publishes from here on
+        if MODE == "silent" and self.heard == AT:
+            return
         self.publisher.publish(Float64(data=self.value))
         if self.heard % 3 == 0:
             self.client.call_async(Trigger.Request())
@@ -87,7 +94,7 @@ class Checker(Node):
         self.asked += 1
         response.success = True
         response.message = f"{self.asked}"
-        if MODE == "service" and self.asked == 2:
+        if MODE == "service" and self.asked == AT:
             response.message = "2 "
         return response
 '''
@@ -143,7 +150,10 @@ def test_a_node_that_misbehaves_once(
     root: Root,
     node: str,
     entity: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    if mode == "service":
+        monkeypatch.setenv("FAULTY_AT", "2")
     diff = diffed(mode)
     (first,) = diff.divergences
     assert (diff.verdict, first.root) == (verdict, root), diff.sentence
@@ -163,6 +173,38 @@ def test_a_node_that_misbehaves_once(
         assert [m.presence for m in first.messages] == ["only b"]
     if mode == "raise":
         assert "raised ValueError: the sensor is unplugged in b and not in a" in diff.sentence
+
+
+KINDS = {
+    "bit": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+    "drop": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+    "extra": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/sensor", "Sensor.tick"),
+    "raise": (Verdict.EXCEPTION, Root.EXCEPTION, "/sensor", "Sensor.tick"),
+    "state": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/filter", "/reading"),
+    "silent": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/filter", "/reading"),
+    "service": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/checker", "/check"),
+}
+CASES = int(os.environ.get("RSLTRACE_PLANTED", "8"))
+
+
+def test_a_fault_at_any_event_of_real_nodes(
+    diffed: Callable[..., Diff], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The callback that misbehaves is named, whichever it is and whenever. ``RSLTRACE_PLANTED``
+    sets how many are tried."""
+    rng = random.Random(CASES)
+    for number in range(CASES):
+        kind = rng.choice(sorted(KINDS))
+        at = rng.randrange(1, 7 if kind == "service" else 21)
+        monkeypatch.setenv("FAULTY_AT", str(at))
+        diff = diffed(kind)
+        (first,) = diff.divergences
+        assert first.a is not None
+        found = (diff.verdict, first.root, first.a.entity.node, first.a.entity.name)
+        assert found == KINDS[kind], f"case {number}: {kind} at {at}: {diff.sentence}"
+        assert first.a.position == at - 1
+        assert first.a.index == diff.agreeing
+    print(f"{CASES} of {CASES} right")
 
 
 def test_another_parameter(diffed: Callable[..., Diff]) -> None:
