@@ -1,18 +1,24 @@
-"""What a person sees: golden screens, readable colours in both themes.
+"""What a person sees: golden screens in every size and theme, readable colours in both themes.
+
+A screen is its text, and (NAME_THEME_80x24.txt) a map of the styles of its cells: a letter each,
+with a legend.
 
 ``UPDATE_GOLDEN=1 pytest tests/viewer/test_viewer_screens.py`` rewrites them; look at their diff.
 """
 
 from __future__ import annotations
 
+import string
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.cells import cell_len
 
 Drive = Callable[..., None]
 Golden = Callable[[str, str], None]
+GOLDEN = Path(__file__).parent / "golden"
 
 SIZES = [(80, 24), (120, 36), (200, 60)]
 SCREENS: dict[str, list[str]] = {
@@ -29,39 +35,77 @@ SCREENS: dict[str, list[str]] = {
 SCREENS_OF_TWO: dict[str, list[str]] = {"divergence": [], "report": ["v"], "plot_of_two": ["p"]}
 
 
-def _keys(keys: list[str]) -> list[str]:
-    return keys
+SIZE_IDS = [f"{width}x{height}" for width, height in SIZES]
+NAMES = [*SCREENS, *SCREENS_OF_TWO]
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-@pytest.mark.parametrize("name", [name for name in SCREENS if name != "palette"])
-def test_screens_of_one_trace(
-    made: Path, drive: Drive, golden: Golden, name: str, size: tuple[int, int]
+@pytest.fixture
+def shown(
+    made: Path, pair: tuple[Path, Path], drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., None]:
+    """``shown(name, check, size, light)`` calls ``check`` with the viewer at a screen."""
+
+    def show(name: str, check: Callable[[Any], None], size: tuple[int, int], light: bool) -> None:
+        async def steps(viewer: Any) -> None:
+            await viewer.press(*(SCREENS | SCREENS_OF_TWO)[name])
+            check(viewer)
+
+        monkeypatch.chdir(pair[0].parent)  # the report names the files as they were given
+        two = (Path(pair[0].name), Path(pair[1].name))
+        drive(two if name in SCREENS_OF_TWO else made, steps, size=size, light=light)
+
+    return show
+
+
+@pytest.mark.parametrize("size", SIZES, ids=SIZE_IDS)
+@pytest.mark.parametrize("name", NAMES)
+def test_text_of_screens(
+    shown: Callable[..., None], golden: Golden, name: str, size: tuple[int, int]
 ) -> None:
-    async def steps(viewer: Any) -> None:
-        await viewer.press(*SCREENS[name])
+    def check(viewer: Any) -> None:
         golden(f"{name}_{size[0]}x{size[1]}.txt", viewer.text)
 
-    drive(made, steps, size=size)
+    shown(name, check, size, light=False)
 
 
-@pytest.mark.parametrize("size", SIZES, ids=lambda size: f"{size[0]}x{size[1]}")
-@pytest.mark.parametrize("name", list(SCREENS_OF_TWO))
-def test_screens_of_two_traces(
-    pair: tuple[Path, Path],
-    drive: Drive,
-    golden: Golden,
-    monkeypatch: pytest.MonkeyPatch,
-    name: str,
-    size: tuple[int, int],
+@pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])
+@pytest.mark.parametrize("name", NAMES)
+def test_styles_of_screens(
+    shown: Callable[..., None], golden: Golden, name: str, light: bool
 ) -> None:
-    monkeypatch.chdir(pair[0].parent)  # the report names the files as they were given
+    def check(viewer: Any) -> None:
+        text = GOLDEN / f"{name}_80x24.txt"
+        assert viewer.text == text.read_text(encoding="utf-8")  # no theme changes what it says
+        golden(f"{name}_{'light' if light else 'dark'}_80x24.txt", _styles(viewer.app))
 
-    async def steps(viewer: Any) -> None:
-        await viewer.press(*SCREENS_OF_TWO[name])
-        golden(f"{name}_{size[0]}x{size[1]}.txt", viewer.text)
+    shown(name, check, (80, 24), light)
 
-    drive((Path(pair[0].name), Path(pair[1].name)), steps, size=size)
+
+def _styles(app: Any) -> str:
+    """Return the styles of the cells of a screen as a map, and a legend."""
+    legend: dict[str, str] = {}
+    lines = []
+    for strip in app.screen._compositor.render_strips(app.size):
+        line = ""
+        for text, style, _ in strip:
+            letter = legend.setdefault(_look(style), _LETTERS[len(legend)])
+            line += letter * cell_len(text)
+        lines.append(line)
+    return "\n".join([*lines, "", *(f"{letter} {look}" for look, letter in legend.items()), ""])
+
+
+_LETTERS = string.ascii_letters + string.digits
+
+
+def _look(style: Any) -> str:
+    if style is None:
+        return "plain"
+    marks = " ".join(name for name in _MARKS if getattr(style, name))
+    colours = " on ".join(c.name if c else "default" for c in (style.color, style.bgcolor))
+    return f"{colours} {marks}".strip()
+
+
+_MARKS = ("bold", "dim", "italic", "underline", "reverse")
 
 
 @pytest.mark.parametrize("light", [False, True], ids=["dark", "light"])

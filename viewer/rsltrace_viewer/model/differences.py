@@ -34,10 +34,13 @@ def pair_lines(comparison: Comparison, place: int, openness: Openness) -> list[L
     sign = comparison.sign(place)
     lines = list(_title(comparison, place, a, b, sign))
     try:
+        first = place == comparison.first_place
+        if first:  # the reason comes first: in a small terminal little else fits
+            lines += _why(comparison)
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _difference_lines(comparison, a, b, openness)
-        if place == comparison.first_place:
-            lines += _why(comparison)
+        if first and comparison.diff is not None and comparison.diff.divergences:
+            lines += chain_lines(comparison, comparison.diff.divergences[0])
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _cause_lines(comparison, a, b)
     except TraceError as error:
@@ -96,17 +99,13 @@ def _view(comparison: Comparison, a: int | None, b: int | None) -> EventView:
 
 
 def _why(comparison: Comparison) -> Iterator[Line]:
-    """Yield the first divergence as the diff explains it, with its cause chain as links."""
+    """Yield the reason of the first divergence, as the diff has it."""
     if comparison.diff is None:
-        yield Line(0, "why", "looking for the cause …", Role.SECTION, "why")
-        return
-    if not comparison.diff.divergences:
-        return
-    divergence = comparison.diff.divergences[0]
-    yield Line(0, "why", comparison.diff.verdict.value, Role.SECTION, "why")
-    sentence = divergence.root_sentence or divergence.sentence
-    yield Line(1, "", printable(sentence), Role.NOTE, "why.sentence")
-    yield from chain_lines(comparison, divergence)
+        yield Line(1, "why", "looking for the cause …", Role.NOTE, "why")
+    elif comparison.diff.divergences:
+        divergence = comparison.diff.divergences[0]
+        sentence = divergence.root_sentence or divergence.sentence
+        yield Line(1, "why", printable(sentence), Role.NOTE, "why")
 
 
 def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line]:
