@@ -8,6 +8,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.draw import draw_text
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, EventFlag, Output, OutputKind
+from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
@@ -47,7 +48,16 @@ class EventText:
         )
         what = ", ".join(self._output(output) for output in outputs)
         flags = "".join(f"  [{name}]" for name in _flag_names(event.flags))
-        return f"{columns}  {what}{flags}".rstrip()
+        found = self._trace.findings.get(event.index, ())
+        lines = [f"{columns}  {what}{flags}".rstrip(), *map(self._finding, found)]
+        return "\n".join(lines)
+
+    def _finding(self, finding: Finding) -> str:
+        where = printable(finding.stack.partition("\n")[0])
+        return (
+            f"{'':>{self._index_width}}  ! {finding.source.value} {finding.mode.value}: "
+            f"{printable(finding.call)} -> {printable(finding.value)}  at {where}"
+        )
 
     def _output(self, output: Output) -> str:
         name = self._names.get(output.entity, f"#{output.entity}")
@@ -98,6 +108,16 @@ class EventJson:
             "chain_hash": f"{event.chain_hash:016x}",
             "flags": _flag_names(event.flags),
             "outputs": [self._output(output) for output in outputs],
+            "findings": [
+                {
+                    "source": finding.source.value,
+                    "mode": finding.mode.value,
+                    "call": finding.call,
+                    "value": finding.value,
+                    "stack": finding.stack.splitlines(),
+                }
+                for finding in self._trace.findings.get(event.index, ())
+            ],
         }
 
     def _entity(self, entity_id: int) -> dict[str, Any]:

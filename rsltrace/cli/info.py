@@ -58,6 +58,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
             lines += ["", title, *table(rows)]
+    lines += _guard_lines(trace)
     lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
     return lines
 
@@ -85,6 +86,19 @@ def _node_lines(trace: Trace, counts: Counts) -> list[str]:
         rows.append((f"  {printable(node.name)}", str(len(owned)), str(events), str(outputs)))
     title = f"nodes: {len(nodes)}"
     return [title, *table(rows, right=frozenset((1, 2, 3)))] if nodes else [title]
+
+
+def _guard_lines(trace: Trace) -> list[str]:
+    """What the guard met, most worrying first; nothing for runs without such calls."""
+    if not trace.guarded:
+        return []
+    rows = [("  source", "done", "node", "call", "times")]
+    for met in sorted(trace.guarded, key=lambda met: (not met.is_finding, met.source, met.node)):
+        row = (f"  {met.source.value}", met.mode.value, printable(met.node) or "-")
+        rows.append((*row, printable(met.call), str(met.count)))
+    findings = sum(met.count for met in trace.guarded if met.is_finding)
+    title = f"guard: {findings} findings" if findings else "guard: nothing that could differ"
+    return ["", title, *table(rows, right=frozenset((4,)))]
 
 
 def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
@@ -132,6 +146,16 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
         "result": trace.result,
         "job": trace.job,
         "environment": trace.environment,
+        "guard": [
+            {
+                "source": met.source.value,
+                "mode": met.mode.value,
+                "node": met.node,
+                "call": met.call,
+                "count": met.count,
+            }
+            for met in trace.guarded
+        ],
         "nodes": [node.name for node in _nodes(trace)],
         "entities": [
             {

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.errors import JobError, NodeError
+from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
@@ -113,10 +114,12 @@ def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
         if isinstance(error, NodeError) and error.traceback_text:
             click.echo(error.traceback_text.rstrip(), err=True)
         click.echo(f"rsltrace: error: {error}", err=True)
+    _warn(result)
     if as_json:
         click.echo(
             json.dumps(
                 {
+                    "findings": sum(met.count for met in result.guarded if met.is_finding),
                     "path": str(path),
                     "digest": result.digest,
                     "events": result.events,
@@ -132,6 +135,26 @@ def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
         return
     click.echo(f"wrote {path}: {result.stop_reason}", err=True)
     click.echo(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
+
+
+def _warn(result: RunResult) -> None:
+    """Say what could make another run differ; the trace has every single call."""
+    found = [met for met in result.guarded if met.is_finding]
+    if not found:
+        return
+    calls: dict[tuple[str, str], int] = {}
+    for met in found:
+        key = (met.source.value, f"{met.call} in {met.node or 'the run'}")
+        calls[key] = calls.get(key, 0) + met.count
+    click.echo("guard: these calls can make runs differ (see docs/guard.md):", err=True)
+    for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
+        times = f", {count} times" if count > 1 else ""
+        click.echo(f"  {source}: {printable(call)}{times}", err=True)
+    if len(calls) > _SHOWN_MAX:
+        click.echo(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}", err=True)
+
+
+_SHOWN_MAX = 8
 
 
 @contextmanager

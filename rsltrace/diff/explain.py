@@ -6,10 +6,12 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from rsltrace.diff.calls import call_differences
 from rsltrace.diff.cause import NODE, Found, Mark
 from rsltrace.diff.classify import ROOT_OF, Case, Judgement, judge
 from rsltrace.diff.evidence import message_differences
 from rsltrace.diff.model import (
+    CallDifference,
     CauseStep,
     Divergence,
     EventView,
@@ -193,15 +195,17 @@ class Explainer:
     ) -> Divergence:
         place_a = judgement.a.index if judgement.a is not None else found.place_a
         place_b = judgement.b.index if judgement.b is not None else found.place_b
+        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b)
         bare = Divergence(
             verdict=judgement.verdict,
             sentence=judgement.sentence,
             a=judgement.a,
             b=judgement.b,
             root=judgement.root,
-            root_sentence=judgement.root_sentence,
+            root_sentence=_with_call(judgement, calls),
             chain=self._chain(found),
             messages=messages,
+            calls=calls,
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
         )
@@ -255,6 +259,15 @@ class Explainer:
         if view.kind is EventKind.CONSTRUCT:
             choice = " --kind construct"
         return f"rsltrace cat {path}{choice} --from {until} --to {until} --json --payloads"
+
+
+def _with_call(judgement: Judgement, calls: Sequence[CallDifference]) -> str:
+    """Add to the root the first call that can explain it."""
+    if judgement.root is not Root.CALLBACK or not calls:
+        return judgement.root_sentence
+    call = calls[0]
+    differs = "gave different answers" if call.a != call.b else "was called in it"
+    return f"{judgement.root_sentence}; {call.call} at {call.where} {differs}"
 
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))

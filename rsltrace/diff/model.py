@@ -151,6 +151,22 @@ class MessageDifference:
 
 
 @dataclass(frozen=True, slots=True)
+class CallDifference:
+    """A call whose answer came from outside, in a diverging event or (``event_*``) before it.
+
+    ``a`` and ``b`` are what it gave, as text; None where a run did not make the call.
+    """
+
+    source: str
+    call: str
+    where: str
+    event_a: int | None
+    event_b: int | None
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class CauseStep:
     """One step of the way from the root to the divergence, root first.
 
@@ -191,6 +207,7 @@ class Divergence:
     root_sentence: str
     chain: tuple[CauseStep, ...] = ()
     messages: tuple[MessageDifference, ...] = ()
+    calls: tuple[CallDifference, ...] = ()
     before_a: tuple[EventView, ...] = ()
     before_b: tuple[EventView, ...] = ()
     same_node_a: tuple[EventView, ...] = ()

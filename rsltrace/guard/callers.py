@@ -13,9 +13,12 @@ _PYTHON = tuple(
     for path in {sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")}
 )
 _INSTALLED = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
+_MIDDLEWARE = ("rclpy", "rpyutils", "ament_index_python", "rosidl_parser", "rosidl_pycommon")
 _LINES_MAX = 6
 
-_USER, _LIBRARY, _OURS, _IMPORT = range(4)
+_USER, _STANDARD, _LIBRARY, _OURS, _IMPORT = range(5)
+_CALLS_BACK = (os.path.join("ros", "core.py"), f"{os.sep}rclpy{os.sep}")
+"""Those of our files that call callbacks."""
 _kinds: dict[str, int] = {}
 
 
@@ -25,11 +28,15 @@ def _kind_of(file: str) -> int:
         if file.startswith("<frozen importlib"):
             kind = _IMPORT
         elif file.startswith(_GUARD):
-            kind = _LIBRARY  # a redirected function: its caller counts
-        elif file.startswith(_HERE):
-            kind = _OURS
-        elif any(part in file for part in _INSTALLED) or file.startswith(("<frozen", *_PYTHON)):
+            kind = _STANDARD  # a redirected function: its caller counts
+        elif file.startswith(_HERE) or any(
+            f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
+        ):
+            kind = _OURS  # rclpy, too: what it looks at is not the user's doing
+        elif any(part in file for part in _INSTALLED):
             kind = _LIBRARY
+        elif file.startswith(("<frozen", *_PYTHON)):
+            kind = _STANDARD
         else:
             kind = _USER
         _kinds[file] = kind
@@ -40,13 +47,20 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     """Return the innermost frame of user code that led to ``frame``, or None if none did.
 
     User code is what lies outside of Python and of the installed packages, or in ``packages``
-    (where installed nodes are). What a library does while it is imported is not the user's doing.
+    (where installed nodes are), and a callback in a library. What a library does while it is
+    imported is not the user's doing, nor is what rsltrace and rclpy do for themselves.
     """
+    library = None
     while frame is not None:
-        kind = _kind_of(frame.f_code.co_filename)
+        file = frame.f_code.co_filename
+        kind = _kind_of(file)
         if kind == _USER or (packages and is_in(frame, packages)):
             return frame
-        if kind != _LIBRARY:
+        if kind == _LIBRARY:
+            library = frame
+        elif kind == _OURS:
+            return library if any(part in file for part in _CALLS_BACK) else None
+        elif kind == _IMPORT:
             return None
         frame = frame.f_back
     return None

@@ -51,7 +51,7 @@ def clock_call(
     mode = guard.mode(Source.CLOCK, frame)
     if mode is Mode.VIRTUAL:
         guard.clock_read()
-        guard.count(Source.CLOCK, mode, call)
+        guard.count(Source.CLOCK, mode, call, frame)
         return virtual(guard.context.now_ns())
     if mode is Mode.ALLOW:
         return real()

@@ -54,7 +54,7 @@ def _listing(name: str, arrange: Callable[[Any], Any], real: Callable[..., Any])
         frame = sys._getframe(1)
         mode = guard.mode(Source.DIRECTORY, frame)
         if mode is Mode.VIRTUAL:
-            guard.count(Source.DIRECTORY, mode, call)
+            guard.count(Source.DIRECTORY, mode, call, frame)
             return arrange(value)
         if mode is not Mode.ALLOW:
             shown = repr(value[:10]) if isinstance(value, list) else ""

@@ -20,8 +20,12 @@ from typing import Any, Protocol
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import module_of, stack_of, user_frame
 from rsltrace.guard.outside import Outside
+from rsltrace.guard.redirect import copy_of
 from rsltrace.guard.streams import Streams
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
+
+_thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
+_process_id = copy_of(os.getpid)  # type: ignore[arg-type]
 
 FINDINGS_PER_EVENT = 100
 """An event that looks at the address of a million objects is one problem, not a million."""
@@ -71,8 +75,8 @@ class Guard:
         self.streams = Streams(seed)
         self.outside: Outside = Outside()
         self._policy = policy
-        self._thread = threading.get_ident()
-        self._process = os.getpid()
+        self._thread = _thread_id()
+        self._process = _process_id()
         self._event = -1
         self._in_event = 0
         self._reads = 0
@@ -80,7 +84,7 @@ class Guard:
 
     def in_charge(self) -> bool:
         """Return whether the calling thread is the simulation's (and no child process)."""
-        return threading.get_ident() == self._thread and os.getpid() == self._process
+        return bool(_thread_id() == self._thread and _process_id() == self._process)
 
     def mode(self, source: Source, frame: FrameType) -> Mode:
         """Return what the job says about ``source`` in the code of ``frame``."""
@@ -100,9 +104,14 @@ class Guard:
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 
-    def count(self, source: Source, mode: Mode, call: str) -> None:
-        """Count a call that is no finding."""
-        self.counts[source, mode, self.context.node(), call] += 1
+    def is_user(self, frame: FrameType) -> bool:
+        """Return whether a frame is user code itself."""
+        return user_frame(frame, self.packages) is frame
+
+    def count(self, source: Source, mode: Mode, call: str, frame: FrameType) -> None:
+        """Count a call of user code that is no finding."""
+        if user_frame(frame, self.packages) is not None:
+            self.counts[source, mode, self.context.node(), call] += 1
 
     def found(self, source: Source, mode: Mode, call: str, value: object, frame: FrameType) -> None:
         """Report a call; ``frame`` is where it was made.

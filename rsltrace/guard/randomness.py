@@ -43,7 +43,7 @@ def _drawn(
         frame = sys._getframe(1)
         mode = guard.mode(Source.RANDOM, frame)
         if mode is Mode.VIRTUAL:
-            guard.count(Source.RANDOM, mode, call)
+            guard.count(Source.RANDOM, mode, call, frame)
             return virtual(guard, frame)(*arguments, **options)
         if mode is Mode.ALLOW:
             return real(*arguments, **options)

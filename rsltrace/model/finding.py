@@ -86,3 +86,19 @@ class Finding:
     call: str
     value: str
     stack: str
+
+
+@dataclass(frozen=True, slots=True)
+class GuardCount:
+    """How often a node made one call in a run, and what was done about it."""
+
+    source: Source
+    mode: Mode
+    node: str
+    call: str
+    count: int
+
+    @property
+    def is_finding(self) -> bool:
+        """Whether runs may differ because of it: it was not made by the run itself."""
+        return self.mode is not Mode.VIRTUAL

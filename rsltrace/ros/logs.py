@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.guard.watch import text_with_address
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_seconds
 from rsltrace.ros.pubsub import PublisherHandle
@@ -72,6 +73,8 @@ class Logs:
         from builtin_interfaces.msg import Time
         from rcl_interfaces.msg import Log
 
+        if " at 0x" in message:
+            text_with_address(message)
         now_ns = self._core.loop.now_ns
         severity = int(severity)
         if self._echo:

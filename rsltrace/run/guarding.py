@@ -11,7 +11,10 @@ from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.randomness import begin_shared
 from rsltrace.job import Job, NodeSpec, policy_of
-from rsltrace.model.finding import Finding
+from rsltrace.model.finding import Finding, GuardCount
+from rsltrace.trace.format import METADATA_GUARD
+from rsltrace.trace.guarded import counts_text
+from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -29,7 +32,14 @@ class Guarding:
         from rsltrace.ros.guarded import GuardContext
 
         def on_finding(finding: Finding) -> None:
-            pass
+            if core.recorder is None:
+                early.append(finding)  # of an import, before there is a trace
+                return
+            for one in [*early, finding]:
+                core.recorder.finding(one, core.loop.now_ns)
+            early.clear()
+
+        early: list[Finding] = []
 
         job = self._job
         if job.guard.enabled:
@@ -41,6 +51,17 @@ class Guarding:
                 on_finding=on_finding,
             )
             begin_shared(job.seed)
+
+    @property
+    def counts(self) -> tuple[GuardCount, ...]:
+        """How often each call was met so far."""
+        counts = self.guard.counts if self.guard is not None else {}
+        return tuple(GuardCount(*key, count) for key, count in sorted(counts.items()))
+
+    def write(self, writer: TraceWriter) -> None:
+        """Put the summary into the trace, if there is anything to say."""
+        if self.counts:
+            writer.add_metadata(METADATA_GUARD, {"calls": counts_text(self.counts)})
 
     def engaged(self) -> AbstractContextManager[None]:
         """Put the guard in charge of what this thread does now."""

@@ -19,6 +19,7 @@ from rsltrace.job import Job, locate, policy_of
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
+from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.bags import (
     BagInput,
@@ -60,6 +61,8 @@ class RunResult:
     error: RunError | None = field(default=None, compare=False)
     notes: tuple[str, ...] = ()
     """What is worth saying of a run that went well: how mains ended."""
+    guarded: tuple[GuardCount, ...] = ()
+    """How often the guard met each call, and what was done about it."""
 
     @property
     def sim_seconds(self) -> str:
@@ -225,6 +228,7 @@ class Session:
         error = self.world.error
         exit_code = error.exit_code if error else stop.exit_code or self.world.exit_code
         if self._writer is not None:
+            self._guarded.write(self._writer)
             self._writer.close(
                 result={
                     "start_time": str(self.start_ns),
@@ -245,6 +249,7 @@ class Session:
             exit_code=exit_code,
             error=error,
             notes=tuple(core.notes),
+            guarded=self._guarded.counts,
         )
 
 

@@ -1,7 +1,7 @@
-"""The two rsltrace messages that hold strings, as CDR.
+"""The rsltrace messages that hold strings, as CDR.
 
-Events and outputs are fixed-size and packed by ``struct``; entities and details are few and small,
-and writing them needs four rules of CDR, not a code generator.
+Events and outputs are fixed-size and packed by ``struct``; the others are few and small, and
+writing them needs four rules of CDR, not a code generator.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import struct
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.finding import Finding, Mode, Source
 from rsltrace.trace.format import CDR_HEADER
 
 _ENTITY_HEAD = struct.Struct("<IIB")
@@ -57,6 +58,24 @@ def unpack_detail(data: bytes) -> tuple[int, int, str]:
         return event, output, text
     except (struct.error, ValueError) as error:
         raise TraceError(f"a detail of the trace cannot be read: {error}") from error
+
+
+def pack_finding(finding: Finding) -> bytes:
+    """Return an ``rsltrace_msgs/msg/Finding``."""
+    head = CDR_HEADER + _DETAIL_HEAD.pack(finding.event, finding.entity)
+    texts = (finding.source.value, finding.mode.value, finding.call, finding.value, finding.stack)
+    return _append_strings(head, finding.node, *texts)
+
+
+def unpack_finding(data: bytes) -> Finding:
+    """Return the finding of one message. Raises TraceError when the bytes are not one."""
+    try:
+        _check_header(data)
+        event, entity = _DETAIL_HEAD.unpack_from(data, 4)
+        node, source, mode, *texts = _read_strings(data, 4 + _DETAIL_HEAD.size, 6)
+        return Finding(event, entity, node, Source(source), Mode(mode), *texts)
+    except (struct.error, ValueError) as error:
+        raise TraceError(f"a finding of the trace cannot be read: {error}") from error
 
 
 def _append_strings(head: bytes, *texts: str) -> bytes:

@@ -20,6 +20,7 @@ TOPIC_EVENTS = "/rsltrace/events"
 TOPIC_OUTPUTS = "/rsltrace/outputs"
 TOPIC_ENTITIES = "/rsltrace/entities"
 TOPIC_DETAILS = "/rsltrace/details"
+TOPIC_FINDINGS = "/rsltrace/findings"
 TOPIC_ROSOUT = "/rosout"
 PREFIX_OWN = "/rsltrace/"
 PREFIX_REQUEST = "/rsltrace/request"
@@ -30,6 +31,7 @@ METADATA_FORMAT = "rsltrace:format"
 METADATA_JOB = "rsltrace:job"
 METADATA_SOURCES = "rsltrace:sources"
 METADATA_ENVIRONMENT = "rsltrace:environment"
+METADATA_GUARD = "rsltrace:guard"
 METADATA_RESULT = "rsltrace:result"
 METADATA_ROSBAG2 = "rosbag2"
 ATTACHMENT_JOB = "job.yaml"
@@ -54,6 +56,7 @@ SCHEMA_EVENT = "rsltrace_msgs/msg/CallbackEvent"
 SCHEMA_OUTPUT = "rsltrace_msgs/msg/CallbackOutput"
 SCHEMA_ENTITY = "rsltrace_msgs/msg/Entity"
 SCHEMA_DETAIL = "rsltrace_msgs/msg/Detail"
+SCHEMA_FINDING = "rsltrace_msgs/msg/Finding"
 
 SCHEMA_TEXT = {
     SCHEMA_EVENT: """\
@@ -89,6 +92,16 @@ string detail        # JSON object
 uint64 event
 uint32 output        # which output of the event
 string text
+""",
+    SCHEMA_FINDING: """\
+uint64 event         # index of the event it happened in
+uint32 entity        # id in /rsltrace/entities of what ran
+string node          # fully qualified name
+string source        # clock, random, file, ...
+string mode          # record, warn, error
+string call
+string value         # what the call gave
+string stack         # lines of user code, innermost first
 """,
 }
 

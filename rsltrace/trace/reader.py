@@ -19,12 +19,14 @@ import numpy.typing as npt
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
-from rsltrace.trace.cdr import unpack_detail, unpack_entity
+from rsltrace.model.finding import Finding, GuardCount
+from rsltrace.trace.cdr import unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.check import check_data_section, check_hashes
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_ENVIRONMENT,
+    METADATA_GUARD,
     METADATA_JOB,
     METADATA_RESULT,
     PREFIX_REQUEST,
@@ -32,9 +34,11 @@ from rsltrace.trace.format import (
     TOPIC_DETAILS,
     TOPIC_ENTITIES,
     TOPIC_EVENTS,
+    TOPIC_FINDINGS,
     TOPIC_OUTPUTS,
     TOPIC_ROSOUT,
 )
+from rsltrace.trace.guarded import parse_counts
 from rsltrace.trace.index import (
     ChannelInfo,
     Header,
@@ -266,6 +270,22 @@ class Trace:
         bounds = np.array([index, index + 1], dtype=np.uint64)
         low, high = np.searchsorted(outputs["event"], bounds).tolist()
         return [output_of(row) for row in outputs[low:high]]
+
+    # What the guard found.
+
+    @cached_property
+    def findings(self) -> dict[int, list[Finding]]:
+        """What the guard found, by event and in order; events without findings are missing."""
+        findings: dict[int, list[Finding]] = {}
+        for _, _, data in self.messages(TOPIC_FINDINGS):
+            finding = unpack_finding(data)
+            findings.setdefault(finding.event, []).append(finding)
+        return findings
+
+    @cached_property
+    def guarded(self) -> tuple[GuardCount, ...]:
+        """How often the guard met each call; empty for a run without guard, or cut off."""
+        return parse_counts(self.metadata(METADATA_GUARD).get("calls", "[]"))
 
     # Payloads.
 

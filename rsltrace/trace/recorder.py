@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
+from rsltrace.model.finding import Finding
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import EVENT_REST, OUTPUT
 from rsltrace.trace.writer import TraceWriter
@@ -70,6 +71,10 @@ class Recorder:
         """Add an output that is described by a text (which itself is not hashed)."""
         sequence = self.writer.add_detail(self.index, self.outputs, stamp_ns, text)
         return self.output(kind, entity, content_hash, sequence)
+
+    def finding(self, finding: Finding, stamp_ns: int) -> None:
+        """Write down what the guard found in the event under way. It is not hashed."""
+        self.writer.add_finding(finding, stamp_ns)
 
     def entity(self, entity: Entity) -> None:
         """Write down an entity. Its content is part of the event that created it."""

@@ -20,8 +20,9 @@ from rsltrace._version import __version__
 from rsltrace.errors import OutputError
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE
+from rsltrace.model.finding import Finding
 from rsltrace.trace import chunks
-from rsltrace.trace.cdr import pack_detail, pack_entity
+from rsltrace.trace.cdr import pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
@@ -38,12 +39,14 @@ from rsltrace.trace.format import (
     SCHEMA_DETAIL,
     SCHEMA_ENTITY,
     SCHEMA_EVENT,
+    SCHEMA_FINDING,
     SCHEMA_OUTPUT,
     SCHEMA_TEXT,
     SEGMENT_DTYPE,
     TOPIC_DETAILS,
     TOPIC_ENTITIES,
     TOPIC_EVENTS,
+    TOPIC_FINDINGS,
     TOPIC_OUTPUTS,
 )
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
@@ -209,6 +212,11 @@ class TraceWriter:
     def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
         """Take the text of output number ``output`` of ``event``. Returns its sequence."""
         return self.add_payload(self._detail_channel, stamp_ns, pack_detail(event, output, text))
+
+    def add_finding(self, finding: Finding, stamp_ns: int) -> int:
+        """Take a finding of the guard. Its channel is there once there is something in it."""
+        channel_id = self._own_channel(TOPIC_FINDINGS, SCHEMA_FINDING)
+        return self.add_payload(channel_id, stamp_ns, pack_finding(finding))
 
     def close(self, *, result: Mapping[str, str]) -> None:
         """Write what is left, then the indexes, and close the file.

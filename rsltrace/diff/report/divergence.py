@@ -43,6 +43,7 @@ def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> 
     """Return what a report says of one divergence: what, why, what was before, what it reaches."""
     return [
         _event(found, width),
+        _calls(found, width),
         _cause(found, width),
         *_before(found, width, options),
         _reaches(found, width),
@@ -104,6 +105,26 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
     if not message.preview and (message.presence == "both" or message.reason):
         rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
     return rows
+
+
+def _calls(found: Divergence, width: int) -> Section:
+    """Return what the guard found: calls in the event, or before it in the node."""
+    if not found.calls:
+        return NOTHING
+    rows = []
+    here = {view.index for view in (found.a, found.b) if view is not None}
+    for call in found.calls:
+        events = [event for event in (call.event_a, call.event_b) if event is not None]
+        earlier = "" if here.intersection(events) else f", event {events[0]}"
+        mark = ("! ", BAD) if call.a != call.b else ("= ", FAINT)
+        rows.append(cut(line("  ", mark, f"{call.source}: {printable(call.call)}{earlier}"), width))
+        if call.a != call.b:
+            for name, style, value in (("a", SIDE_A, call.a), ("b", SIDE_B, call.b)):
+                text = "not called" if value is None else printable(value)
+                rows.append(cut(line("      ", (f"{name} ", style), text), width))
+        rows.append(cut(line((f"      at {printable(call.where)}", FAINT)), width))
+    title = "calls in it whose answers come from outside"
+    return Section(line((title, TITLE)), rows, 8, "lines", least=3)
 
 
 def _cause(found: Divergence, width: int) -> Section:

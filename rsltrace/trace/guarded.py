@@ -1,0 +1,26 @@
+"""The guard's summary of a run, as the metadata ``rsltrace:guard`` holds it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+
+from rsltrace.errors import TraceError
+from rsltrace.model.finding import GuardCount, Mode, Source
+
+
+def counts_text(counts: Iterable[GuardCount]) -> str:
+    """Return the summary as JSON, in an order of its own."""
+    rows = [[c.source.value, c.mode.value, c.node, c.call, c.count] for c in counts]
+    return json.dumps(sorted(rows), ensure_ascii=False)
+
+
+def parse_counts(text: str) -> tuple[GuardCount, ...]:
+    """Return the summary of ``counts_text``. Raises TraceError for anything else."""
+    try:
+        return tuple(
+            GuardCount(Source(source), Mode(mode), str(node), str(call), int(count))
+            for source, mode, node, call, count in json.loads(text)
+        )
+    except (ValueError, TypeError, RecursionError) as error:
+        raise TraceError(f"the guard's summary in the trace cannot be read: {error}") from error

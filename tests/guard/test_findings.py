@@ -1,0 +1,190 @@
+"""What cannot be made deterministic is found: in the trace, info, cat and diff, or as an error."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.errors import GuardError, JobError
+from rsltrace.job import load_job
+from rsltrace.model.finding import Mode, Source
+from rsltrace.run import run
+from rsltrace.trace.reader import Trace
+from tests.guard.conftest import node_code
+
+pytestmark = pytest.mark.ros
+
+NAME = "N." if sys.version_info >= (3, 11) else ""
+TICK, INIT = f"m.py:15 in {NAME}tick", f"m.py:9 in {NAME}__init__"
+READS = node_code(
+    "self.say(os.environ.get('SHIFT', '0'))",
+    imports="import os",
+    init="self.token = os.getenv('MY_TOKEN')",
+)
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Callable[..., Any]:
+    """Write and record a job of node ``m:N``; its result."""
+
+    def go(code: str, guard: str = "{}", name: str = "run") -> Any:
+        (tmp_path / "m.py").write_text(code)
+        (tmp_path / "job.yaml").write_text(
+            f"nodes: [{{node: 'm:N'}}]\nstop: {{duration: 1.2s}}\nguard: {guard}\n"
+        )
+        return run(load_job(tmp_path / "job.yaml"), tmp_path / f"{name}.mcap", force=True)
+
+    return go
+
+
+def test_a_finding_says_where_what_and_what_it_gave(
+    recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SHIFT", "7")
+    monkeypatch.setenv("MY_TOKEN", "s3cret")
+    result = recorded(READS)
+    with Trace.open(result.path) as trace:
+        found = [f for findings in trace.findings.values() for f in findings]
+        assert [(f.event, f.node, f.call, f.value) for f in found][1:] == [
+            (1, "/n", "os.environ['SHIFT']", "'7'"),
+            (2, "/n", "os.environ['SHIFT']", "'7'"),
+        ]
+        assert found[0].value.startswith("SHA-256 "), "what may be a secret is not written down"
+        assert {(f.source, f.mode) for f in found} == {(Source.ENVIRONMENT, Mode.WARN)}
+        assert found[1].stack == TICK
+        assert trace.guarded == result.guarded
+    assert b"s3cret" not in result.path.read_bytes()
+
+
+def test_findings_change_no_digest(
+    recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    warned = recorded(READS)
+    allowed = recorded(READS, "{environment: allow}", "allowed")
+    assert warned.digest == allowed.digest
+    assert not allowed.guarded
+    with Trace.open(allowed.path) as trace:
+        assert trace.findings == {}
+        assert "/rsltrace/findings" not in {c.topic for c in trace.channels.values()}
+
+
+def test_an_error_ends_the_run_and_says_what_to_do(recorded: Callable[..., Any]) -> None:
+    result = recorded(READS, "{environment: error}")
+    assert isinstance(result.error, GuardError)
+    assert result.exit_code == 3
+    assert "os.environ['MY_TOKEN'] at " + INIT in str(result.error)
+    assert "make it a parameter of the node" in str(result.error)
+    with Trace.open(result.path) as trace:
+        assert [f.mode for f in trace.findings[0]] == [Mode.ERROR]
+
+
+@pytest.mark.parametrize("call", ["time.time()", "random.random()", "random.Random()"])
+def test_what_could_be_virtual_may_be_an_error_too(recorded: Callable[..., Any], call: str) -> None:
+    code = node_code(call, imports="import random, time")
+    result = recorded(code, "{clock: error, random: error}")
+    assert isinstance(result.error, GuardError)
+    assert TICK in str(result.error)
+
+
+def test_modules_on_the_list_are_allowed(recorded: Callable[..., Any]) -> None:
+    assert not recorded(READS, "{environment: {mode: error, allow: [m]}}").error
+    assert recorded(READS, "{environment: {mode: error, allow: [m.*, other]}}").error
+
+
+def test_imports_are_watched_and_libraries_are_not(recorded: Callable[..., Any]) -> None:
+    code = node_code(
+        "logging.getLogger('x').debug('y'); copy.deepcopy({1: [2]}); json.dumps({1: 2})",
+        imports="import copy, json, logging, os, wave, sqlite3\nX = os.environ.get('SHIFT')",
+    )
+    counted = [(met.call, met.node, met.count) for met in recorded(code).guarded if met.is_finding]
+    assert counted == [("os.environ['SHIFT']", "", 1)]
+
+
+def test_a_million_calls_in_an_event_are_not_a_million_records(
+    recorded: Callable[..., Any],
+) -> None:
+    result = recorded(node_code("for _ in range(3000): id(self)"))
+    with Trace.open(result.path) as trace:
+        assert [len(found) for found in trace.findings.values()] == [100, 100]
+    assert [met.count for met in result.guarded] == [6000]
+
+
+def test_info_cat_and_diff_tell(
+    recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    recorded(READS, name="a")
+    monkeypatch.setenv("SHIFT", "9")
+    recorded(READS, name="b")
+
+    def command(*arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-m", "rsltrace", *arguments],
+            cwd=tmp_path,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode in (0, 1), done.stderr
+        return done.stdout
+
+    assert "guard: 3 findings" in command("info", "a.mcap")
+    assert "! environment warn: os.environ['SHIFT'] -> '9'  at " + TICK in command("cat", "b.mcap")
+    last = json.loads(command("cat", "b.mcap", "--json", "--kind", "timer").splitlines()[0])
+    assert last["findings"][0]["value"] == "'9'"
+    report = command("diff", "a.mcap", "b.mcap")
+    assert "verdict: same-input-different-output" in report
+    assert "! environment: os.environ['SHIFT']\n      a not set\n      b '9'" in report
+    assert "gave different answers" in report
+    as_json = json.loads(command("diff", "a.mcap", "b.mcap", "--format", "json"))
+    assert as_json["divergences"][0]["calls"][0] == {
+        "source": "environment",
+        "call": "os.environ['SHIFT']",
+        "where": TICK,
+        "event_a": 1,
+        "event_b": 1,
+        "a": "not set",
+        "b": "'9'",
+    }
+
+
+def test_a_diff_remembers_what_the_node_read_before(
+    recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rsltrace.diff import diff_files
+
+    code = node_code(
+        "self.say(self.shift)", imports="import os", init="self.shift = os.environ.get('SHIFT')"
+    )
+    a = recorded(code, name="a")
+    monkeypatch.setenv("SHIFT", "9")
+    b = recorded(code, name="b")
+    (found,) = diff_files(str(a.path), str(b.path)).divergences
+    assert [(c.call, c.event_a, c.a, c.b) for c in found.calls] == [
+        ("os.environ['SHIFT']", 0, "not set", "'9'")
+    ]
+    assert f"os.environ['SHIFT'] at {INIT} gave different answers" in (found.root_sentence)
+
+
+@pytest.mark.parametrize(
+    ("guard", "message"),
+    [
+        ("{clock: vrtual}", "guard.clock: expected one of virtual, record, warn, error, allow"),
+        ("{thread: virtual}", "the answers of this source cannot be made 'virtual'"),
+        ("{process: record}", "what this source answers cannot be recorded"),
+        ("{clok: warn}", "unknown key 'clok' in guard; did you mean 'clock'?"),
+        ("{file: {mode: warn, allow: [a/b]}}", "expected the name of a module"),
+        ("{state: maybe}", "guard.state: expected true, false or record"),
+    ],
+)
+def test_mistakes_in_guard_point_at_their_line(
+    recorded: Callable[..., Any], guard: str, message: str
+) -> None:
+    with pytest.raises(JobError, match=r"job\.yaml:3:") as raised:
+        recorded(node_code("pass"), guard)
+    assert message in str(raised.value)
