@@ -314,6 +314,8 @@ def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]
     sender, that of ``a``. The order does not matter."""
     if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
         return []
+    if len(a) == 1 == len(b):  # as most events: counting would take ten times as long
+        return [*a] if a[0][:2] == b[0][:2] else [*a, *b]
     theirs = Counter(output[:3] for output in b)
     mine = Counter(output[:3] for output in a)
     result = list(_beyond(a, theirs))

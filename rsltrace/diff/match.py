@@ -11,7 +11,6 @@ from bisect import bisect_left, bisect_right
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median_low
 
 NO_CAUSE = -1
 """The cause of an event that nothing caused."""
@@ -196,8 +195,8 @@ class _Matching:
 
 def _usual_gap(stamps: Sequence[int]) -> int:
     """Return the usual time between events; -1 if there are too few to tell."""
-    gaps = [late - early for early, late in itertools.pairwise(stamps)]
-    return median_low(gaps) if gaps else -1
+    gaps = sorted(late - early for early, late in itertools.pairwise(stamps))
+    return gaps[(len(gaps) - 1) // 2] if gaps else -1
 
 
 def _between(positions: list[int], begin: int, end: int) -> list[int]:

@@ -7,13 +7,17 @@ and the runs otherwise did the same things at the same times.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.bag_model import BagDiff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.reader import Trace
+
+if TYPE_CHECKING:
+    from rsltrace.diff.bag_model import BagDiff
 
 _SAME_EVENTS = "stamp entity kind flags outputs cause_event cause_output".split()
 _SAME_OUTPUTS = "event entity kind".split()

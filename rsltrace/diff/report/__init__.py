@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
-from rsltrace.diff.bag_model import BagDiff
 from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import HEIGHT, Line, plain_text
 from rsltrace.errors import TraceError
+
+if TYPE_CHECKING:
+    from rsltrace.diff.bag_model import BagDiff
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
 
@@ -31,7 +34,7 @@ def render(
     ``width`` is that of text lines. Raises TraceError for another format.
     """
     options = options or DiffOptions()
-    several = [diff] if isinstance(diff, (Diff, BagDiff)) else list(diff)
+    several = list(diff) if isinstance(diff, Sequence) else [diff]
     if not several:
         raise TraceError("there is nothing to report: no run was compared")
     if format == "text":
@@ -69,7 +72,7 @@ def report_lines(
         from rsltrace.diff.report.text import trace_report
 
         return trace_report(diff, options, width, height)
-    if isinstance(diff, BagDiff):
+    if not isinstance(diff, Sequence):
         from rsltrace.diff.report.bag_text import bag_report
 
         return bag_report(diff, options, width, height)
