@@ -19,7 +19,7 @@ $(INSTALLED): pyproject.toml
 		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
 	@echo "setting up $(VENV) (once, about a minute)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,view,remote,rerun,dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,view,graph,remote,rerun,dev]'
 	@touch $@
 
 demo: $(INSTALLED)

@@ -1,0 +1,127 @@
+"""``rsltrace check``: what a job means, and what its graph looks like, without running it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.cli.record import SET
+from rsltrace.cli.text import table
+from rsltrace.errors import EXIT_USAGE, NodeError, OutputError, RunError
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration, format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.job import Job
+    from rsltrace.ros.overview import Link
+    from rsltrace.run.checking import Checked
+
+
+@click.command()
+@click.argument("job", type=click.Path(path_type=Path))
+@SET
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("text", "json")),
+    default="text",
+    show_default=True,
+    help="What to print: text for people, or JSON with every default filled in.",
+)
+@click.option(
+    "--graph",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE.svg",
+    help="Draw the graph of nodes and topics.",
+)
+@click.option(
+    "--all", "everything", is_flag=True, help="With what every node has: /rosout, parameters, …"
+)
+def check(
+    job: Path, overrides: tuple[str, ...], form: str, graph: Path | None, everything: bool
+) -> int:
+    """Check JOB and print what it means: the job with all its parts, and the graph of its nodes.
+
+    The nodes are constructed (so their constructors run), the loop never is: what a node creates
+    later, in a callback, is not seen.
+
+    The exit status is 0 if all is well, 1 if something in the graph looks wrong (QoS that keeps a
+    publisher and a subscription apart, a subscription or a client without anybody at the other
+    end), 2 if the job cannot run.
+    """
+    from rsltrace.job import load_job
+    from rsltrace.run.checking import check_job
+
+    loaded = load_job(job, overrides=overrides)
+    try:
+        checked = check_job(loaded, everything=everything)
+    except RunError as error:
+        if isinstance(error, NodeError) and error.traceback_text:
+            click.echo(error.traceback_text.rstrip(), err=True)
+        click.echo(f"rsltrace: error: {error}", err=True)
+        return EXIT_USAGE
+    if graph is not None:
+        _draw(checked, graph)
+    if form == "json":
+        click.echo(json.dumps(_values(loaded, checked), indent=2))
+    else:
+        for note in checked.notes:
+            click.echo(f"rsltrace: note: {note}", err=True)
+        click.echo("\n".join(map(printable, _text(loaded, checked))))
+    return 1 if checked.overview.problems else 0
+
+
+def _draw(checked: Checked, path: Path) -> None:
+    from rsltrace.cli.graph_svg import graph_svg
+
+    picture = graph_svg(checked.overview)
+    try:
+        path.write_text(picture, encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _values(job: Job, checked: Checked) -> dict[str, Any]:
+    return {
+        "job": job.resolved(),
+        "start_ns": checked.start_ns,
+        "graph": asdict(checked.overview),
+        "notes": list(checked.notes),
+    }
+
+
+def _text(job: Job, checked: Checked) -> list[str]:
+    found = checked.overview
+    lines = ["job:", *(f"  {line}" for line in job.to_yaml().splitlines()), ""]
+    lines += [f"starts at simulated time {format_seconds(checked.start_ns)} s", ""]
+    lines.append("nodes:")
+    for node in found.nodes:
+        lines.append(f"  {node.name}  {node.type}".rstrip())
+        lines += [
+            f"    timer {name} every {format_duration(period)}" for name, period in node.timers
+        ]
+    for kind in ("topic", "service", "action"):
+        links = found.of_kind(kind)
+        if links:
+            lines += ["", f"{kind}s:"]
+            lines += [f"  {line}" for line in table([_row(link) for link in links])]
+    for wait in found.waiting:
+        lines += ["", *f"still {wait}".splitlines()]
+    lines.append("")
+    if found.problems:
+        lines += ["to look at:", *(f"  {problem}" for problem in found.problems)]
+    else:
+        lines.append("nothing looks wrong")
+    return lines
+
+
+def _row(link: Link) -> list[str]:
+    senders, receivers = (
+        ", ".join(dict.fromkeys(end.node for end in ends)) or "nobody"
+        for ends in (link.senders, link.receivers)
+    )
+    return [link.name, link.type, senders, "->", receivers]

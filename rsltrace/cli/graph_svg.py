@@ -1,0 +1,248 @@
+"""The graph of a job as a picture: nodes and what connects them, from left to right.
+
+The layers, their order and the routes of the edges are fast-sugiyama's (no Graphviz needed); boxes,
+arrows and text are drawn here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import pairwise
+from typing import Literal
+from xml.sax.saxutils import escape
+
+from rsltrace.errors import SetupError
+from rsltrace.model.printable import printable
+from rsltrace.ros.overview import End, Link, Overview
+
+_CHARACTER = 7.3
+_ROW = 54.0
+_BOX_HEIGHT = 28.0
+_GAP = 70.0
+_MARGIN = 24.0
+_STYLE = """\
+text { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; fill: #1f2328; }
+.small { font-size: 10px; fill: #57606a; }
+.node rect { fill: #ddf4ff; stroke: #0969da; }
+.topic rect { fill: #ffffff; stroke: #8c959f; }
+.service rect { fill: #fff8c5; stroke: #9a6700; }
+.action rect { fill: #fbefff; stroke: #8250df; }
+.edge { fill: none; stroke: #57606a; stroke-width: 1.3; }
+.apart { stroke: #cf222e; stroke-dasharray: 5 4; stroke-width: 1.6; }
+.lonely rect { stroke-dasharray: 3 3; }
+"""
+
+
+@dataclass
+class _Box:
+    """A node or a link: what is written in it, and where its middle is."""
+
+    label: str
+    kind: str
+    title: str
+    lonely: bool = False
+    x: float = 0.0
+    y: float = 0.0
+
+    @property
+    def width(self) -> float:
+        return len(self.label) * _CHARACTER + 22
+
+
+@dataclass
+class _Edge:
+    """An arrow between boxes; ``both`` has one at either end, ``apart`` never connects."""
+
+    source: int
+    target: int
+    both: bool = False
+    apart: str = ""
+    through: list[tuple[float, float]] = field(default_factory=list)
+
+
+def graph_svg(overview: Overview) -> str:
+    """Return the picture of a graph, the same for the same graph.
+
+    :raises SetupError: if the library that lays it out is not installed.
+    """
+    boxes, edges = _boxes_and_edges(overview)
+    if edges:
+        _lay_out(boxes, edges)
+    _place_alone(boxes, edges)
+    return "\n".join(_svg(boxes, edges)) + "\n"
+
+
+def _boxes_and_edges(overview: Overview) -> tuple[list[_Box], list[_Edge]]:
+    boxes = [_Box(node.name, "node", node.type) for node in overview.nodes]
+    number = {node.name: index for index, node in enumerate(overview.nodes)}
+    edges: list[_Edge] = []
+    for link in overview.links:
+        here = len(boxes)
+        lonely = not link.senders or not link.receivers
+        boxes.append(_Box(link.name, link.kind, link.type, lonely))
+        senders = _numbers(link.senders, number, boxes)
+        receivers = _numbers(link.receivers, number, boxes)
+        for sender in senders:
+            both = sender in receivers
+            edges.append(_Edge(sender, here, both, _apart(link, boxes[sender].label, 0)))
+        edges += [
+            _Edge(here, receiver, apart=_apart(link, boxes[receiver].label, 1))
+            for receiver in receivers
+            if receiver not in senders
+        ]
+    return boxes, edges
+
+
+def _numbers(ends: tuple[End, ...], number: dict[str, int], boxes: list[_Box]) -> list[int]:
+    found: dict[int, None] = {}
+    for end in ends:
+        name = end.node
+        if name not in number:  # the bag player, or a node that is gone
+            number[name] = len(boxes)
+            boxes.append(_Box(name, "node", ""))
+        found[number[name]] = None
+    return list(found)
+
+
+def _apart(link: Link, name: str, side: Literal[0, 1]) -> str:
+    """Return the policies by which a node connects with nobody at the other end."""
+    apart = [pair for pair in link.apart if pair[side].node == name]
+    others = {end.node for end in (link.senders if side else link.receivers)}
+    partners = {(receiver if side == 0 else sender).node for sender, receiver, _ in apart}
+    if others and partners >= others:
+        return ", ".join(dict.fromkeys(pair[2] for pair in apart))
+    return ""
+
+
+def _lay_out(boxes: list[_Box], edges: list[_Edge]) -> None:
+    if find_spec("fast_sugiyama") is None:
+        raise SetupError(
+            "drawing a graph needs fast-sugiyama, which is not installed; install it with "
+            "pip install 'rsltrace[graph]' (Python 3.11 or newer)"
+        )
+    from fast_sugiyama import from_edges
+
+    # Its vertices are the boxes in order of use, so that equal graphs give equal pictures.
+    pairs = [(edge.source, edge.target) for edge in edges]
+    above = 0.0
+    placed: dict[int, tuple[float, float]] = {}
+    for positions, _, height, layout_edges in from_edges(pairs, vertex_spacing=_ROW):
+        points = {vertex: (height - y, x) for vertex, (x, y) in positions}
+        top = min(y for _, y in points.values())
+        bottom = max(y for _, y in points.values())
+        points = {vertex: (x, y - top + above) for vertex, (x, y) in points.items()}
+        above += bottom - top + _ROW * 1.5
+        placed.update((v, p) for v, p in points.items() if 0 <= v < len(boxes))
+        _route(edges, points, layout_edges or [], len(boxes))
+    layers = sorted({x for x, _ in placed.values()})
+    left = _columns(boxes, placed, layers)
+    for vertex, (x, y) in placed.items():
+        boxes[vertex].x, boxes[vertex].y = left[x], y
+    for edge in edges:
+        edge.through = [(left.get(x, x), y) for x, y in edge.through]
+
+
+def _columns(
+    boxes: list[_Box], placed: dict[int, tuple[float, float]], layers: list[float]
+) -> dict[float, float]:
+    """Return the middle of each layer: as wide as its widest box."""
+    middles, at = {}, 0.0
+    for layer in layers:
+        width = max(boxes[v].width for v, (x, _) in placed.items() if x == layer)
+        middles[layer] = at + width / 2
+        at += width + _GAP
+    return middles
+
+
+def _route(
+    edges: list[_Edge],
+    points: dict[int, tuple[float, float]],
+    pieces: list[tuple[int, int]],
+    real: int,
+) -> None:
+    """Let long edges go through the dummy vertices that the layout gave them."""
+    following: dict[int, list[int]] = {}
+    for source, target in pieces:
+        following.setdefault(source, []).append(target)
+    for edge in edges:
+        for step in following.get(edge.source, []):
+            chain: list[int] = []
+            while step >= real and len(chain) < len(points):
+                chain.append(step)
+                step = following.get(step, [edge.target])[0]
+            if step == edge.target:
+                edge.through = [points[vertex] for vertex in chain]
+                break
+
+
+def _place_alone(boxes: list[_Box], edges: list[_Edge]) -> None:
+    """Put what is connected with nothing into rows below the rest."""
+    connected = {end for edge in edges for end in (edge.source, edge.target)}
+    bottom = max((boxes[i].y for i in connected), default=-_ROW)
+    right = max((boxes[i].x + boxes[i].width / 2 for i in connected), default=0.0)
+    x, y = 0.0, bottom + _ROW * 1.2
+    for index, box in enumerate(boxes):
+        if index in connected:
+            continue
+        if x and x + box.width > max(right, 800.0):
+            x, y = 0.0, y + _ROW
+        box.x, box.y = x + box.width / 2, y
+        x += box.width + 30
+
+
+def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
+    points = [(x, y) for edge in edges for x, y in edge.through]
+    left = min([box.x - box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
+    right = max([box.x + box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
+    top = min([box.y for box in boxes] + [y for _, y in points] + [0.0]) - _BOX_HEIGHT
+    bottom = max([box.y for box in boxes] + [y for _, y in points] + [0.0]) + _BOX_HEIGHT
+    width, height = right - left + 2 * _MARGIN, bottom - top + 2 * _MARGIN
+    yield (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
+        f'viewBox="{left - _MARGIN:.1f} {top - _MARGIN:.1f} {width:.1f} {height:.1f}">'
+    )
+    yield f"<style>{_STYLE}</style>"
+    yield (
+        '<defs><marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
+        'markerHeight="7" orient="auto-start-reverse"><path d="M0 0 L8 4 L0 8 z" fill="#57606a"/>'
+        "</marker></defs>"
+    )
+    yield (
+        f'<rect x="{left - _MARGIN:.1f}" y="{top - _MARGIN:.1f}" width="{width:.1f}" '
+        f'height="{height:.1f}" fill="#ffffff"/>'
+    )
+    for edge in edges:
+        yield _path(boxes[edge.source], boxes[edge.target], edge)
+    for box in boxes:
+        yield _drawn(box)
+    yield "</svg>"
+
+
+def _path(source: _Box, target: _Box, edge: _Edge) -> str:
+    points = [(source.x, source.y), *edge.through, (target.x, target.y)]
+    sides = [1 if b[0] >= a[0] else -1 for a, b in (points[:2], points[-2:])]
+    points[0] = (source.x + sides[0] * source.width / 2, source.y)
+    points[-1] = (target.x - sides[1] * (target.width / 2 + 2), target.y)
+    path = f"M{points[0][0]:.1f} {points[0][1]:.1f}"
+    for (ax, ay), (bx, by) in pairwise(points):
+        bend = (bx - ax) / 2
+        path += f" C{ax + bend:.1f} {ay:.1f} {bx - bend:.1f} {by:.1f} {bx:.1f} {by:.1f}"
+    start = ' marker-start="url(#head)"' if edge.both else ""
+    style = "edge apart" if edge.apart else "edge"
+    title = f"<title>does not connect: {escape(edge.apart)}</title>" if edge.apart else ""
+    return f'<path class="{style}" d="{path}" marker-end="url(#head)"{start}>{title}</path>'
+
+
+def _drawn(box: _Box) -> str:
+    width, x, y = box.width, box.x - box.width / 2, box.y - _BOX_HEIGHT / 2
+    radius = 6 if box.kind == "node" else _BOX_HEIGHT / 2
+    lonely = " lonely" if box.lonely else ""
+    label, title = escape(printable(box.label)), escape(printable(box.title))
+    return (
+        f'<g class="{box.kind}{lonely}"><title>{title}</title>'
+        f'<rect x="{x:.1f}" y="{y:.1f}" width="{width:.1f}" height="{_BOX_HEIGHT:.0f}" '
+        f'rx="{radius:.0f}"/><text x="{box.x:.1f}" y="{box.y + 4:.1f}" '
+        f'text-anchor="middle">{label}</text></g>'
+    )

@@ -1,0 +1,170 @@
+"""``rsltrace check``: what a job means and who talks to whom, without a callback being run."""
+
+from __future__ import annotations
+
+import json
+import xml.etree.ElementTree as ET
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.job import load_job
+from rsltrace.run.checking import check_job
+
+NODES = """
+from test_msgs.action import Fibonacci
+from rclpy.action import ActionClient, ActionServer
+from rclpy.qos import qos_profile_sensor_data
+from std_srvs.srv import Trigger
+
+class Sensor(Node):
+    def __init__(self):
+        super().__init__('sensor')
+        self.publisher = self.create_publisher(UInt64, 'raw', qos_profile_sensor_data)
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        raise AssertionError('no callback runs')
+
+class Filter(Node):
+    def __init__(self):
+        super().__init__('filter')
+        self.create_subscription(UInt64, 'raw', print, 10)
+        self.create_subscription(UInt64, 'nothing', print, 10)
+        self.out = self.create_publisher(UInt64, 'smooth', 10)
+        self.client = self.create_client(Trigger, 'reset')
+        self.action = ActionServer(self, Fibonacci, 'count', print)
+
+class Caller(Node):
+    def __init__(self):
+        super().__init__('caller')
+        self.action = ActionClient(self, Fibonacci, 'count')
+        self.create_subscription(UInt64, 'smooth', print, 10)
+
+class Broken(Node):
+    def __init__(self):
+        super().__init__('broken')
+        raise ValueError('not today')
+"""
+
+JOB = """
+nodes:
+  - node: nodes_under_test:Sensor
+  - node: nodes_under_test:Filter
+  - node: nodes_under_test:Caller
+stop: {duration: 5s}
+"""
+
+FINE = "nodes: [{node: nodes_under_test:Talker}, {node: nodes_under_test:Listener}]\n"
+
+EXPECTED = """\
+job:
+  nodes:
+    - node: nodes_under_test:Sensor
+    - node: nodes_under_test:Filter
+    - node: nodes_under_test:Caller
+  stop:
+    duration: 2s
+
+starts at simulated time 0.000000000 s
+
+nodes:
+  /sensor  nodes_under_test:Sensor
+    timer Sensor.tick every 100 ms
+  /filter  nodes_under_test:Filter
+  /caller  nodes_under_test:Caller
+
+topics:
+  /nothing  std_msgs/msg/UInt64  nobody   ->  /filter
+  /raw      std_msgs/msg/UInt64  /sensor  ->  /filter
+  /smooth   std_msgs/msg/UInt64  /filter  ->  /caller
+
+services:
+  /reset  std_srvs/srv/Trigger  /filter  ->  nobody
+
+actions:
+  /count  test_msgs/action/Fibonacci  /caller  ->  /filter
+
+to look at:
+  service /reset: /filter calls, and nobody serves
+  topic /nothing: /filter subscribes, and nobody publishes
+  topic /raw: /sensor and /filter do not connect: reliability \
+(/sensor offers best effort, volatile, keep last 5; \
+/filter asks for reliable, volatile, keep last 10)
+"""
+
+
+def test_the_report_of_a_job(rsltrace: Any, job_file: Callable[..., Path], tmp_path: Path) -> None:
+    job_file(JOB, NODES)
+    done = rsltrace("check", "job.yaml", "--set", "stop.duration=2s", "--graph", "g.svg")
+    assert done.stderr == ""
+    assert done.stdout == EXPECTED
+    assert done.returncode == 1
+    picture = (tmp_path / "g.svg").read_text("utf-8")
+    texts = [e.text for e in ET.fromstring(picture).iter() if e.tag.endswith("}text")]
+    assert sorted(filter(None, texts)) == [
+        "/caller", "/count", "/filter", "/nothing", "/raw", "/reset", "/sensor", "/smooth"
+    ]  # fmt: skip
+    assert picture.count('class="edge apart"') == 2  # both halves of /raw
+    assert {path.name for path in tmp_path.iterdir()} >= {"job.yaml", "g.svg"}
+    assert not list(tmp_path.glob("*.mcap"))
+
+
+def test_a_job_in_which_nothing_is_wrong(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+    job_file(FINE)
+    done = rsltrace("check", "job.yaml", "--format", "json")
+    assert done.returncode == 0
+    values = json.loads(done.stdout)
+    assert values["job"]["livelock_limit"] == 100_000
+    assert values["graph"]["problems"] == []
+    (link,) = values["graph"]["links"]
+    assert (link["name"], link["senders"][0]["node"]) == ("/numbers", "/talker")
+
+
+@pytest.mark.parametrize(
+    ("job", "expected"),
+    [
+        (FINE.replace("Listener", "Broken"), "ValueError: not today"),
+        (FINE + "sede: 1\n", "job.yaml:2:1: unknown key 'sede'; did you mean 'seed'?"),
+        (FINE.replace("Listener", "Lisener"), "did you mean 'Listener'?"),
+    ],
+)
+def test_a_job_that_cannot_run(
+    rsltrace: Any, job_file: Callable[..., Path], job: str, expected: str
+) -> None:
+    job_file(job, NODES)
+    done = rsltrace("check", "job.yaml")
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert done.stdout == ""
+
+
+def test_everything_includes_what_each_node_has(job_file: Callable[..., Path]) -> None:
+    job = load_job(job_file(FINE))
+    few = {link.name for link in check_job(job).overview.links}
+    many = {link.name for link in check_job(job, everything=True).overview.links}
+    assert few == {"/numbers"}
+    assert {"/numbers", "/rosout", "/talker/get_parameters"} <= many
+
+
+def test_a_constructor_that_waits_is_named(job_file: Callable[..., Path]) -> None:
+    code = """
+class Waits(Node):
+    def __init__(self):
+        super().__init__('waits')
+        self.get_clock().sleep_for(rclpy.duration.Duration(seconds=1))
+"""
+    job = load_job(job_file("nodes: [{node: nodes_under_test:Waits}]\n", "import rclpy\n" + code))
+    (waiting,) = check_job(job).overview.waiting
+    assert waiting.startswith("constructing nodes_under_test:Waits waits for a time to come")
+
+
+def test_the_picture_of_a_graph_is_the_same_every_time(job_file: Callable[..., Path]) -> None:
+    pytest.importorskip("fast_sugiyama")
+    from rsltrace.cli.graph_svg import graph_svg
+
+    job = load_job(job_file(JOB, NODES))
+    pictures = {graph_svg(check_job(job).overview) for _ in range(3)}
+    assert len(pictures) == 1
