@@ -73,7 +73,7 @@ pictures: $(INSTALLED)
 	cd sample_traces/delayed_input && $(abspath $(BIN))/rsltrace view a.mcap --at 252 \
 		--export $(PICTURES)/view.svg
 	cd sample_traces/schedule && $(VIEW) --light --keys p --export $(PICTURES)/view_plot.svg
-	cd $(SAMPLE) && $(abspath $(BIN))/rsltrace rerun a.mcap b.mcap -o $(abspath $(OUT))/pictures.rrd
+	cd $(SAMPLE) && $(abspath $(BIN))/rsltrace rerun a.mcap b.mcap -o $(abspath $(OUT))/pictures.rrd --force
 	$(BIN)/python -m rsltrace_viewer.rerun_export.picture $(OUT)/pictures.rrd \
 		$(PICTURES)/rerun_two.png sim_time 2.1
 

@@ -153,7 +153,7 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
         tmux("send-keys", "/", "kind:srv", "Enter")
         wait_for("srv", "/check")
         tmux("resize-window", "-x", "150", "-y", "40")
-        wait_for("exit code", "13/603")
+        wait_for("digest 6aa85b69f4342806", "13/603")
         assert tmux("display-message", "-p", "#{alternate_on}").strip() == "1"
         tmux("send-keys", "q")
         assert "Traceback" not in wait_for("left with 0")

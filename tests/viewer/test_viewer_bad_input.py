@@ -69,6 +69,8 @@ def test_a_trace_that_was_cut_off(tmp_path: Path, drive: Drive) -> None:
         assert "not finished" in viewer.text
         assert 0 < viewer.app.session.a.count < 9000
         await viewer.press(*EVERY_KEY)
+        await viewer.resize(60, 20)
+        assert "not finished" in viewer.text
 
     drive(path, steps)
 

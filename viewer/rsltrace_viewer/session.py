@@ -305,18 +305,19 @@ class Session:
     def facts(self) -> str:
         """Return a line of facts about it."""
         trace = self.a.trace
-        parts = [f"{self.a.count:,} events"]
+        parts = [f"{self.a.count:,} event{'' if self.a.count == 1 else 's'}"]
         if self.b is not None and self.b.count != self.a.count:
             parts[0] = f"{self.a.count:,} and {self.b.count:,} events"
-        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
-        nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
-        parts.append(f"{nodes} nodes")
-        if self.b is None:
-            parts.append(f"digest {trace.digest}")
+        # What is wrong comes early: little fits into a narrow terminal.
         unfinished = [r.name for r in (self.a, self.b) if r is not None and not r.trace.complete]
         if unfinished:
             parts.append("not finished" if self.b is None else f"{unfinished[0]} is not finished")
         reason = trace.result.get("exit_code", "0")
         if self.b is None and reason != "0":
             parts.append(f"exit code {reason}")
+        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
+        nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
+        parts.append(f"{nodes} nodes")
+        if self.b is None:
+            parts.append(f"digest {trace.digest}")
         return "  ".join(parts)
