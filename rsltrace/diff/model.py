@@ -207,13 +207,13 @@ class Divergence:
     root_sentence: str
     chain: tuple[CauseStep, ...] = ()
     messages: tuple[MessageDifference, ...] = ()
-    calls: tuple[CallDifference, ...] = ()
     before_a: tuple[EventView, ...] = ()
     before_b: tuple[EventView, ...] = ()
     same_node_a: tuple[EventView, ...] = ()
     same_node_b: tuple[EventView, ...] = ()
     reaches: tuple[Reach, ...] = ()
     next_step: str = ""
+    calls: tuple[CallDifference, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from rsltrace.diff.model import Setting
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 
+_NOTHING = ("null", "[]", "{}")
 _ENTITIES_MAX = 50
 _LINES_MAX = 20_000
 """Longer job files are compared as a whole: difflib takes time with the square of the lines."""
@@ -28,10 +29,21 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
     # line (--seed) is only there. What the lines show already is not said twice.
     shown = " ".join(f"{setting.a} {setting.b}" for setting in found)
     for path, value_a, value_b in _differences("", resolved_a, resolved_b):
-        key = path.rpartition(".")[2].partition("[")[0]
-        if key.removesuffix("_ns") not in shown:
+        key = path.rpartition(".")[2].partition("[")[0].removesuffix("_ns")
+        if (value_a is None or value_b is None) and not _names_of_users(path):
+            # A key that only one version of rsltrace knows is no difference unless it was given.
+            value, text = (value_b, b.job_text) if value_a is None else (value_a, a.job_text)
+            if value in _NOTHING or (text and key not in text):
+                continue
+        if key not in shown:
             found.append(Setting(f"job: {path}", value_a, value_b))
     return tuple(found)
+
+
+def _names_of_users(path: str) -> bool:
+    """Whether a key of the job is a name that its author chose, not one that rsltrace knows."""
+    parents = path.split(".")[:-1]
+    return any(parent in ("arguments", "parameters", "remappings") for parent in parents)
 
 
 def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:

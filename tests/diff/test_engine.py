@@ -421,14 +421,15 @@ def test_a_resolved_job_that_differs_is_a_setting(tmp_path: Path) -> None:
         resolved = {"seed": 0, "nodes": [{"parameters": {"x": 1.0}}], "stop": {"events": None}}
         a.job["resolved"] = json.dumps(resolved)
         resolved["seed"] = 5
-        resolved["nodes"] = [{"parameters": {"x": 2.0, "y": True}}]
+        resolved["nodes"] = [{"parameters": {"x": 2.0, "yaw_rate": True}, "later": None}]
+        resolved["of_a_later_version"] = {"mode": "virtual"}
         b.job["resolved"] = json.dumps(resolved)
         found = {s.place: (s.a, s.b) for s in job_settings(a, b)}
     assert found == {
         "job: seed": ("0", "5"),
         "job: nodes[0].parameters.x": ("1.0", "2.0"),
-        "job: nodes[0].parameters.y": (None, "true"),
-    }
+        "job: nodes[0].parameters.yaw_rate": (None, "true"),
+    }, "keys that only one version of rsltrace knows are no difference of the jobs"
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:

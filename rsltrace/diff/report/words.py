@@ -68,7 +68,8 @@ def message_title(message: MessageDifference) -> str:
     else:
         verb = _VERBS.get(message.kind, message.kind.label)
         what = f"output {message.position}: {verb}" if message.position >= 0 else f"input: {verb}"
-    text = f"{what} {printable(message.topic)}".rstrip()
+    named = message.kind is None or message.topic != message.kind.label
+    text = f"{what} {printable(message.topic)}".rstrip() if named else what
     if message.type:
         text += f" ({printable(message.type)})"
     if message.presence != "both":
