@@ -65,7 +65,8 @@ class Channel:
 
     ``transmit`` returns the delay in ns, or one of the ``LOST_…`` codes. After it ``duplicate_ns``
     is the delay of a second copy, or -1; ``held_until_ns`` is the end of the outage through which
-    a reliable link held the message back, or -1.
+    a reliable link held the message back, or -1. ``plain`` is the sampler of a link that does
+    nothing but delay, for callers in a hurry; ``keep_order`` is then theirs to see to.
     """
 
     def __init__(
@@ -92,19 +93,19 @@ class Channel:
         self._duplicate = Stream(seed, f"{name}\0duplicate").uniform
         self._bad = False
         self._last_ns = -1
-        self._keep_order = model.keep_order
+        self.keep_order = model.keep_order
         lossy = model.drop > 0.0 or model.burst is not None or model.duplicate > 0.0
-        self._plain = not lossy and not outages
+        self.plain = None if lossy or outages else self._delay
 
     def transmit(self, now_ns: int) -> int:
         """Send one message at ``now_ns``."""
-        if self._plain:
-            delay_ns = self._delay(now_ns)
+        if self.plain is not None:
+            delay_ns = self.plain(now_ns)
         else:
             delay_ns = self._troubled(now_ns)
             if delay_ns < 0:
                 return delay_ns
-        if self._keep_order:
+        if self.keep_order:
             arrival_ns = now_ns + delay_ns
             if arrival_ns < self._last_ns:
                 return self._last_ns - now_ns

@@ -8,7 +8,7 @@ never negative.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from math import sqrt
 from typing import Protocol
@@ -46,8 +46,9 @@ class Uniform:
     max_ns: int
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:
-        uniform, low, width = stream.uniform, self.min_ns, self.max_ns - self.min_ns + 1
-        return lambda now_ns: low + int(uniform() * width)
+        values = _whole_numbers(stream, self.min_ns, self.max_ns - self.min_ns + 1)
+        next(values)
+        return values.send  # half the time of a function, and this is the usual jitter
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,3 +167,11 @@ class Series:
             return value_ns + (next_value_ns - value_ns) * (since_ns - time_ns) // run_ns
 
         return value
+
+
+def _whole_numbers(stream: Stream, low: int, width: int) -> Generator[int, int, None]:
+    """Yield integers from ``low`` to ``low`` + ``width`` - 1; the first one is none of them."""
+    uniform = stream.uniform
+    yield 0
+    while True:
+        yield low + int(uniform() * width)

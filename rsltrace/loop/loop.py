@@ -20,7 +20,7 @@ from heapq import heappop, heappush
 from typing import Protocol
 
 from rsltrace.errors import LivelockError
-from rsltrace.loop.stop import Progress, Stop, StopCondition
+from rsltrace.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.loop.timer import TimerState
 from rsltrace.loop.timer_queue import TimerQueue
 from rsltrace.model.stamp import format_seconds
@@ -51,9 +51,10 @@ class EventLoop:
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
     (how many have run), ``activity_ns``.
 
-    ``gate``, if set, is called between time steps with the time of the next one (None: nothing is
-    left); it may switch to another stack and so pause the run. When it returns True, something may
-    have been made ready meanwhile, and the loop looks again.
+    ``between_steps`` is called between time steps and returns how many events there must have been
+    before it is called again. ``gate``, if set, is called between time steps with the time of the
+    next one (None: nothing is left); it may switch to another stack and so pause the run. When it
+    returns True, something may have been made ready meanwhile, and the loop looks again.
     """
 
     def __init__(
@@ -63,7 +64,7 @@ class EventLoop:
         timers: TimerQueue,
         stop_conditions: tuple[StopCondition, ...] = (),
         livelock_limit: int = 100_000,
-        between_steps: Callable[[], None] | None = None,
+        between_steps: Callable[[], int] | None = None,
     ) -> None:
         self.now_ns = start_ns
         self.start_ns = start_ns
@@ -79,6 +80,7 @@ class EventLoop:
         self._interrupt = False
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
+        self._pause_events = 0
         self._scheduled: list[tuple[int, int, int, Callable[[], None]]] = []
         self._schedule_count = 0
 
@@ -112,23 +114,30 @@ class EventLoop:
 
     def run(self) -> Stop:
         """Run until something stops the run, and say what."""
+        quiet_ns = quiet_until_ns(self.stop_conditions)
+        scheduled, first = self._scheduled, self.timers.first
         while True:
             self.run_step()
             if self.stopped is not None:  # by an event, or by a signal at any time
                 return self.stopped
-            next_ns = self.next_ns()
+            timer = first()
+            next_ns = None if timer is None else timer.deadline_ns
+            if scheduled and (next_ns is None or scheduled[0][0] < next_ns):
+                next_ns = scheduled[0][0]
             if self.gate is not None and self.gate(next_ns):
                 continue
-            stop = self._ask_conditions(next_ns)
-            if stop is not None:
-                self.stopped = stop
-                return stop
+            if next_ns is None or next_ns > quiet_ns or self.now_ns >= quiet_ns:
+                stop = self._ask_conditions(next_ns)
+                if stop is not None:
+                    self.stopped = stop
+                    return stop
             if next_ns is None:
                 self.stopped = Stop(NOTHING_LEFT)
                 return self.stopped
-            if self._between_steps is not None:
-                self._between_steps()
-            self.now_ns = max(next_ns, self.now_ns)
+            if self.events >= self._pause_events and self._between_steps is not None:
+                self._pause_events = self._between_steps()
+            if next_ns > self.now_ns:
+                self.now_ns = next_ns
 
     def next_ns(self) -> int | None:
         """Return when the next timer or release is due, or None if there is neither."""
@@ -160,7 +169,7 @@ class EventLoop:
                 if timer is not None and timer.deadline_ns <= now_ns:
                     owner: TimerOwner = timer.owner  # type: ignore[assignment]
                     owner.dispatch()
-                elif not self._run_idle():
+                elif not self.idle or not self._run_idle():
                     break
             if self.events >= limit:
                 self._livelock(now_ns)

@@ -37,16 +37,30 @@ class StopCondition(Protocol):
         """Return why to stop now, or None to go on."""
 
 
-def stop_at(time_ns: int, reason: str) -> StopCondition:
-    """Run every step up to and including ``time_ns``."""
+class _StopAt:
+    """See ``stop_at``. ``quiet_until_ns``: no answer while time is before, and stays up to it."""
 
-    def condition(progress: Progress) -> Stop | None:
+    def __init__(self, time_ns: int, reason: str) -> None:
+        self.quiet_until_ns = time_ns
+        self._reason = reason
+
+    def __call__(self, progress: Progress) -> Stop | None:
+        time_ns = self.quiet_until_ns
         over = progress.now_ns >= time_ns or (
             progress.next_ns is not None and progress.next_ns > time_ns
         )
-        return Stop(reason) if over else None
+        return Stop(self._reason) if over else None
 
-    return condition
+
+def stop_at(time_ns: int, reason: str) -> StopCondition:
+    """Run every step up to and including ``time_ns``."""
+    return _StopAt(time_ns, reason)
+
+
+def quiet_until_ns(conditions: tuple[StopCondition, ...]) -> int:
+    """Return the time before which none of the conditions needs to be asked."""
+    never_asked = 2**63
+    return min((getattr(c, "quiet_until_ns", -1) for c in conditions), default=never_asked)
 
 
 def stop_after_events(count: int) -> StopCondition:

@@ -39,7 +39,7 @@ class Network:
         self._plan = plan
         self._counts: dict[tuple[str, str, str], int] = {}
         self._ends: dict[int, tuple[str, int]] = {}
-        self._exchanges: dict[tuple[int, int, str], Channel | None] = {}
+        self._exchanges: dict[tuple[int, int, bool], Exchanges] = {}
 
     def link(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> Link:
         """Return the link of two endpoints that have just been connected."""
@@ -51,34 +51,29 @@ class Network:
         )
         return Link(self._core, publisher, subscription, channel)
 
-    def exchange(
-        self, client: ClientHandle, server: ServiceHandle, direction: str, exchange: Exchange
+    def request(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
+        """Bring a request to the server."""
+        self._bring(client, server, True, exchange)
+
+    def response(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
+        """Bring a response to the client."""
+        self._bring(client, server, False, exchange)
+
+    def _bring(
+        self, client: ClientHandle, server: ServiceHandle, ask: bool, exchange: Exchange
     ) -> None:
-        """Bring a ``request`` to the server, or a ``response`` to the client."""
-        receiver: Any = server if direction == "request" else client
-        key = (client.entity_id, server.entity_id, direction)
-        if key not in self._exchanges:
-            self._exchanges[key] = self._plan.service_channel(
+        key = (client.entity_id, server.entity_id, ask)
+        way = self._exchanges.get(key)
+        if way is None:
+            channel = self._plan.service_channel(
                 client.service,
                 self._end("client", client.service, client),
                 self._end("service", client.service, server),
-                direction,
+                "request" if ask else "response",
             )
-        channel = self._exchanges[key]
-        core = self._core
-        now_ns = core.loop.now_ns
-        sent_ns = now_ns + core.busy_ns
-        delay_ns = 0
-        if channel is not None:
-            delay_ns = channel.transmit(sent_ns)
-            note(core, receiver.entity_id, _LOST[delay_ns] if delay_ns < 0 else _DELAY | delay_ns)
-            if delay_ns < 0:
-                return
-        arrive = partial(_arrive, receiver, exchange)
-        if sent_ns + delay_ns == now_ns:
-            arrive()
-        else:
-            core.loop.schedule(sent_ns + delay_ns, arrive)
+            way = Exchanges(self._core, server if ask else client, channel)
+            self._exchanges[key] = way
+        way.send(exchange)
 
     def _end(self, kind: str, name: str, endpoint: Any) -> tuple[str, int]:
         """Return (node, how many such endpoints it has made before this one)."""
@@ -98,9 +93,35 @@ def note(core: Core, entity: int, draw: int) -> None:
         core.recorder.output(_DRAW, entity, draw)
 
 
-def _arrive(receiver: Any, exchange: Any) -> None:
-    if not receiver._destroyed:
-        receiver.deliver(exchange)
+class Exchanges:
+    """The requests of one client to one server, or the responses."""
+
+    def __init__(self, core: Core, receiver: Any, channel: Channel | None) -> None:
+        self._core = core
+        self._receiver = receiver
+        self._channel = channel
+
+    def send(self, exchange: Exchange) -> None:
+        """Send a request or response on its way."""
+        core = self._core
+        now_ns = core.loop.now_ns
+        arrival_ns = now_ns + core.busy_ns
+        channel = self._channel
+        if channel is not None:
+            delay_ns = channel.transmit(arrival_ns)
+            draw = _LOST[delay_ns] if delay_ns < 0 else _DELAY | delay_ns
+            note(core, self._receiver.entity_id, draw)
+            if delay_ns < 0:
+                return
+            arrival_ns += delay_ns
+        if arrival_ns == now_ns:
+            self._arrive(exchange)
+        else:
+            core.loop.schedule(arrival_ns, partial(self._arrive, exchange))
+
+    def _arrive(self, exchange: Exchange) -> None:
+        if not self._receiver._destroyed:
+            self._receiver.deliver(exchange)
 
 
 class Link:
@@ -122,6 +143,11 @@ class Link:
         self._channel = channel
         self._held: deque[tuple[Delivery, int]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
+        self._under_way: deque[Delivery] = deque()
+        self._plain = channel.plain if channel is not None and channel.keep_order else None
+        self._last_ns = 0
+        self._arrive_next = self._next_arrives
+        self._receiver = subscription.entity_id
 
     def send(self, delivery: Delivery) -> None:
         """Send a message on its way."""
@@ -129,6 +155,21 @@ class Link:
         loop = core.loop
         now_ns = loop.now_ns
         arrival_ns = now_ns + core.busy_ns
+        plain = self._plain
+        if plain is not None:
+            # The usual case: delays only, in order, so that the next to arrive is the next sent.
+            delay_ns = plain(arrival_ns)
+            if arrival_ns + delay_ns < self._last_ns:
+                delay_ns = self._last_ns - arrival_ns
+            self._last_ns = arrival_ns = arrival_ns + delay_ns
+            if core.recorder is not None:
+                core.recorder.output(_DRAW, self._receiver, _DELAY | delay_ns)
+            if arrival_ns == now_ns:
+                self._arrive(delivery)
+            else:
+                self._under_way.append(delivery)
+                loop.schedule(arrival_ns, self._arrive_next)
+            return
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
@@ -149,6 +190,19 @@ class Link:
             self._arrive(delivery)
         else:
             loop.schedule(arrival_ns, partial(self._arrive, delivery))
+
+    def _next_arrives(self) -> None:
+        subscription = self.subscription
+        data, event, position, digest, sent_ns, count, _ = self._under_way.popleft()
+        if subscription._destroyed:
+            return
+        loop = self._core.loop
+        delivery = (data, event, position, digest, sent_ns, count, loop.now_ns)
+        if subscription.wrapper is not None:
+            subscription.queue.append(delivery)
+            loop.ready.append(subscription)
+        else:
+            subscription.deliver(delivery)
 
     def _arrive(self, delivery: Delivery) -> None:
         subscription = self.subscription

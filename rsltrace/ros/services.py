@@ -197,7 +197,7 @@ class ServiceHandle(_End):
             if self.core.network is None:
                 client.deliver(exchange)
             else:
-                self.core.network.exchange(client, self, "response", exchange)
+                self.core.network.response(client, self, exchange)
         if self._events is not None:
             self._tell(RESPONSE_SENT, request_id, response)
 
@@ -243,7 +243,7 @@ class ClientHandle(_End):
             if network is None:
                 server.deliver(exchange)
             else:
-                network.exchange(self, server, "request", exchange)
+                network.request(self, server, exchange)
         if self._events is not None:
             self._tell(REQUEST_SENT, header.request_id, request)
         return self._sequence

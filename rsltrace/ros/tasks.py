@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
@@ -106,6 +107,8 @@ class TaskRun:
         self._awaited = awaited_future(task._handler)
         if self._awaited is None:
             core.polled.append(self)
+            if not core.loop.idle:
+                core.loop.idle.append(partial(poll, core))
         else:
             self._awaited.add_done_callback(Resume(self))
 

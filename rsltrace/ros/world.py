@@ -29,7 +29,6 @@ from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
-from rsltrace.ros.tasks import poll
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +64,6 @@ class World:
         self.core = Core(loop, base_dir=base_dir, seed=seed)
         self.core.graph = Graph()
         self.core.logs = Logs(self.core, echo=echo)
-        loop.idle.append(lambda: poll(self.core))
         self._boundary: Boundary
         self._stack = ExitStack()
         self.nodes: list[Any] = []

@@ -17,13 +17,14 @@ from rsltrace.loop.stop import Stop
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
 
+_PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
 class Observer:
     """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
-    about every thousand time steps; ``interrupt`` gets a function that ends the run properly;
+    about every thousand events; ``interrupt`` gets a function that ends the run properly;
     ``note`` gets what somebody should know before the run begins (a bag that was cut off)."""
 
     progress: Callable[[int, int | None, int], None] | None = None
@@ -33,26 +34,26 @@ class Observer:
 
 def housekeeping(
     core: Callable[[], Core], observer: Observer, end_ns: int | None
-) -> Callable[[], None]:
+) -> Callable[[], int]:
     """Return what is done between time steps: progress, and collecting garbage.
 
     Python's collector would otherwise run finalizers in the middle of some callback; here they run
     between steps, after the same events in every run.
     """
     collect_at = _GC_EVERY_EVENTS
-    steps = 0
 
-    def between_steps() -> None:
-        nonlocal collect_at, steps
-        steps += 1
+    def between_steps() -> int:
+        nonlocal collect_at
         events = core().loop.events
         if events >= collect_at:
             collect_at = events + _GC_EVERY_EVENTS
             with core().outside_events():
                 gc.collect(1)
-        if steps % 1000 == 0 and observer.progress is not None:
-            with engage(None):  # whoever watches lives in real time
-                observer.progress(core().loop.now_ns, end_ns, events)
+        if observer.progress is None:
+            return collect_at
+        with engage(None):  # whoever watches lives in real time
+            observer.progress(core().loop.now_ns, end_ns, events)
+        return min(collect_at, events + _PROGRESS_EVERY_EVENTS)
 
     return between_steps
 
