@@ -85,7 +85,7 @@ class Channel:
         self.held_until_ns = -1
         self._model = model
         self._reliable = reliable
-        self._outages = sorted(outages, key=lambda outage: outage.from_ns)
+        self.outages = tuple(sorted(outages, key=lambda outage: outage.from_ns))
         self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
         self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
         self._drop = Stream(seed, f"{name}\0drop").uniform
@@ -158,7 +158,7 @@ class Channel:
     def _cut_off_until(self, now_ns: int) -> int | None:
         """Return the end of the outage at ``now_ns``; outages that touch count as one."""
         end_ns = None
-        for outage in self._outages:
+        for outage in self.outages:
             at_ns = now_ns if end_ns is None else end_ns
             if outage.from_ns <= at_ns < outage.to_ns:
                 end_ns = outage.to_ns

@@ -281,7 +281,7 @@ class Boundary:
         return codec_for(message_type).deserialize(bytes(data))
 
     def rclpy_assert_liveliness(self, publisher: Any) -> None:
-        pass
+        publisher.assert_liveliness()
 
     def rclpy_get_rmw_implementation_identifier(self) -> str:
         return "rmw_rsltrace"

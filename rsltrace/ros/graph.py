@@ -78,6 +78,8 @@ class Graph:
             subscription.publishers.remove(publisher)
             subscription.events.matched(-1)
         publisher.subscriptions = []
+        for link in publisher.links or ():
+            link.close()
         if publisher.links is not None:
             publisher.links.clear()
 

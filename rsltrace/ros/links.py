@@ -14,8 +14,9 @@ from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import OutputKind
-from rsltrace.ros.qos import Reliability
+from rsltrace.ros.qos import INFINITE_NS, Reliability
 from rsltrace.ros.qos_status import MESSAGE_LOST
+from rsltrace.ros.qos_time import RequestedLease, finite
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -125,7 +126,7 @@ class Exchanges:
 
 
 class Link:
-    """From one publisher to one subscription; ``channel`` is None if nothing is the matter.
+    """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
 
     What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
     messages as its history: later ones push the oldest out, as in DDS.
@@ -140,6 +141,7 @@ class Link:
     ) -> None:
         self.subscription = subscription
         self._core = core
+        self._publisher = publisher
         self._channel = channel
         self._held: deque[tuple[Delivery, int]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
@@ -148,6 +150,27 @@ class Link:
         self._last_ns = 0
         self._arrive_next = self._next_arrives
         self._receiver = subscription.entity_id
+        self._lifespan_ns = min(
+            limit if finite(limit) else INFINITE_NS
+            for limit in (publisher.qos.lifespan_ns, subscription.qos.lifespan_ns)
+        )
+        self._timed = self._lifespan_ns != INFINITE_NS or subscription.timed
+        self._lease: RequestedLease | None = None
+        lease_ns = subscription.qos.lease_ns
+        if finite(lease_ns):
+            events = subscription.events
+            self._lease = RequestedLease(core.loop, lease_ns, subscription.qos.liveliness, events)
+            for outage in channel.outages if channel is not None else ():
+                self._lease.cut_off(outage.from_ns, outage.to_ns)
+
+    @classmethod
+    def between(
+        cls, core: Core, publisher: PublisherHandle, subscription: SubscriptionHandle
+    ) -> Link:
+        """Make the link of two endpoints, with the model that the job has for it."""
+        if core.network is None:
+            return cls(core, publisher, subscription, None)
+        return core.network.link(publisher, subscription)
 
     def send(self, delivery: Delivery) -> None:
         """Send a message on its way."""
@@ -183,9 +206,11 @@ class Link:
             if channel.duplicate_ns >= 0:
                 self._duplicate(delivery, arrival_ns + channel.duplicate_ns)
             if channel.held_until_ns >= 0:
+                self._last_ns = max(self._last_ns, arrival_ns + delay_ns)
                 self._hold(delivery, arrival_ns + delay_ns, channel.held_until_ns)
                 return
             arrival_ns += delay_ns
+            self._last_ns = max(self._last_ns, arrival_ns)
         if arrival_ns == now_ns:
             self._arrive(delivery)
         else:
@@ -194,15 +219,16 @@ class Link:
     def _next_arrives(self) -> None:
         subscription = self.subscription
         data, event, position, digest, sent_ns, count, _ = self._under_way.popleft()
-        if subscription._destroyed:
-            return
-        loop = self._core.loop
-        delivery = (data, event, position, digest, sent_ns, count, loop.now_ns)
-        if subscription.wrapper is not None:
-            subscription.queue.append(delivery)
-            loop.ready.append(subscription)
-        else:
-            subscription.deliver(delivery)
+        if self._timed:
+            self._arrive((data, event, position, digest, sent_ns, count, 0))
+        elif not subscription._destroyed:
+            loop = self._core.loop
+            delivery = (data, event, position, digest, sent_ns, count, loop.now_ns)
+            if subscription.wrapper is not None:
+                subscription.queue.append(delivery)
+                loop.ready.append(subscription)
+            else:
+                subscription.deliver(delivery)
 
     def _arrive(self, delivery: Delivery) -> None:
         subscription = self.subscription
@@ -211,7 +237,43 @@ class Link:
         if self._lost:
             lost, self._lost = self._lost, 0
             subscription.events.add(MESSAGE_LOST, total=lost)
-        subscription.deliver((*delivery[:6], self._core.loop.now_ns))
+        loop = self._core.loop
+        arrived = (*delivery[:6], loop.now_ns)
+        if self._timed:
+            if self._lease is not None:
+                self._lease.seen()
+            if subscription.deadline is not None:
+                subscription.deadline.seen()
+            if self._lifespan_ns != INFINITE_NS:
+                stale_ns = delivery[4] + self._lifespan_ns
+                if stale_ns <= loop.now_ns:
+                    return
+                loop.schedule(stale_ns, partial(self._expire, arrived))
+        subscription.deliver(arrived)
+
+    def _expire(self, delivery: Delivery) -> None:
+        """Drop a message that nobody has taken within its lifespan."""
+        queue = self.subscription.queue
+        for place, waiting in enumerate(queue):
+            if waiting is delivery:
+                del queue[place]
+                return
+
+    def sign_of_life(self) -> None:
+        """Tell the subscription that its publisher is alive; takes no time."""
+        if self._lease is not None:
+            self._lease.seen()
+
+    def acked_ns(self) -> int:
+        """Return when all that was sent so far has arrived, where that is acknowledged."""
+        if self.subscription.qos.reliability is not Reliability.RELIABLE:
+            return 0
+        return self._last_ns
+
+    def close(self) -> None:
+        """Forget the publisher, or the subscription: one of them goes."""
+        if self._lease is not None:
+            self._lease.gone()
 
     def _duplicate(self, delivery: Delivery, arrival_ns: int) -> None:
         core = self._core

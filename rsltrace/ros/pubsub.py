@@ -8,18 +8,20 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.ros.blocking import wait
 from rsltrace.ros.codec import codec_for
 from rsltrace.ros.entity_handle import EntityHandle, Receiver, callback_name
 from rsltrace.ros.groups import begin
 from rsltrace.ros.interfaces import schema_text, type_hash
-from rsltrace.ros.qos import Durability, Qos
+from rsltrace.ros.links import Link
+from rsltrace.ros.qos import Durability, Qos, Reliability
 from rsltrace.ros.qos_status import EndpointEvents
+from rsltrace.ros.qos_time import Deadline, Offers, finite
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
 from rsltrace.trace.chain import hash64
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
-    from rsltrace.ros.links import Link
     from rsltrace.ros.node import NodeHandle
 
 _SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
@@ -55,6 +57,9 @@ class PublisherHandle(EntityHandle):
         self.subscriptions: list[SubscriptionHandle] = []
         self.links: list[Link] | None = None if core.network is None else []
         self.events: EndpointEvents = EndpointEvents()
+        self._offers = Offers.of(core.loop, self.qos, self.events)
+        if finite(self.qos.lifespan_ns):
+            self.links = []
         self._count = 0
         self._channel: int | None = None
         self._watcher = core.watchers.get(self.topic)
@@ -107,32 +112,50 @@ class PublisherHandle(EntityHandle):
                     subscription.find_wrapper()
         if self._history is not None:
             self._history.append(delivery)
+        if self._offers is not None:
+            self._offers.sent()
         if self._watcher is not None:
             self._watcher(self._msg_type, data)
 
     def send_history(self, subscription: SubscriptionHandle) -> None:
-        """Give a late joiner what it asks for and this publisher kept."""
-        if self._history and subscription.qos.durability is Durability.TRANSIENT_LOCAL:
-            kept = list(self._history)
-            give: Callable[[Delivery], None] = subscription.deliver
-            if self.links is not None:
-                give = next(link for link in self.links if link.subscription is subscription).send
-            for delivery in kept[-subscription.qos.keep :] if subscription.qos.keep else kept:
-                give(delivery)
+        """Give a late joiner what it asks for and this publisher kept; never by best effort."""
+        if (
+            not self._history
+            or subscription.qos.durability is not Durability.TRANSIENT_LOCAL
+            or subscription.qos.reliability is not Reliability.RELIABLE
+        ):
+            return
+        kept = list(self._history)
+        give: Callable[[Delivery], None] = subscription.deliver
+        if self.links is not None:
+            give = next(link for link in self.links if link.subscription is subscription).send
+        for delivery in kept[-subscription.qos.keep :] if subscription.qos.keep else kept:
+            give(delivery)
 
     def connect(self, subscription: SubscriptionHandle) -> None:
         """Send to this subscription, too; fan-out is in the creation order of subscriptions."""
+        if self.links is None and subscription.timed:
+            self.links = [Link.between(self.core, self, other) for other in self.subscriptions]
         self.subscriptions.append(subscription)
         self.subscriptions.sort(key=_by_age)
         if self.links is not None:
-            assert self.core.network is not None
-            self.links.append(self.core.network.link(self, subscription))
+            self.links.append(Link.between(self.core, self, subscription))
             self.links.sort(key=lambda link: link.subscription.entity_id)
+
+    def assert_liveliness(self) -> None:
+        """Show that this publisher is alive, without a message."""
+        if self._offers is not None:
+            self._offers.asserted()
+        for link in self.links or ():
+            link.sign_of_life()
 
     def disconnect(self, subscription: SubscriptionHandle) -> None:
         """Send to this subscription no longer."""
         self.subscriptions.remove(subscription)
         if self.links is not None:
+            for link in self.links:
+                if link.subscription is subscription:
+                    link.close()
             self.links = [link for link in self.links if link.subscription is not subscription]
 
     def _open_channel(self) -> int:
@@ -153,8 +176,18 @@ class PublisherHandle(EntityHandle):
         return len(self.subscriptions)
 
     def wait_for_all_acked(self, timeout: Any) -> bool:
-        """Return True: delivery within a process is acknowledged at once."""
-        return True
+        """Wait in simulated time until what was sent has reached every reliable subscription.
+
+        Returns whether it has; without links it has at once.
+        """
+        limit_ns: int = timeout.nanoseconds
+        until_ns = max((link.acked_ns() for link in self.links or ()), default=0)
+        left_ns = until_ns - self.core.loop.now_ns
+        if left_ns <= 0 or limit_ns == 0:
+            return left_ns <= 0
+        acked = limit_ns < 0 or left_ns <= limit_ns
+        wait(self.core, "its messages to be acknowledged", for_ns=left_ns if acked else limit_ns)
+        return acked
 
     def settle(self) -> bool:
         return True
@@ -170,6 +203,8 @@ class PublisherHandle(EntityHandle):
 
     def _destroy(self) -> None:
         self.core.graph.remove_publisher(self)
+        if self._offers is not None:
+            self._offers.end()
 
 
 class SubscriptionHandle(Receiver):
@@ -188,8 +223,13 @@ class SubscriptionHandle(Receiver):
         self.qos: Qos = Qos.from_rmw(qos).resolved(publisher=False, peers=peers)
         super().__init__(core, node)
         self.queue: deque[Delivery] = deque(maxlen=self.qos.keep)
+        self.timed = any(map(finite, (self.qos.deadline_ns, self.qos.lifespan_ns)))
+        self.timed |= finite(self.qos.lease_ns)
         self.publishers: list[PublisherHandle] = []
         self.events: EndpointEvents = EndpointEvents()
+        self.deadline: Deadline | None = None
+        if finite(self.qos.deadline_ns):
+            self.deadline = Deadline(core.loop, self.qos.deadline_ns, self.events)
         self._callback: Any = None
         self._coroutine = False
         self._with_info = False
@@ -251,6 +291,8 @@ class SubscriptionHandle(Receiver):
     def _destroy(self) -> None:
         self.core.graph.remove_subscription(self)
         self.queue.clear()
+        if self.deadline is not None:
+            self.deadline.over = True
 
 
 def _by_age(endpoint: SubscriptionHandle) -> int:

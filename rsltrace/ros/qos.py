@@ -160,36 +160,43 @@ class Qos:
         return "\n".join(lines)
 
     def summary(self) -> dict[str, object]:
-        """Return the few policies worth showing for an entity."""
-        return {
+        """Return the policies worth showing for an entity: of times only those that are limits."""
+        shown: dict[str, object] = {
             "history": self.history.name.lower(),
             "depth": self.depth,
             "reliability": self.reliability.name.lower(),
             "durability": self.durability.name.lower(),
         }
+        for name in ("deadline_ns", "lifespan_ns", "lease_ns"):
+            if 0 < getattr(self, name) < INFINITE_NS:
+                shown[name] = getattr(self, name)
+        if self.liveliness is Liveliness.MANUAL_BY_TOPIC:
+            shown["liveliness"] = "manual_by_topic"
+        return shown
 
 
 def incompatible_policy(offered: Qos, requested: Qos) -> PolicyKind | None:
-    """Return the policy that keeps a publisher and a subscription apart, or None if they match."""
+    """Return the policy that keeps a publisher and a subscription apart, or None if they match.
+
+    Of several it is the one that Fast DDS names, which counts a lease as liveliness.
+    """
     if (
         offered.reliability is Reliability.BEST_EFFORT
         and requested.reliability is Reliability.RELIABLE
     ):
         return PolicyKind.RELIABILITY
     if (
+        offered.liveliness is Liveliness.AUTOMATIC
+        and requested.liveliness is Liveliness.MANUAL_BY_TOPIC
+    ) or (offered.lease_ns or INFINITE_NS) > (requested.lease_ns or INFINITE_NS):
+        return PolicyKind.LIVELINESS
+    if (offered.deadline_ns or INFINITE_NS) > (requested.deadline_ns or INFINITE_NS):
+        return PolicyKind.DEADLINE
+    if (
         offered.durability is Durability.VOLATILE
         and requested.durability is Durability.TRANSIENT_LOCAL
     ):
         return PolicyKind.DURABILITY
-    if (offered.deadline_ns or INFINITE_NS) > (requested.deadline_ns or INFINITE_NS):
-        return PolicyKind.DEADLINE
-    if (
-        offered.liveliness is Liveliness.AUTOMATIC
-        and requested.liveliness is Liveliness.MANUAL_BY_TOPIC
-    ):
-        return PolicyKind.LIVELINESS
-    if (offered.lease_ns or INFINITE_NS) > (requested.lease_ns or INFINITE_NS):
-        return PolicyKind.LIVELINESS_LEASE_DURATION
     return None
 
 
