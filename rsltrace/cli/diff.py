@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
-from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 
 if TYPE_CHECKING:
     from rsltrace.diff.bag_model import BagDiff
     from rsltrace.diff.model import Diff
     from rsltrace.diff.report.line import Line
+    from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
 _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 140
@@ -207,14 +208,26 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
     from rsltrace.diff.engine import diff_traces
-    from rsltrace.trace.reader import Trace
 
-    with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
+    with _opened(a) as trace_a, _opened(b) as trace_b:
         if check_a:
             trace_a.check()
         if check:
             trace_b.check()
         return diff_traces(trace_a, trace_b, options)
+
+
+def _opened(place: str) -> Trace:
+    from rsltrace.trace.reader import Trace
+
+    try:
+        return Trace.open(place)
+    except TraceFormatError as error:
+        if "://" not in place:
+            raise
+        raise TraceFormatError(
+            f"{error}; only traces are read from addresses: download a recording to compare it"
+        ) from error
 
 
 def _print(

@@ -148,6 +148,23 @@ def test_what_is_not_there(server: Server, tmp_path: Path) -> None:
         Trace.open("nothing://a/b")
 
 
+def test_a_recording_at_an_address(server: Server, tmp_path: Path) -> None:
+    from click.testing import CliRunner
+    from mcap.writer import Writer
+
+    from rsltrace.cli.main import cli
+
+    with (tmp_path / "bag.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="somebody")
+        writer.finish()
+    result = CliRunner().invoke(cli, ["diff", f"{server.address}/bag.mcap", "other.mcap"])
+    assert result.exit_code == 2
+    said = " ".join(result.output.split())
+    assert "plain MCAP recording" in said, said
+    assert "download a recording to compare it" in said, said
+
+
 def test_without_fsspec(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "fsspec", None)
     with pytest.raises(SetupError, match=r"pip install 'rsltrace\[remote\]'"):
