@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rsltrace_viewer import follow
 from rsltrace_viewer.screens.pick import PickScreen
 from trace_maker import Opened, boundaries, write_run
 
@@ -175,6 +176,26 @@ def test_a_growing_file_is_followed(tmp_path: Path, drive: Drive) -> None:
         assert "the recording has ended" in viewer.text
         await viewer.press("R")
         assert "nothing to follow" in viewer.text
+
+    drive(growing, steps, follow=True)
+
+
+def test_the_end_of_a_recording_is_shown_at_once(
+    tmp_path: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long an unfinished file takes to open, and is therefore left alone for a while."""
+    monkeypatch.setattr(follow, "_IDLE_FACTOR", 1e9)
+    whole, growing = tmp_path / "whole.mcap", tmp_path / "growing.mcap"
+    write_run(whole, 20_000)
+    data = whole.read_bytes()
+    growing.write_bytes(data[: len(data) // 2])
+
+    async def steps(viewer: Any) -> None:
+        session = viewer.app.session
+        growing.write_bytes(data[: len(data) * 3 // 4])
+        await wait(viewer, lambda: viewer.app._follow._not_before > 0)
+        growing.write_bytes(data)
+        await wait(viewer, lambda: session.a.trace.complete)
 
     drive(growing, steps, follow=True)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 from textual.app import App
 
 from rsltrace.errors import RsltraceError
+from rsltrace.trace.format import MCAP_MAGIC
 from rsltrace_viewer.model.run import Run
 
 _EVERY_S = 0.5
@@ -39,7 +41,9 @@ class Follow:
             size = os.stat(self._path).st_size
         except OSError:
             return
-        if self._opening or size == self._size or perf_counter() < self._not_before:
+        if self._opening or size == self._size:
+            return
+        if perf_counter() < self._not_before and not _is_finished(self._path):
             return
         self._size = size
         self._opening = True
@@ -65,3 +69,11 @@ class Follow:
         if run.trace.complete:
             self.stop()
         self._grown(run)
+
+
+def _is_finished(path: Path) -> bool:
+    """Return whether a recording was closed: then it has a summary and opens at once."""
+    with suppress(OSError), path.open("rb") as stream:
+        stream.seek(-len(MCAP_MAGIC), os.SEEK_END)
+        return stream.read() == MCAP_MAGIC
+    return False
