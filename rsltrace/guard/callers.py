@@ -43,6 +43,11 @@ def _kind_of(file: str) -> int:
     return kind
 
 
+def is_user_file(file: str) -> bool:
+    """Return whether a source file is neither Python's nor an installed package's nor ours."""
+    return _kind_of(file) == _USER
+
+
 def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
     """Return the innermost frame of user code that led to ``frame``, or None if none did.
 

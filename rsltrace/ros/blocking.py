@@ -15,6 +15,7 @@ import os
 import threading
 import time
 import traceback
+from _thread import get_ident
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import UnsupportedError
+from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
 
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
+getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
 _PATIENCE = 100
@@ -41,6 +44,9 @@ _PATIENCE = 100
 _abandoned: list[greenlet] = []
 
 
+Patience = bool | Callable[[], bool]
+
+
 class RunEnded(BaseException):
     """Raised in a blocked call when the run ends, so that ``finally`` blocks run."""
 
@@ -48,16 +54,17 @@ class RunEnded(BaseException):
 class Wait:
     """One blocked call. ``wake`` makes it ready; it is dispatched like any other event."""
 
-    def __init__(self, core: Core, what: str, group: object, *, quiet: bool, patient: bool) -> None:
+    def __init__(
+        self, core: Core, what: object, group: object, *, quiet: bool, patient: Patience
+    ) -> None:
         self.core = core
         self.what = what
-        self.patient = patient
-        """Whether it is in order to wait for ever: for more work, say."""
+        self._patient = patient
         self.error: BaseException | None = None
         """What to raise in the blocked call when it goes on."""
         self.program = core.program
         self.deadline_ns: int | None = None
-        self._quiet = quiet
+        self.quiet = quiet
         self._group = group
         self.stack = getcurrent()
         self.timed_out = False
@@ -67,6 +74,23 @@ class Wait:
         self._end_group = core.on_end
         self._cause = (NO_EVENT, 0)
         self._input_hash = 0
+
+    @property
+    def waiting(self) -> bool:
+        """Whether nothing has let the call return yet."""
+        return not self._woken
+
+    def stop_waiting(self) -> None:
+        """Take no more notice of what the call waited for."""
+        self._woken = True
+
+    def is_patient(self) -> bool:
+        """Return whether it is in order to wait for ever: for more work, say."""
+        patient, self._patient = self._patient, False  # False, should somebody ask in a circle
+        try:
+            return patient if isinstance(patient, bool) else patient()
+        finally:
+            self._patient = patient
 
     def wake(self) -> None:
         """Let the call return: because of the event under way."""
@@ -105,7 +129,7 @@ class Wait:
         core.input_hash = self._input_hash
         core.node_arguments = self._arguments
         core.on_end = self._end_group
-        core.quiet = self._quiet
+        core.quiet = self.quiet
         if self.program is not core.program:
             self.program.enter()
 
@@ -130,12 +154,12 @@ class Wait:
 
 def wait(
     core: Core,
-    what: str,
+    what: object,
     *,
     until: Callable[[Wait], None] | None = None,
     for_ns: int | None = None,
     quiet: bool = False,
-    patient: bool = False,
+    patient: Patience = False,
 ) -> bool:
     """Block the present callback in simulated time; return whether it was woken (not timed out).
 
@@ -145,14 +169,14 @@ def wait(
 
     :raises RunEnded: when the run ends before the wait does.
     """
-    if threading.get_ident() != core.thread or os.getpid() != core.process:
-        place = "thread" if os.getpid() == core.process else "process"
+    if get_ident() != core.thread or getpid() != core.process:
+        place = "thread" if getpid() == core.process else "process"
         raise UnsupportedError(
             f"a {place} that a node has started waits for {what}, which takes simulated time: only "
             "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
             f"there, or let a callback wait and hand the result to the {place}"
         )
-    if core.ending:
+    if core.ending or core.program.ended:
         _refuse(core)
     if core.current_handle is None:
         raise UnsupportedError(
@@ -164,7 +188,7 @@ def wait(
     if until is not None:
         until(blocked)
     if for_ns is not None:
-        blocked.deadline_ns = core.loop.now_ns + max(for_ns, 0)
+        blocked.deadline_ns = core.loop.now_ns + core.grace_ns + max(for_ns, 0)
         core.loop.schedule(blocked.deadline_ns, blocked.time_out)
     _end_stretch(core)
     core.blocked[blocked] = None
@@ -173,6 +197,7 @@ def wait(
         core.host.enter()
     core.next_runner().switch()
     core.blocked.pop(blocked, None)
+    blocked.stop_waiting()
     blocked.resumed()
     if core.ending:
         raise RunEnded
@@ -292,19 +317,22 @@ class FutureWake:
         self._event.set()
 
 
-_real_sleep = time.sleep
+_real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
 _world: list[Core] = []
 
 
-def _sleep(seconds: float) -> None:
-    """Stand in for ``time.sleep`` in every run: ``from time import sleep`` keeps it for ever."""
+def simulated_core() -> Core | None:
+    """Return the world in which the calling code runs: a node's, not that of who drives it."""
     core = _world[-1] if _world else None
-    if (
-        core is None
-        or core.current_handle is None
-        or threading.get_ident() != core.thread
-        or os.getpid() != core.process
-    ):
+    if core is None or get_ident() != core.thread or getpid() != core.process:
+        return None
+    return core if core.current_handle is not None or core.importing else None
+
+
+def _sleep(seconds: float) -> None:
+    """Stand in for ``time.sleep`` while a run lasts."""
+    core = simulated_core()
+    if core is None or core.current_handle is None:
         _real_sleep(seconds)
         return
     if seconds < 0:
@@ -324,28 +352,31 @@ def simulated_waiting(core: Core) -> Iterator[None]:
     import rclpy.action.client
     import rclpy.client
     import rclpy.node
+    import rclpy.task
     import rclpy.timer
 
     def now() -> float:
         return core.loop.now_ns / 1_000_000_000
 
     replaced = [
-        (time, "sleep", _sleep),
         (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "threading", _threading(core, "the response to a service call")),
         (rclpy.timer, "threading", _threading(core, "the next period of a Rate")),
         (rclpy.action.client, "threading", _threading(core, "an answer of an action server")),
+        (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
         (rclpy.action.client, "uuid", SimpleNamespace(uuid4=core.random_uuid)),
     ]
     saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
     for module, name, value in replaced:
         setattr(module, name, value)
+    turned = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
     _world.append(core)
     try:
         yield
     finally:
         _world.remove(core)
+        turned.restore()
         for module, name, value in saved:
             setattr(module, name, value)
 

@@ -10,8 +10,8 @@ import contextlib
 import os
 import random
 import struct
-import threading
 import uuid
+from _thread import get_ident
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.logs import Logs
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.tasks import TaskRun
+    from rsltrace.ros.threads import SimThread
     from rsltrace.ros.world import Entry
 
 _RAISED = int(EventFlag.RAISED)
@@ -60,7 +61,7 @@ class Core:
         self.loop = loop
         self.seed = seed
         self.process = os.getpid()
-        self.thread = threading.get_ident()
+        self.thread = get_ident()
         self.recorder: Recorder | None = None
         self.base_dir = base_dir
         self.graph: Graph
@@ -95,6 +96,11 @@ class Core:
         self.programs: list[Program] = []
         self.notes: list[str] = []
         self.closing = False
+        self.grace_ns = 0
+        self.importing = False
+        self.threads: list[SimThread] = []
+        self.thread_stacks: dict[greenlet, SimThread] = {}
+        self.thread_count = 0
         self.fed = False
         self.arrivals = 0
         self.quiet = False
@@ -104,8 +110,8 @@ class Core:
         self.polled: list[TaskRun] = []
         self.polls = 0
         self.poll_stage: tuple[int, int] | None = None
-        self.pending: list[EntityHandle | Program] = []
-        self.unowned: list[EntityHandle | Program] = []
+        self.pending: list[EntityHandle | Program | SimThread] = []
+        self.unowned: list[EntityHandle | Program | SimThread] = []
         self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
         self._entity_count = 0
         self._parked: dict[object, list[Callable[[], None]]] = {}
@@ -229,7 +235,7 @@ class Core:
     def who_waits(self) -> list[str]:
         """Say of every suspended coroutine and blocked call what it waits for."""
         runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
-        return runs + [blocked.waits_for() for blocked in self.blocked if not blocked.patient]
+        return runs + [blocked.waits_for() for blocked in self.blocked if not blocked.is_patient()]
 
     @property
     def entry(self) -> Entry | None:
@@ -408,6 +414,18 @@ class Core:
             )
         self.error.__cause__ = error
         self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
+
+    def outside(self, describe: Callable[[], str], entry: Entry | None) -> Dispatchable:
+        """Return what stands for an event that is no entity's callback."""
+        return _Outside(describe, entry)
+
+    def is_thread(self, stack: greenlet) -> bool:
+        """Return whether a stack is that of a thread which user code has started."""
+        return stack in self.thread_stacks
+
+    def program_of(self, stack: greenlet) -> Program | None:
+        """Return the program whose main runs on a stack, if it is one's."""
+        return next((program for program in self.programs if program.stack is stack), None)
 
     def in_callback(self) -> bool:
         """Return whether the event under way is a callback's, not a main's or a thread's."""

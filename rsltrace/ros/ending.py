@@ -7,6 +7,7 @@ contexts are shut down and the call that blocks raises ``KeyboardInterrupt``. Wh
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING, Any
 
 from greenlet import getcurrent
@@ -16,6 +17,7 @@ from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded, Wait
 from rsltrace.ros.failure import exit_status, text_of
+from rsltrace.ros.threads import SimThread
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -30,7 +32,10 @@ def end_program(program: Program, error: BaseException | None) -> None:
     An exception that nobody caught is raised again: it fails the run, except while that ends.
     """
     core = program.core
+    if error is None or isinstance(error, SystemExit):
+        _wait_for_threads(program)
     program.ended = True
+    _stop_threads(program)
     failed = _judge(program, error)
     spun = any(node.mailbox is not None for node in _nodes(program))
     idle = [node.fully_qualified_name for node in _nodes(program) if node.wrapper is None]
@@ -48,6 +53,25 @@ def end_program(program: Program, error: BaseException | None) -> None:
     alone = not core.fed and all(node.program is not core.host for node in core.graph.nodes)
     if alone and core.loop.stopped is None and all(other.ended for other in core.programs):
         core.loop.stop(Stop(_EVERY_MAIN_ENDED))
+
+
+def _wait_for_threads(program: Program) -> None:
+    """Wait for all threads that are no daemons, as a process does when its main has returned."""
+    own = [t for t in program.core.threads if t.program is program and not t.ended]
+    with contextlib.suppress(RunEnded, KeyboardInterrupt):
+        for thread in own:
+            thread.dismiss()
+        for thread in own:
+            if not thread.daemon:
+                thread.join(None)
+
+
+def _stop_threads(program: Program) -> None:
+    """Unwind the threads that are left: they end with their process."""
+    for blocked in list(program.core.blocked):
+        if blocked.program is program:
+            blocked.error = RunEnded()
+            blocked.release()
 
 
 def _judge(program: Program, error: BaseException | None) -> bool:
@@ -105,7 +129,7 @@ def end_programs(core: Core) -> None:
     for program in core.programs:
         if not program.ended and program.begun:
             _interrupt(program)
-            _let_run(core)
+            _let_run(program)
 
 
 def _interrupt(program: Program) -> None:
@@ -116,26 +140,35 @@ def _interrupt(program: Program) -> None:
         blocked.error = KeyboardInterrupt()
         blocked.release()
     for other in list(program.core.blocked):
-        if other.program is program and other.patient:
+        if other.program is program and other.quiet:
             other.release()
 
 
-def _let_run(core: Core) -> None:
-    """Let stacks go on that have been woken; a wait that only time would end, ends at once."""
+def _let_run(program: Program) -> None:
+    """Let a program end that has been told to, as long as ros2 launch leaves it.
+
+    Time stands still meanwhile: who sleeps goes on when nobody else can.
+    """
+    core = program.core
     loop = core.loop
-    here = getcurrent()
-    for _ in range(_PATIENCE):
+    core.grace_ns = 0
+    while not program.ended:
         item = loop.tasks.popleft() if loop.tasks else loop.ready.popleft() if loop.ready else None
-        if item is None:
-            timed = [
-                w for w in core.blocked if w.deadline_ns is not None and w.program.ended is False
-            ]
-            if not timed:
-                return
-            min(timed, key=lambda w: w.deadline_ns or 0).time_out()
-        elif isinstance(item, Wait):
-            core.runners.append(here)
+        if isinstance(item, Wait):
+            core.runners.append(getcurrent())
             item.stack.switch()
+        elif isinstance(item, SimThread):
+            item.dispatch()
+        elif item is None:
+            timed = [(w.deadline_ns, w) for w in core.blocked if w.deadline_ns and w.waiting]
+            own = [pair for pair in timed if pair[1].program is program]
+            if not own:
+                return
+            deadline_ns, first = min(own, key=lambda pair: pair[0])
+            core.grace_ns = max(deadline_ns - loop.now_ns, core.grace_ns + 1)
+            if core.grace_ns > _GRACE_NS:
+                return
+            first.time_out()
 
 
-_PATIENCE = 10_000
+_GRACE_NS = 10_000_000_000

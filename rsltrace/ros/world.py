@@ -29,6 +29,7 @@ from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
+from rsltrace.ros.threads import cooperative_threads
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +83,7 @@ class World:
 
             stack.enter_context(simulated_waiting(self.core))
             stack.enter_context(own_executors(self.core))
+            stack.enter_context(cooperative_threads(self.core))
             rclpy.init(args=[])
             self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
@@ -106,7 +108,7 @@ class World:
         if self.core.error is not None and self.core.error.__cause__ is not None:
             traceback.clear_frames(self.core.error.__cause__.__traceback__)
         self.nodes.clear()
-        for program in self.core.programs:
+        for program in (self.core.host, *self.core.programs):
             program.forget()
         gc.collect()
 
@@ -119,6 +121,15 @@ class World:
         self.core.programs = [
             Program(self.core, entry) for entry in entries if entry.argv is not None
         ]
+
+    @contextmanager
+    def importing(self) -> Iterator[None]:
+        """Let what modules make when they are imported (a lock, a thread) belong to the run."""
+        self.core.importing = True
+        try:
+            yield
+        finally:
+            self.core.importing = False
 
     # -- the stages of a run ---------------------------------------------------------------------
 

@@ -152,7 +152,8 @@ class Session:
             loop.stop_conditions = tuple(
                 stop_conditions(job, self.start_ns, world.core.outside_events)
             )
-            self._entries = _prepare(job)
+            with world.importing():
+                self._entries = _prepare(job)
         check_bag_types(self._bags)
         if self._output is not None:
             self._writer = writer = stack.enter_context(

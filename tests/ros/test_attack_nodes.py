@@ -6,7 +6,6 @@ import gc
 import multiprocessing
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -17,9 +16,8 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from rclpy.task import Future
 from std_msgs.msg import UInt64
-from std_srvs.srv import Trigger
 
-from rsltrace.errors import NodeError, UnsupportedError
+from rsltrace.errors import NodeError
 
 pytestmark = pytest.mark.ros
 
@@ -214,30 +212,6 @@ def test_a_forked_child_that_exits_does_not_go_on_with_the_run(simulate: Any) ->
     with recorded.trace() as trace:
         assert trace.complete
         assert trace.event_count == 4
-
-
-def test_a_thread_cannot_wait_in_simulated_time(simulate: Any) -> None:
-    heard: list[BaseException] = []
-
-    class Calls(Ticker):
-        def setup(self) -> None:
-            self.create_service(Trigger, "x", lambda request, response: response)
-            self.client = self.create_client(Trigger, "x")
-
-        def act(self) -> None:
-            def call() -> None:
-                try:
-                    self.client.call(Trigger.Request())
-                except BaseException as error:
-                    heard.append(error)
-
-            thread = threading.Thread(target=call)
-            thread.start()
-            thread.join()
-
-    simulate(Calls, duration=1)
-    assert [type(error) for error in heard] == [UnsupportedError] * 2
-    assert "thread" in str(heard[0])
 
 
 def test_a_cancelled_task_waits_for_nothing(simulate: Any) -> None:

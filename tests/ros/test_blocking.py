@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from typing import Any
 
@@ -284,28 +283,6 @@ def test_an_executor_of_ones_own_in_a_callback_waits_for_its_own_callback_group(
 
     with pytest.raises(DeadlockError, match=r"/spinner: timer .*waits for work for its executor"):
         simulate(Spinner)
-
-
-def test_other_threads_really_sleep(simulate: Any) -> None:
-    slept: list[float] = []
-
-    class Threaded(Node):
-        def __init__(self) -> None:
-            super().__init__("threaded")
-            self.create_timer(1.0, self.tick)
-
-        def tick(self) -> None:
-            def work() -> None:
-                began = time.monotonic()
-                time.sleep(0.05)
-                slept.append(time.monotonic() - began)
-
-            thread = threading.Thread(target=work)
-            thread.start()
-            thread.join()
-
-    simulate(Threaded, duration=1)
-    assert slept[0] >= 0.05
 
 
 def test_sleep_is_real_again_after_a_run(simulate: Any) -> None:
