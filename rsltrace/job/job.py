@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -219,7 +220,8 @@ class Job(Part):
             )
         if stop_ns is not None and stop_ns < start_ns:
             yield Problem(
-                f"{format_time(stop_ns)} is before the start ({format_time(start_ns)})",
+                f"{format_time(stop_ns)} is before the start ({format_time(start_ns)}): it is a "
+                "simulated time; 'duration' counts from the start",
                 ("stop", "time"),
             )
 
@@ -238,18 +240,33 @@ class Job(Part):
                 )
             first.setdefault(key, index)
 
+    def _near(self, path: str) -> str:
+        """Say what there is instead of a path that does not lead anywhere."""
+        full = self.resolve(path)
+        if full.exists():
+            return ""
+        if not full.parent.is_dir():
+            return f" (there is no folder {os.path.dirname(path)!r} either)"
+        names = sorted(entry.name for entry in full.parent.iterdir())
+        close = difflib.get_close_matches(full.name, names, n=1)
+        if not close:
+            return ""
+        return f"; did you mean {os.path.join(os.path.dirname(path), close[0])!r}?"
+
     def _paths_exist(self) -> Iterator[Problem]:
         for index, folder in enumerate(self.search_path):
             path = self.resolve(folder)
             if not path.is_dir():
                 what = "is not a folder" if path.exists() else "there is no such folder"
-                yield Problem(f"{folder!r}: {what}", ("search_path", index))
+                near = self._near(folder)
+                yield Problem(f"{folder!r}: {what}{near}", ("search_path", index))
         for index, node in enumerate(self.nodes):
             for number, file in enumerate(node.parameter_files):
                 path = self.resolve(file)
                 if not path.is_file():
                     what = "is not a file" if path.exists() else "there is no such parameter file"
-                    yield Problem(f"{file!r}: {what}", ("nodes", index, "parameter_files", number))
+                    loc = ("nodes", index, "parameter_files", number)
+                    yield Problem(f"{file!r}: {what}{self._near(file)}", loc)
         for place, file in self.model_files():
             path = self.resolve(file)
             if not path.is_file():
@@ -257,4 +274,5 @@ class Job(Part):
                 yield Problem(f"{file!r}: {what}", place)
         for index, bag in enumerate(self.bags):
             if not self.resolve(bag.path).exists():
-                yield Problem(f"{bag.path!r}: there is no such bag", ("bags", index, "path"))
+                message = f"{bag.path!r}: there is no such bag{self._near(bag.path)}"
+                yield Problem(message, ("bags", index, "path"))

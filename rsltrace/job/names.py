@@ -78,7 +78,19 @@ def check_field_path(path: str) -> None:
 def check_target(target: str) -> None:
     """Raise ``ValueError`` unless ``target`` looks like ``module:Class`` (dots in both parts)."""
     if not _TARGET.fullmatch(target):
-        raise ValueError(f"expected module:Class or module:function, got {target!r}")
+        raise ValueError(
+            f"expected module:Class or module:function, got {target!r}{_as_target(target)}"
+        )
+
+
+def _as_target(text: str) -> str:
+    """Say how to write what was probably meant: a dotted name, or the path of a module."""
+    path, _, attribute = text.replace("/", ".").partition(":")
+    if path.endswith(".py"):
+        module = path[: -len(".py")].strip(".")
+        return f"; a module is named with dots: {module}:{attribute or 'Class'}"
+    module, dot, last = text.rpartition(".")
+    return f"; write {module}:{last}" if dot and _TARGET.fullmatch(f"{module}:{last}") else ""
 
 
 def check_executable(name: str) -> None:

@@ -40,6 +40,8 @@ def check_callable_target(value: object) -> Target:
     """Check a class or function, given itself or as ``module:attribute``."""
     if callable(value):
         return value
+    if not isinstance(value, str):
+        raise Problem(f"expected module:Class or module:function, got {describe(value)}")
     return text(check_target)(value)
 
 

@@ -128,7 +128,7 @@ def whole(least: int, most: int = 2**63 - 1) -> Callable[[Any], int]:
 
     def function(value: object) -> int:
         if isinstance(value, bool) or not isinstance(value, int):
-            raise Problem(f"expected an integer, got {describe(value)}")
+            raise Problem(f"expected an integer, got {describe(value)}{_as_integer(value)}")
         if not least <= value <= most:
             bound = f"at least {least}" if value < least else f"at most {most}"
             raise Problem(f"must be {bound}, got {value}")
@@ -136,6 +136,15 @@ def whole(least: int, most: int = 2**63 - 1) -> Callable[[Any], int]:
 
     attach(function, schema={"type": "integer", "minimum": least, "maximum": most})
     return function
+
+
+def _as_integer(value: object) -> str:
+    """Say how to write what is an integer in all but form: ``1e5``, ``"7"``."""
+    if isinstance(value, str):
+        return "; take the quotes away" if value.strip().lstrip("+-").isdecimal() else ""
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2**63:
+        return f"; write {int(value)}"
+    return ""
 
 
 def one_of(*choices: str) -> Callable[[Any], str]:
@@ -191,7 +200,7 @@ def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ..
 
     def check_items(values: object) -> tuple[object, ...]:
         if not isinstance(values, (list, tuple)):
-            raise Problem(f"expected a list, got {describe(values)}")
+            raise Problem(f"expected a list, got {describe(values)}{_as_list(values)}")
         checked: list[object] = []
         problems: list[Problem] = []
         for index, value in enumerate(values):
@@ -207,12 +216,19 @@ def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ..
     return attach(check_items, schema={"type": "array", "items": schema})  # type: ignore[no-any-return]
 
 
+def _as_list(value: object) -> str:
+    return f"; write [{value}]" if isinstance(value, (str, int, float)) else ""
+
+
 def parts(shorthand: str | None = None) -> BeforeValidator:
     """Prepare a list of parts for pydantic; plain text stands for ``{shorthand: text}``."""
 
     def validate(values: object) -> object:
         if not isinstance(values, (list, tuple)):
-            raise Problem(f"expected a list, got {describe(values)}")
+            hint = _as_list(values) if shorthand is not None else ""
+            if isinstance(values, dict):
+                hint = "; put '- ' in front of each entry"
+            raise Problem(f"expected a list, got {describe(values)}{hint}")
         if shorthand is None:
             return tuple(values)
         return tuple({shorthand: v} if isinstance(v, str) else v for v in values)

@@ -58,12 +58,20 @@ def describe(value: object) -> str:
     return f"an object of {type(value).__name__}"
 
 
+def nearest(word: str, names: Iterable[str]) -> str | None:
+    """Return the name that ``word`` was most probably meant to be: one of the same letters, or
+    the most similar one; None if none is near."""
+    close = difflib.get_close_matches(word, list(names), n=3)
+    swapped = [name for name in close if sorted(name) == sorted(word)]
+    return next(iter([*swapped, *close]), None)
+
+
 def unknown_key(key: object, valid: Iterable[str], loc: Loc) -> Problem:
     """Return the finding that ``key``, below ``loc``, is none of the ``valid`` keys."""
     names = list(valid)
     inside = f" in {format_loc(loc)}" if loc else ""
-    close = difflib.get_close_matches(str(key), names, n=1)
-    advice = f"did you mean {close[0]!r}?" if close else f"valid keys are {', '.join(names)}"
+    near = nearest(str(key), names)
+    advice = f"did you mean {near!r}?" if near else f"valid keys are {', '.join(names)}"
     place = key if isinstance(key, (str, int)) else str(key)
     return Problem(f"unknown key {key!r}{inside}; {advice}", (*loc, place), at_key=True)
 
@@ -71,7 +79,14 @@ def unknown_key(key: object, valid: Iterable[str], loc: Loc) -> Problem:
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]:
     """Return the findings of a failed validation of ``model``, worded and with full locations."""
     found: list[Problem] = []
-    for entry in error.errors(include_url=False):
+    entries = error.errors(include_url=False)
+    # A misspelt key is one mistake, not two: the key that it was meant to be is not missing.
+    meant = {
+        (*entry["loc"][:-1], nearest(str(entry["loc"][-1]), _keys_at(model, entry["loc"][:-1])))
+        for entry in entries
+        if entry["type"] == "extra_forbidden"
+    }
+    for entry in entries:
         loc: Loc = entry["loc"]
         cause = entry.get("ctx", {}).get("error")
         if isinstance(cause, (Problem, Problems)):
@@ -79,11 +94,18 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
             found += [_named(item.message, loc + item.loc, at_key=item.at_key) for item in items]
         elif entry["type"] == "extra_forbidden":
             found.append(unknown_key(loc[-1], _keys_at(model, loc[:-1]), loc[:-1]))
+        elif entry["type"] == "missing" and loc in meant:
+            continue
         elif entry["type"] == "missing":
             inside = f"{format_loc(loc[:-1])}: " if loc[:-1] else ""
             found.append(Problem(f"{inside}the key '{loc[-1]}' is missing", loc))
         else:
-            found.append(_named(_wording(entry["type"], entry["msg"], cause, entry["input"]), loc))
+            text = _wording(entry["type"], entry["msg"], cause, entry["input"])
+            is_part = entry["type"].startswith("model_") and not isinstance(cause, ValueError)
+            if is_part and isinstance(entry["input"], (str, int, float, list, tuple)):
+                keys = _keys_at(model, loc)
+                text += f"; its keys are {', '.join(keys)}" if keys else ""
+            found.append(_named(text, loc))
     return found
 
 

@@ -28,6 +28,16 @@ UNITS_NS = {
 _TIME_TEXT = re.compile(
     r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-z]*)\s*"
 )
+_WORDS = {
+    "ns": ("nsec", "nsecs", "nanosecond", "nanoseconds"),
+    "us": ("usec", "usecs", "microsecond", "microseconds"),
+    "ms": ("msec", "msecs", "millisecond", "milliseconds", "millis"),
+    "s": ("s", "sec", "secs", "second", "seconds"),
+    "min": ("m", "mins", "minute", "minutes"),
+    "h": ("hr", "hrs", "hour", "hours"),
+}
+"""Other words for units, to say what was meant."""
+
 TIME_SCHEMA: dict[str, object] = {
     "anyOf": [
         {"type": "number", "minimum": 0},
@@ -97,7 +107,9 @@ def _parse_text(text: str) -> int:
     if not unit:
         raise ValueError(f"{text!r} has no unit: write '{number}s' for seconds")
     if unit not in UNITS_NS:
-        raise ValueError(f"unknown unit {unit!r} in {text!r}; units are {', '.join(UNITS_NS)}")
+        meant = next((u for u in _WORDS if unit.lower() in _WORDS[u]), None)
+        hint = f"write '{number}{meant}'" if meant else f"units are {', '.join(UNITS_NS)}"
+        raise ValueError(f"unknown unit {unit!r} in {text!r}; {hint}")
     return _exact(number, UNITS_NS[unit], text.strip())
 
 

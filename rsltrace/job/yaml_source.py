@@ -218,7 +218,10 @@ class _Builder:
 
     def _unknown_tag(self, node: Node) -> JobError:
         tag = _tag(node).replace(_TAG, "!!")
-        return self.source.error(f"the YAML tag {tag} has no meaning in a job", _mark(node))
+        return self.source.error(
+            f"the YAML tag {tag} has no meaning in a job: quote a text that begins with '!'",
+            _mark(node),
+        )
 
 
 # A date is text to a job, and so is the lone '=' that YAML 1.1 gave a meaning.
@@ -255,12 +258,18 @@ def _mark_at(text: str, position: int) -> Mark:
 
 _ADVICE = {
     "mapping values are not allowed here": "check the indentation, or quote a text with ': ' in it",
-    "expected <block end>": "check the indentation",
+    "expected <block end>": "check the indentation: this does not line up with what is above",
     "found character '\\t'": "indent with spaces, not tabs",
     "but found another document": "a job file holds one document, without '---' in between",
     "expected ',' or": "a bracket is not closed, or a comma is missing",
+    "could not find expected ':'": "there is no ': ' after this key",
+    "found unexpected end of stream": "a quote is not closed",
+    "found undefined alias": "quote a text that begins with '*'",
 }
 """What to do about the parser's commonest complaints, by how they begin."""
+
+_WHERE_IT_BEGAN = ("expected ',' or", "could not find expected ':'")
+"""Complaints that are made long after the place to look at."""
 
 
 def _syntax_error(source: YamlSource, error: Any) -> JobError:
@@ -268,15 +277,21 @@ def _syntax_error(source: YamlSource, error: Any) -> JobError:
     mark = Mark(place.line + 1, place.column + 1) if place else Mark(1, 1)
     problem = str(error.problem or error.context)
     advice = next((text for start, text in _ADVICE.items() if problem.startswith(start)), None)
-    message = f"not YAML: {problem}"
+    message = problem
     if error.context and began and began.line + 1 < mark.line:
-        if source.excerpt(mark):
-            message += f", {error.context} that began in line {began.line + 1}"
+        first = Mark(began.line + 1, began.column + 1)
+        if problem.startswith(_WHERE_IT_BEGAN):
+            message += f" in line {mark.line}, {error.context} that begins here"
+            mark = first
+        elif source.excerpt(mark):
+            message += f", {error.context} that began in line {first.line}"
         else:
             # The file ended; what was left open is what to look at.
-            mark = Mark(began.line + 1, began.column + 1)
+            mark = first
             message += f", {error.context} that begins here"
-    return source.error(f"{message}; {advice}" if advice else message, mark)
+    return source.error(
+        f"not YAML: {advice} ({message})" if advice else f"not YAML: {message}", mark
+    )
 
 
 def _integer(text: str) -> int:

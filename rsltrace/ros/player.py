@@ -34,6 +34,10 @@ class Player:
         self._core = core
         self._messages = messages
         self._on_end = on_end
+        self._publisher: BagPublisher
+        self._raw = b""
+        self._schedule = core.loop.schedule
+        self._hash = hash64 if core.recorder is not None else _no_hash
         self.played = 0
 
     def start(self) -> None:
@@ -45,20 +49,20 @@ class Player:
         if message is None:
             self._on_end()
             return
-        stamp_ns, publisher, data = message
-        self._core.loop.schedule(stamp_ns, lambda: self._publish(publisher, data), order=ORDER_BAG)
+        stamp_ns, self._publisher, self._raw = message
+        self._schedule(stamp_ns, self._publish, order=ORDER_BAG)
 
-    def _publish(self, publisher: BagPublisher, raw: bytes) -> None:
+    def _publish(self) -> None:
+        publisher = self._publisher
         try:
-            data = publisher._canonical(raw)
+            data = publisher._canonical(self._raw)
         except ValueError as error:
             raise BagError(
                 f"message {self.played + 1} of the bag, on {publisher.topic}, is not a "
                 f"{publisher.type_name}: {error}"
             ) from error
-        core = self._core
-        digest = hash64(data) if core.recorder is not None else 0
-        core.execute(
+        digest = self._hash(data)
+        self._core.execute(
             publisher,
             publisher.entity_id,
             publisher.node,
@@ -71,6 +75,10 @@ class Player:
         )
         self.played += 1
         self._next()
+
+
+def _no_hash(data: bytes) -> int:
+    return 0
 
 
 class BagPublisher(PublisherHandle):

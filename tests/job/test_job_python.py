@@ -75,7 +75,7 @@ def test_paths_are_relative_to_the_current_folder(
     ("build", "message"),
     [
         (lambda: NodeSpec(node="Talker"), "NodeSpec: node: expected module:Class or module:function, got 'Talker'"),
-        (lambda: NodeSpec(node=3), "NodeSpec: node: expected text, got the number 3"),
+        (lambda: NodeSpec(node=3), "NodeSpec: node: expected module:Class or module:function, got the number 3"),
         (lambda: NodeSpec(nod="m:N"), "NodeSpec: unknown key 'nod'; did you mean 'node'?"),
         (lambda: StopSpec(duration=1, duration_ns=1), "StopSpec: duration_ns: give either duration or duration_ns, not both"),
         (lambda: StopSpec(duration_ns=1.0), "StopSpec: duration: expected an integer number of nanoseconds, got 1.0"),
@@ -84,7 +84,7 @@ def test_paths_are_relative_to_the_current_folder(
         (lambda: Job(nodes=NODE), "Job: nodes: expected a list, got an object of NodeSpec"),
         (lambda: Job(nodes=[Talker]), "Job: nodes[0]: expected a mapping, got an object of type"),
         (lambda: Job(nodes=[{"node": "m:N", "nam": "x"}]), "Job: unknown key 'nam' in nodes[0]; did you mean 'name'?"),
-        (lambda: Job(nodes=[NODE], bags=["/no/such/bag"]), "Job: bags[0].path: '/no/such/bag': there is no such bag"),
+        (lambda: Job(nodes=[NODE], bags=["/no/such/bag"]), "Job: bags[0].path: '/no/such/bag': there is no such bag (there is no folder '/no/such' either)"),
         (lambda: Job(nodes=[NODE], seed=2**64), f"Job: seed: must be at most {2**64 - 1}, got {2**64}"),
         (lambda: Job(nodes=[NODE], timer_ties=None), "Job: timer_ties: expected creation or heap, got nothing"),
     ],

@@ -249,7 +249,7 @@ GOLDEN = {
            name: talker
         """,
         """
-        job.yaml:3:4: not YAML: expected <block end>, but found '<block mapping start>', while parsing a block collection that began in line 2; check the indentation
+        job.yaml:3:4: not YAML: check the indentation: this does not line up with what is above (expected <block end>, but found '<block mapping start>', while parsing a block collection that began in line 2)
             3 |    name: talker
               |    ^
         """,  # noqa: E501
@@ -257,7 +257,7 @@ GOLDEN = {
     "a colon in a text": (
         "nodes:\n  - node: m:N\n    name: a: b\n",
         """
-        job.yaml:3:12: not YAML: mapping values are not allowed here; check the indentation, or quote a text with ': ' in it
+        job.yaml:3:12: not YAML: check the indentation, or quote a text with ': ' in it (mapping values are not allowed here)
             3 |     name: a: b
               |            ^
         """,  # noqa: E501
@@ -265,7 +265,7 @@ GOLDEN = {
     "unclosed quote": (
         'nodes: [{node: "m:N}]\nseed: 1\n',
         """
-        job.yaml:1:16: not YAML: found unexpected end of stream, while scanning a quoted scalar that begins here
+        job.yaml:1:16: not YAML: a quote is not closed (found unexpected end of stream, while scanning a quoted scalar that begins here)
             1 | nodes: [{node: "m:N}]
               |                ^
         """,  # noqa: E501
@@ -276,15 +276,15 @@ GOLDEN = {
         seed: 3
         """,
         """
-        job.yaml:2:1: not YAML: expected ',' or ']', but got '<scalar>', while parsing a flow sequence that began in line 1; a bracket is not closed, or a comma is missing
-            2 | seed: 3
-              | ^
+        job.yaml:1:8: not YAML: a bracket is not closed, or a comma is missing (expected ',' or ']', but got '<scalar>' in line 2, while parsing a flow sequence that begins here)
+            1 | nodes: [{node: my_nodes:Talker}
+              |        ^
         """,  # noqa: E501
     ),
     "tab": (
         "nodes:\n\t- node: m:N\n",
         """
-        job.yaml:2:1: not YAML: found character '\\t' that cannot start any token; indent with spaces, not tabs
+        job.yaml:2:1: not YAML: indent with spaces, not tabs (found character '\\t' that cannot start any token)
             2 | \t- node: m:N
               | ^
         """,  # noqa: E501
@@ -300,7 +300,7 @@ GOLDEN = {
     "two documents": (
         "nodes: [{node: m:N}]\n---\nseed: 1\n",
         """
-        job.yaml:2:1: not YAML: but found another document, expected a single document in the stream that began in line 1; a job file holds one document, without '---' in between
+        job.yaml:2:1: not YAML: a job file holds one document, without '---' in between (but found another document, expected a single document in the stream that began in line 1)
             2 | ---
               | ^
         """,  # noqa: E501
@@ -321,15 +321,15 @@ GOLDEN = {
     "tag": (
         "nodes: [{node: !!python/name:os.system m:N}]\n",
         """
-        job.yaml:1:16: the YAML tag !!python/name:os.system has no meaning in a job
+        job.yaml:1:16: the YAML tag !!python/name:os.system has no meaning in a job: quote a text that begins with '!'
             1 | nodes: [{node: !!python/name:os.system m:N}]
               |                ^
-        """,
+        """,  # noqa: E501
     ),
     "undefined alias": (
         "nodes: *all\n",
         """
-        job.yaml:1:8: not YAML: found undefined alias 'all'
+        job.yaml:1:8: not YAML: quote a text that begins with '*' (found undefined alias 'all')
             1 | nodes: *all
               |        ^
         """,
@@ -451,10 +451,10 @@ GOLDEN = {
     "a node as text": (
         "nodes: [my_nodes:Talker]\n",
         """
-        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'
+        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard
             1 | nodes: [my_nodes:Talker]
               |         ^
-        """,
+        """,  # noqa: E501
     ),
     "wrong types": (
         """\
@@ -475,18 +475,18 @@ GOLDEN = {
         job.yaml:4:13: timer_ties: expected creation or heap, got text 'stack'
             4 | timer_ties: stack
               |             ^
-        job.yaml:5:7: stop: expected a mapping, got text '10s'
+        job.yaml:5:7: stop: expected a mapping, got text '10s'; its keys are duration, time, events, topic, function, quiescence
             5 | stop: 10s
               |       ^
         job.yaml:6:20: record.payloads: expected true or false, got text 'yes'
             6 | record: {payloads: "yes"}
               |                    ^
-        """,
+        """,  # noqa: E501
     ),
     "a float for an integer": (
         "nodes: [{node: m:N}]\nstop: {events: 1e5}\n",
         """
-        job.yaml:2:16: stop.events: expected an integer, got the number 1e5
+        job.yaml:2:16: stop.events: expected an integer, got the number 1e5; write 100000
             2 | stop: {events: 1e5}
               |                ^
         """,
@@ -538,7 +538,7 @@ GOLDEN = {
         job.yaml:3:17: construct_time: 11s is after the start (10s): nodes are constructed before the run starts
             3 | construct_time: 11s
               |                 ^
-        job.yaml:4:14: stop.time: 9.5s is before the start (10s)
+        job.yaml:4:14: stop.time: 9.5s is before the start (10s): it is a simulated time; 'duration' counts from the start
             4 | stop: {time: 9.5}
               |              ^
         """,  # noqa: E501
@@ -558,7 +558,7 @@ GOLDEN = {
           function: finished
         """,
         """
-        job.yaml:2:11: nodes[0].node: expected module:Class or module:function, got 'my_nodes.Talker'
+        job.yaml:2:11: nodes[0].node: expected module:Class or module:function, got 'my_nodes.Talker'; write my_nodes:Talker
             2 |   - node: my_nodes.Talker
               |           ^
         job.yaml:3:11: nodes[0].name: '2nd' is not a node name: use letters, digits and '_', not starting with a digit
@@ -728,7 +728,7 @@ GOLDEN = {
         job.yaml:2:18: record.topics: an empty list would keep no payload: write 'payloads: false' for that
             2 | record: {topics: [], exclude: /tf}
               |                  ^
-        job.yaml:2:31: record.exclude: expected a list, got text '/tf'
+        job.yaml:2:31: record.exclude: expected a list, got text '/tf'; write [/tf]
             2 | record: {topics: [], exclude: /tf}
               |                               ^
         """,  # noqa: E501
