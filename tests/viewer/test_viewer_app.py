@@ -450,6 +450,18 @@ def test_two_traces_inspected_one_by_one(pair: tuple[Path, Path], drive: Drive) 
     drive(pair, steps)
 
 
+def test_what_both_runs_share_is_shown_once_with_its_effects(
+    pair: tuple[Path, Path], drive: Drive
+) -> None:
+    async def steps(viewer: Any) -> None:
+        await viewer.press("c", "enter", "z")
+        assert viewer.text.count("2.100000000 s") == 1
+        assert "effects  1" in viewer.text
+        assert "→ 64" in viewer.text
+
+    drive(pair, steps, size=(80, 40))
+
+
 @pytest.mark.parametrize("name", ["schedule", "delayed_input", "missing_event"])
 def test_every_sample_can_be_walked_through(drive: Drive, name: str) -> None:
     folder = Path(__file__).parents[2] / "sample_traces" / name

@@ -180,7 +180,7 @@ class Session:
         if self.comparison is not None and self.side == "diff":
             from rsltrace_viewer.model.differences import pair_lines
 
-            return pair_lines(self.comparison, self.place, self.openness)
+            return pair_lines(self.comparison, self.place, self.openness, self.effects)
         return inspect(here[0], here[1], self.openness, self.effects)
 
     # Lanes.

@@ -12,7 +12,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.model.compare import Comparison
-from rsltrace_viewer.model.inspector import event_link, inspect
+from rsltrace_viewer.model.inspector import Effects, event_link, inspect
 from rsltrace_viewer.model.lines import Line, Openness, Role
 from rsltrace_viewer.model.run import KIND_WORDS
 from rsltrace_viewer.model.timeline import Sign
@@ -28,8 +28,11 @@ _SAYS = {
 _FIRST_SHOWN = 3
 
 
-def pair_lines(comparison: Comparison, place: int, openness: Openness) -> list[Line]:
-    """Return the lines of the inspector for a place of two runs."""
+def pair_lines(
+    comparison: Comparison, place: int, openness: Openness, effects: Effects | None = None
+) -> list[Line]:
+    """Return the lines of the inspector for a place of two runs. ``effects`` are those of the
+    event in run a, or in run b if it is there only."""
     a, b = comparison.a(place), comparison.b(place)
     sign = comparison.sign(place)
     lines = list(_title(comparison, place, a, b, sign))
@@ -53,7 +56,15 @@ def pair_lines(comparison: Comparison, place: int, openness: Openness) -> list[L
         is_open = openness.is_open(f"run{name}", sign is Sign.MATCH)
         lines.append(Line(0, words, f"event {index}", Role.SECTION, f"run{name}", is_open))
         if is_open:
-            inner = inspect(run, index, openness)[1:]
+            said = {"event", "event.at"} if sign is Sign.MATCH else {"event"}
+            own = name == "a" or a is None
+            if not own:
+                said.add("effects")  # nobody looks for these; run a's are shown
+            inner = (
+                line
+                for line in inspect(run, index, openness, effects if own else None)
+                if line.path not in said
+            )
             lines += [_of_run(line, other=name == "b") for line in inner]
     return lines
 
