@@ -15,7 +15,7 @@ from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.counts import Counts, count
-from rsltrace.trace.format import FORMAT_VERSION
+from rsltrace.trace.format import FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
 
 
@@ -90,15 +90,17 @@ def _node_lines(trace: Trace, counts: Counts) -> list[str]:
 
 def _guard_lines(trace: Trace) -> list[str]:
     """What the guard met, most worrying first; nothing for runs without such calls."""
+    left_out = printable(trace.metadata(METADATA_GUARD).get("left_out", ""))
+    lines = ["", f"state hashes leave out: {_short(left_out)}"] if left_out else []
     if not trace.guarded:
-        return []
+        return lines
     rows = [("  source", "done", "node", "call", "times")]
     for met in sorted(trace.guarded, key=lambda met: (not met.is_finding, met.source, met.node)):
         row = (f"  {met.source.value}", met.mode.value, printable(met.node) or "-")
         rows.append((*row, printable(met.call), str(met.count)))
     findings = sum(met.count for met in trace.guarded if met.is_finding)
     title = f"guard: {findings} findings" if findings else "guard: nothing that could differ"
-    return ["", title, *table(rows, right=frozenset((4,)))]
+    return [*lines, "", title, *table(rows, right=frozenset((4,)))]
 
 
 def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:

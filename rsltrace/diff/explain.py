@@ -23,6 +23,7 @@ from rsltrace.diff.model import (
 )
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.rows import Run, outputs_of
+from rsltrace.diff.states import state_differences
 from rsltrace.diff.views import Viewer
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
@@ -206,6 +207,7 @@ class Explainer:
             chain=self._chain(found),
             messages=messages,
             calls=calls,
+            state=state_differences(self.run_a, self.run_b, judgement.a, judgement.b),
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
         )

@@ -167,6 +167,18 @@ class CallDifference:
 
 
 @dataclass(frozen=True, slots=True)
+class StateDifference:
+    """A value in a node's state that differs after a diverging event: ``estimator.P[2][2]``.
+
+    ``a`` and ``b`` are printable; None where a state has no such value.
+    """
+
+    path: str
+    a: str | None
+    b: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class CauseStep:
     """One step of the way from the root to the divergence, root first.
 
@@ -214,6 +226,7 @@ class Divergence:
     reaches: tuple[Reach, ...] = ()
     next_step: str = ""
     calls: tuple[CallDifference, ...] = ()
+    state: tuple[StateDifference, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

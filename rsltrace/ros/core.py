@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.links import Network
     from rsltrace.ros.logs import Logs
     from rsltrace.ros.node import NodeHandle
+    from rsltrace.ros.stating import NodeState
     from rsltrace.ros.tasks import TaskRun
     from rsltrace.ros.threads import SimThread
     from rsltrace.ros.world import Entry
@@ -112,6 +113,8 @@ class Core:
         self.poll_stage: tuple[int, int] | None = None
         self.pending: list[EntityHandle | Program | SimThread] = []
         self.unowned: list[EntityHandle | Program | SimThread] = []
+        self.default_policy = Policy()
+        self.states: dict[str, NodeState] = {}
         self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
         self._entity_count = 0
         self._parked: dict[object, list[Callable[[], None]]] = {}
@@ -155,6 +158,10 @@ class Core:
             self.settle()
         loop = self.loop
         recorder = self.recorder
+        node = self.current_node
+        state_hash = 0
+        if node is not None and node.state is not None:
+            state_hash = node.state.after_event()
         if recorder is None:
             self.unrecorded = 0
         else:
@@ -166,6 +173,7 @@ class Core:
                 self.cause_event,
                 self.cause_output,
                 self.input_hash,
+                state_hash,
             )
         loop.events += 1
         self.flags = 0

@@ -10,6 +10,7 @@ from rsltrace.model.entity import EntityKind
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments, UnknownArgumentsError
 from rsltrace.ros.entity_handle import EntityHandle
 from rsltrace.ros.graph import action_names_and_types
+from rsltrace.ros.stating import NodeState
 
 if TYPE_CHECKING:
     from rsltrace.ros.boundary import Boundary
@@ -72,6 +73,10 @@ class NodeHandle(EntityHandle):
         super().__init__(core, None)
         self.node = self
         self.policy = core.policy
+        state = (self.policy or core.default_policy).state
+        self.state = NodeState(core, self, keeps=state == "record") if state else None
+        if self.state is not None:
+            core.states[self.fully_qualified_name] = self.state
         self.mailbox: Mailbox | None = None
         self.rosout: PublisherHandle | None = None
         self.log_exceptions = core.log_exceptions or program.log_exceptions

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -26,6 +27,7 @@ class Guarding:
     def __init__(self, job: Job) -> None:
         self._job = job
         self.guard: Guard | None = None
+        self._core: Core | None = None
 
     def begin(self, core: Core) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
@@ -41,6 +43,7 @@ class Guarding:
 
         early: list[Finding] = []
 
+        self._core = core
         job = self._job
         if job.guard.enabled:
             self.guard = Guard(
@@ -51,6 +54,7 @@ class Guarding:
                 on_finding=on_finding,
             )
             begin_shared(job.seed)
+        core.default_policy = policy_of(job.guard)
 
     @property
     def counts(self) -> tuple[GuardCount, ...]:
@@ -60,8 +64,15 @@ class Guarding:
 
     def write(self, writer: TraceWriter) -> None:
         """Put the summary into the trace, if there is anything to say."""
+        summary = {}
         if self.counts:
-            writer.add_metadata(METADATA_GUARD, {"calls": counts_text(self.counts)})
+            summary["calls"] = counts_text(self.counts)
+        states = self._core.states if self._core is not None else {}
+        left_out = {name: state.left_out for name, state in states.items() if state.left_out}
+        if left_out:
+            summary["left_out"] = json.dumps(left_out, sort_keys=True, ensure_ascii=False)
+        if summary:
+            writer.add_metadata(METADATA_GUARD, summary)
 
     def engaged(self) -> AbstractContextManager[None]:
         """Put the guard in charge of what this thread does now."""

@@ -21,6 +21,7 @@ TOPIC_OUTPUTS = "/rsltrace/outputs"
 TOPIC_ENTITIES = "/rsltrace/entities"
 TOPIC_DETAILS = "/rsltrace/details"
 TOPIC_FINDINGS = "/rsltrace/findings"
+TOPIC_STATES = "/rsltrace/states"
 TOPIC_ROSOUT = "/rosout"
 PREFIX_OWN = "/rsltrace/"
 PREFIX_REQUEST = "/rsltrace/request"
@@ -57,6 +58,7 @@ SCHEMA_OUTPUT = "rsltrace_msgs/msg/CallbackOutput"
 SCHEMA_ENTITY = "rsltrace_msgs/msg/Entity"
 SCHEMA_DETAIL = "rsltrace_msgs/msg/Detail"
 SCHEMA_FINDING = "rsltrace_msgs/msg/Finding"
+SCHEMA_STATE = "rsltrace_msgs/msg/StateChange"
 
 SCHEMA_TEXT = {
     SCHEMA_EVENT: """\
@@ -92,6 +94,11 @@ string detail        # JSON object
 uint64 event
 uint32 output        # which output of the event
 string text
+""",
+    SCHEMA_STATE: """\
+uint64 event         # index of the event after which the state is this
+uint32 node          # id in /rsltrace/entities
+string changes       # JSON: attributes that changed, each with its values by path
 """,
     SCHEMA_FINDING: """\
 uint64 event         # index of the event it happened in

@@ -76,6 +76,10 @@ class Recorder:
         """Write down what the guard found in the event under way. It is not hashed."""
         self.writer.add_finding(finding, stamp_ns)
 
+    def state(self, node: int, stamp_ns: int, changes: str) -> None:
+        """Write down how the state of a node changed in the event under way. It is not hashed."""
+        self.writer.add_state(self.index, node, stamp_ns, changes)
+
     def entity(self, entity: Entity) -> None:
         """Write down an entity. Its content is part of the event that created it."""
         self.writer.add_entity(entity)
@@ -91,6 +95,7 @@ class Recorder:
         cause_event: int,
         cause_output: int,
         input_hash: int,
+        state_hash: int = 0,
     ) -> None:
         """Close the event under way and move the hash chain on."""
         rest = _pack_event(
@@ -99,7 +104,7 @@ class Recorder:
             cause_event,
             input_hash,
             self.output_hash,
-            0,
+            state_hash,
             entity,
             cause_output,
             self.outputs,

@@ -41,6 +41,7 @@ from rsltrace.trace.format import (
     SCHEMA_EVENT,
     SCHEMA_FINDING,
     SCHEMA_OUTPUT,
+    SCHEMA_STATE,
     SCHEMA_TEXT,
     SEGMENT_DTYPE,
     TOPIC_DETAILS,
@@ -48,6 +49,7 @@ from rsltrace.trace.format import (
     TOPIC_EVENTS,
     TOPIC_FINDINGS,
     TOPIC_OUTPUTS,
+    TOPIC_STATES,
 )
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
 from rsltrace.trace.stream import McapStream
@@ -217,6 +219,11 @@ class TraceWriter:
         """Take a finding of the guard. Its channel is there once there is something in it."""
         channel_id = self._own_channel(TOPIC_FINDINGS, SCHEMA_FINDING)
         return self.add_payload(channel_id, stamp_ns, pack_finding(finding))
+
+    def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
+        """Take what changed in a node's state, as JSON."""
+        channel_id = self._own_channel(TOPIC_STATES, SCHEMA_STATE)
+        return self.add_payload(channel_id, stamp_ns, pack_detail(event, node, changes))
 
     def close(self, *, result: Mapping[str, str]) -> None:
         """Write what is left, then the indexes, and close the file.

@@ -43,6 +43,7 @@ def divergence_sections(found: Divergence, width: int, options: DiffOptions) -> 
     """Return what a report says of one divergence: what, why, what was before, what it reaches."""
     return [
         _event(found, width),
+        _state(found, width),
         _calls(found, width),
         _cause(found, width),
         *_before(found, width, options),
@@ -105,6 +106,29 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
     if not message.preview and (message.presence == "both" or message.reason):
         rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
     return rows
+
+
+def _state(found: Divergence, width: int) -> Section:
+    """Return which attributes of the node differ after the event."""
+    if not found.state:
+        return NOTHING
+    rows = [
+        cut(
+            line(
+                f"  {printable(one.path)}  ",
+                (_value(one.a), SIDE_A),
+                ("  |  ", FAINT),
+                (_value(one.b), SIDE_B),
+            ),
+            width,
+        )
+        for one in found.state
+    ]
+    return Section(line(("state of the node after it", TITLE)), rows, 6, "values", least=2)
+
+
+def _value(value: str | None) -> str:
+    return "(not there)" if value is None else printable(value)
 
 
 def _calls(found: Divergence, width: int) -> Section:

@@ -1,0 +1,380 @@
+"""A node's state as one number: equal for equal states, whatever addresses and orders there are.
+
+What a node keeps is written as canonical bytes and hashed with XXH3-64. Values count, not objects:
+two equal lists hash alike, shared or not. -0.0 is 0.0, every NaN is the same, sets have no order
+(dicts have one that programs see, so it counts). An array's data is hashed where it is, at some 20
+microseconds a megabyte. What has no value to speak of (locks,
+generators, handles of the middleware) is left out and listed.
+"""
+
+from __future__ import annotations
+
+import array
+import collections
+import datetime
+import decimal
+import enum
+import fractions
+import functools
+import pathlib
+import struct
+import types
+import uuid
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import xxhash
+
+DEPTH_MAX = 200
+"""What lies deeper (a linked list of a million nodes) is left out and listed."""
+
+_hash64 = xxhash.xxh3_64_intdigest
+_pack_double = struct.Struct("<d").pack
+_pack_count = struct.Struct("<Q").pack
+_NAN = b"fN"
+
+_SKIPPED_MODULES = frozenset(
+    "_thread threading _io io socket ssl _socket select selectors asyncio multiprocessing "
+    "subprocess concurrent rclpy rsltrace greenlet logging weakref ctypes _ctypes "
+    "mmap".split()
+)
+
+
+class StateHasher:
+    """Hashes values. ``skipped`` says what was left out: its type by where it was."""
+
+    def __init__(self) -> None:
+        self.skipped: dict[str, str] = {}
+        self.place = ""
+        self._open: dict[int, int] = {}
+        self._seen: dict[tuple[str, int], int] = {}
+        self._out: list[bytes] = []
+
+    def digest(self, value: object, place: str) -> int:
+        """Return the hash of a value, never 0; ``place`` names it where something is left out."""
+        self.place = place
+        out: list[bytes] = []
+        self._out = out
+        self._open.clear()
+        self._add(value)
+        return _hash64(b"".join(out)) or 1
+
+    def _add(self, value: Any) -> None:
+        kind = type(value)
+        write = _PLAIN.get(kind)
+        if write is not None:
+            self._out.append(write(value))
+            return
+        if id(value) in self._open:
+            self._out.append(b"^%d;" % self._open[id(value)])
+            return
+        if len(self._open) >= DEPTH_MAX:
+            self._skip(value)
+            return
+        self._open[id(value)] = len(self._open)
+        try:
+            handler = _HANDLERS.get(kind) or _handler_of(kind)
+            handler(self, value)
+        finally:
+            del self._open[id(value)]
+
+    def _skip(self, value: object) -> None:
+        kind = type(value)
+        if kind.__module__.partition(".")[0] not in ("rclpy", "rsltrace"):  # every node has those
+            self.skipped.setdefault(self.place, f"{kind.__module__}.{kind.__qualname__}")
+        self._out.append(b"?")
+
+    # -- containers ------------------------------------------------------------------------------
+
+    def _sequence(self, value: Any) -> None:
+        out = self._out
+        out.append(b"l" + _pack_count(len(value)))
+        add, plain = self._add, _PLAIN.get
+        for item in value:
+            write = plain(type(item))
+            if write is not None:
+                out.append(write(item))
+            else:
+                add(item)
+
+    def _mapping(self, value: Any) -> None:
+        self._out.append(b"d" + _pack_count(len(value)))
+        for key, item in value.items():
+            self._add(key)
+            self._add(item)
+
+    def _set(self, value: Any) -> None:
+        self._out.append(b"e" + _pack_count(len(value)))
+        self._out += sorted(self._bytes_of(item) for item in value)
+
+    def _bytes_of(self, value: object) -> bytes:
+        saved, self._out = self._out, []
+        self._add(value)
+        own, self._out = self._out, saved
+        return b"".join(own)
+
+    def _array(self, value: Any) -> None:
+        self._out.append(b"a" + f"{value.dtype.str}{value.shape}".encode())
+        if value.dtype.hasobject:
+            self._sequence(value.ravel().tolist())
+        elif value.dtype.names is not None:
+            for name in value.dtype.names:
+                self._array(value[name])
+        else:
+            self._out.append(_pack_count(array_hash(value, self._seen)))
+
+    # -- objects ---------------------------------------------------------------------------------
+
+    def _object(self, value: Any) -> None:
+        kind = type(value)
+        self._out.append(f"o{kind.__module__}.{kind.__qualname__};".encode())
+        hook = getattr(value, "rsltrace_state", None)
+        if callable(hook):
+            self._add(hook())
+            return
+        if isinstance(value, dict):
+            self._mapping(value)
+        elif isinstance(value, (list, tuple, collections.deque)):
+            self._sequence(value)
+        elif isinstance(value, (set, frozenset)):
+            self._set(value)
+        for name, item in attributes_of(value).items():
+            self._out.append(name.encode("utf-8", "surrogatepass") + b"=")
+            self._add(item)
+
+    def _reduced(self, value: Any) -> None:
+        """A value of a C type without attributes: what pickle would keep of it."""
+        try:
+            parts = value.__reduce_ex__(4)
+        except Exception:
+            self._skip(value)
+            return
+        kind = type(value)
+        self._out.append(f"r{kind.__module__}.{kind.__qualname__};".encode())
+        if isinstance(parts, tuple):
+            self._sequence(parts[1:3])
+            for extra in parts[3:5]:
+                if extra is not None:
+                    self._sequence(list(extra))
+        else:
+            self._add(parts)
+
+    def _bound(self, value: Any) -> None:
+        self._out.append(f"m{value.__func__.__qualname__};".encode())
+        if id(value.__self__) not in self._open:
+            self._add(value.__self__)
+
+    def _partial(self, value: Any) -> None:
+        self._sequence((value.func, value.args, value.keywords))
+
+    def _random(self, value: Any) -> None:
+        self._sequence(value.getstate())
+
+    def _generator(self, value: Any) -> None:
+        self._add(value.bit_generator.state)
+
+    def _legacy_generator(self, value: Any) -> None:
+        self._add(value.get_state(legacy=False))
+
+
+def attributes_of(value: Any) -> dict[str, Any]:
+    """Return an object's attributes by name, sorted: its ``__dict__`` and its slots."""
+    kind = type(value)
+    slots = _slots.get(kind)
+    if slots is None:
+        slots = _slots[kind] = _slots_of(kind)
+    attributes = {name: getattr(value, name) for name in slots if hasattr(value, name)}
+    attributes.update(getattr(value, "__dict__", {}))
+    return dict(sorted(attributes.items()))
+
+
+_slots: dict[type, tuple[str, ...]] = {}
+
+
+def _slots_of(kind: type) -> tuple[str, ...]:
+    names = []
+    for cls in kind.__mro__:
+        slots = cls.__dict__.get("__slots__", ())
+        for name in (slots,) if isinstance(slots, str) else slots:
+            if name.startswith("__") and not name.endswith("__"):
+                name = f"_{cls.__name__.lstrip('_')}{name}"
+            if name not in ("__dict__", "__weakref__"):
+                names.append(name)
+    return tuple(names)
+
+
+def is_left_out(value: object) -> bool:
+    """Return whether an object has no value to speak of: a lock, a generator, a handle."""
+    kind = type(value)
+    if kind in _PLAIN or hasattr(kind, "rsltrace_state"):
+        return False
+    return _is_left_out(kind)
+
+
+def _is_left_out(kind: type) -> bool:
+    # A subclass of a node or a thread is one, too.
+    modules = {cls.__module__.partition(".")[0] for cls in kind.__mro__}
+    return issubclass(kind, _SKIPPED_TYPES) or not _SKIPPED_MODULES.isdisjoint(modules)
+
+
+def array_hash(value: Any, seen: dict[tuple[str, int], int]) -> int:
+    """Return the hash of an array's data, in which equal numbers count as equal.
+
+    It is done in blocks, and ``seen`` remembers the canonical hash of a block by its plain one:
+    what has not changed is read only once.
+    """
+    data = np.ascontiguousarray(value)
+    dtype = data.dtype
+    if dtype.kind not in "fc" or not data.size:
+        return _hash64(data.view(np.uint8) if dtype.kind in "UMm" and data.size else data)
+    parts = data.reshape(-1).view(data.real.dtype)
+    if parts.itemsize > 8:  # long doubles have padding, which is never set
+        high = parts.astype(np.float64)
+        low = np.where(np.isfinite(high), parts - high, 0).astype(np.float64)
+        return _hash64(struct.pack("<2Q", array_hash(high, seen), array_hash(low, seen)))
+    if len(seen) > _SEEN_MAX:
+        seen.clear()
+    count = _BLOCK_BYTES // parts.itemsize
+    digests = []
+    for start in range(0, len(parts), count):
+        block = parts[start : start + count]
+        key = dtype.str, _hash64(block)
+        digest = seen.get(key)
+        if digest is None:
+            digest = seen[key] = _canonical_hash(block)
+        digests.append(digest)
+    return digests[0] if len(digests) == 1 else _hash64(struct.pack(f"<{len(digests)}Q", *digests))
+
+
+def _canonical_hash(block: Any) -> int:
+    if _has_several_forms(block):
+        block = block + 0.0  # -0.0 + 0.0 is 0.0
+        block[np.isnan(block)] = np.nan
+    return _hash64(block)
+
+
+def _has_several_forms(parts: Any) -> bool:
+    """Return whether there is a -0.0 or a NaN among floats: two quick looks, rarely true."""
+    lowest = _LOWEST[parts.dtype.itemsize]
+    return bool(np.isnan(parts.min()) or parts.view(lowest.dtype).min() == lowest)
+
+
+_BLOCK_BYTES = 64 << 10
+_SEEN_MAX = 100_000
+_LOWEST = {size: np.array(-(2 ** (8 * size - 1)), dtype=f"<i{size}") for size in (2, 4, 8)}
+"""-0.0 has this bit pattern, the smallest integer of its size."""
+
+
+def _float(value: float) -> bytes:
+    return b"f" + _pack_double(value + 0.0) if value == value else _NAN
+
+
+def _text(value: str) -> bytes:
+    data = value.encode("utf-8", "surrogatepass")
+    return b"s" + _pack_count(len(data)) + data
+
+
+def _bytes(value: Any) -> bytes:
+    return b"b" + _pack_count(len(value)) + bytes(value)
+
+
+def _named(letter: bytes) -> Callable[[Any], bytes]:
+    def write(value: Any) -> bytes:
+        module = getattr(value, "__module__", "") or ""
+        name = getattr(value, "__qualname__", None) or value.__name__
+        return letter + f"{module}.{name};".encode()
+
+    return write
+
+
+_PLAIN: dict[type, Callable[[Any], bytes]] = {
+    type(None): lambda value: b"n",
+    bool: lambda value: b"T" if value else b"F",
+    int: lambda value: b"i%d;" % value,
+    float: _float,
+    complex: lambda value: b"c" + _float(value.real) + _float(value.imag),
+    str: _text,
+    bytes: _bytes,
+    bytearray: _bytes,
+    memoryview: _bytes,
+    range: lambda value: repr(value).encode(),
+    type(...): lambda value: b".",
+    types.FunctionType: _named(b"F"),
+    types.BuiltinFunctionType: _named(b"B"),
+    types.ModuleType: _named(b"M"),
+    type: _named(b"C"),
+    decimal.Decimal: lambda value: b"D" + repr(value).encode(),
+    fractions.Fraction: lambda value: b"Q" + repr(value).encode(),
+    datetime.datetime: lambda value: b"t" + repr(value).encode(),
+    datetime.date: lambda value: b"t" + repr(value).encode(),
+    datetime.time: lambda value: b"t" + repr(value).encode(),
+    datetime.timedelta: lambda value: b"t" + repr(value).encode(),
+    uuid.UUID: lambda value: b"u" + value.bytes,
+}
+
+_Handler = Callable[[StateHasher, Any], None]
+_HANDLERS: dict[type, _Handler] = {
+    list: StateHasher._sequence,
+    tuple: StateHasher._sequence,
+    dict: StateHasher._mapping,
+    set: StateHasher._set,
+    frozenset: StateHasher._set,
+    types.MappingProxyType: StateHasher._mapping,
+    types.MethodType: StateHasher._bound,
+    functools.partial: StateHasher._partial,
+    np.ndarray: StateHasher._array,
+    np.random.Generator: StateHasher._generator,
+    np.random.RandomState: StateHasher._legacy_generator,
+}
+_SKIPPED_TYPES = (
+    types.GeneratorType,
+    types.CoroutineType,
+    types.AsyncGeneratorType,
+    types.FrameType,
+    types.TracebackType,
+    weakref.ReferenceType,
+)
+
+
+def _handler_of(kind: type) -> _Handler:
+    """Choose how objects of a type are hashed, once."""
+    handler = _choose(kind)
+    _HANDLERS[kind] = handler
+    return handler
+
+
+def _choose(kind: type) -> _Handler:
+    import random
+
+    if hasattr(kind, "rsltrace_state"):
+        return StateHasher._object
+    if _is_left_out(kind):
+        return StateHasher._skip
+    if issubclass(kind, enum.Enum):
+        return lambda hasher, value: hasher._out.append(
+            f"E{type(value).__qualname__}.{value.name};".encode()
+        )
+    if issubclass(kind, type):
+        return lambda hasher, value: hasher._out.append(_named(b"C")(value))
+    if issubclass(kind, np.ndarray):
+        return StateHasher._array
+    if issubclass(kind, np.generic):
+        return lambda hasher, value: hasher._array(np.asarray(value))
+    if issubclass(kind, random.Random):
+        return StateHasher._random
+    if issubclass(kind, array.array):
+        return lambda hasher, value: hasher._out.append(
+            f"A{value.typecode}".encode() + _bytes(value.tobytes())
+        )
+    if issubclass(kind, pathlib.PurePath):
+        return lambda hasher, value: hasher._out.append(b"p" + _text(str(value)))
+    if issubclass(kind, tuple(_PLAIN)) and kind not in (type,):
+        plain = next(cls for cls in kind.__mro__ if cls in _PLAIN)
+        return lambda hasher, value: hasher._out.append(_PLAIN[plain](value))
+    if kind.__dictoffset__ or any("__slots__" in cls.__dict__ for cls in kind.__mro__[:-1]):
+        return StateHasher._object
+    if issubclass(kind, (dict, list, tuple, set, frozenset, collections.deque)):
+        return StateHasher._object
+    return StateHasher._reduced

@@ -1,0 +1,90 @@
+"""The state of a node after each of its events: its own attributes, not those rclpy gave it."""
+
+from __future__ import annotations
+
+import dis
+import json
+from collections.abc import Iterator
+from functools import lru_cache
+from types import CodeType, FunctionType
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.guard.guard import engage
+from rsltrace.guard.snapshot import Snapshots
+from rsltrace.guard.state import StateHasher
+from rsltrace.trace.chain import hash64
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+    from rsltrace.ros.node import NodeHandle
+
+
+class NodeState:
+    """Hashes one node's state; ``keeps`` says whether what changes is written down, too."""
+
+    def __init__(self, core: Core, handle: NodeHandle, *, keeps: bool) -> None:
+        self._core = core
+        self._handle = handle
+        self._hasher = StateHasher()
+        self._snapshots = Snapshots() if keeps else None
+
+    @property
+    def left_out(self) -> dict[str, str]:
+        """What has no hash: types by attribute."""
+        return self._hasher.skipped
+
+    def after_event(self) -> int:
+        """Return the hash of the node's state now, 0 as long as there is no node."""
+        node = self._handle.wrapper
+        if node is None:
+            return 0
+        with engage(None):  # what a hash looks at is no finding
+            attributes = self._attributes(node)
+            digest = self._hasher.digest
+            hashes = {name: digest(value, name) for name, value in attributes.items()}
+            recorder = self._core.recorder
+            if self._snapshots is not None and recorder is not None:
+                changes = self._snapshots.changes(attributes, hashes)
+                if changes:
+                    text = json.dumps(changes, separators=(",", ":"), sort_keys=True)
+                    recorder.state(self._handle.entity_id, self._core.loop.now_ns, text)
+        parts = "".join(f"{name}={value:x};" for name, value in hashes.items())
+        return hash64(parts.encode("utf-8", "surrogatepass")) or 1
+
+    def _attributes(self, node: Any) -> dict[str, Any]:
+        hook = getattr(node, "rsltrace_state", None)
+        if callable(hook):
+            state = hook()
+            return dict(state) if isinstance(state, dict) else {"rsltrace_state()": state}
+        own = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
+        attributes = {name: value for name, value in vars(node).items() if name not in own}
+        for name, parameter in node._parameters.items():
+            attributes[f"parameter {name}"] = parameter.value
+        return dict(sorted(attributes.items()))
+
+
+@lru_cache(maxsize=256)
+def _attributes_of_rclpy(kind: type) -> frozenset[str]:
+    """Return the attributes that rclpy's own classes set on a node of this class."""
+    return frozenset(
+        name
+        for cls in kind.__mro__
+        if cls.__module__.partition(".")[0] in ("rclpy", "rsltrace")
+        for function in vars(cls).values()
+        if isinstance(function, FunctionType)
+        for name in _stored_on_self(function.__code__)
+    )
+
+
+def _stored_on_self(code: CodeType) -> Iterator[str]:
+    before = None
+    for instruction in dis.get_instructions(code):
+        # Python 3.13 loads the value and self in one instruction.
+        if (
+            instruction.opname == "STORE_ATTR"
+            and before is not None
+            and before.opname.startswith("LOAD_FAST")
+            and "self" in str(before.argval)
+        ):
+            yield str(instruction.argval)
+        before = instruction
