@@ -82,7 +82,7 @@ class StateHasher:
 
     def _skip(self, value: object) -> None:
         kind = type(value)
-        if kind.__module__.partition(".")[0] not in ("rclpy", "rsltrace"):  # every node has those
+        if kind.__module__.partition(".")[0] != "rclpy":  # every node has those
             self.skipped.setdefault(self.place, f"{kind.__module__}.{kind.__qualname__}")
         self._out.append(b"?")
 

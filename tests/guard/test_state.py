@@ -329,10 +329,11 @@ def test_state_hashes_are_off_by_default_and_listed_in_info(tmp_path: Path) -> N
         hashes = [int(h) for events in trace.events() for h in events["state_hash"]]
         assert len(set(hashes)) > 10
         assert (
-            trace.metadata("rsltrace:guard")["left_out"] == '{"/planted": {"lock": "_thread.lock"}}'
+            trace.metadata("rsltrace:guard")["left_out"]
+            == '{"/planted": {"lock": "rsltrace.ros.locks.SimLock"}}'
         )
     shown = CliRunner().invoke(info, [str(on)]).output
-    assert 'state hashes leave out: {"/planted": {"lock": "_thread.lock"}}' in shown
+    assert 'state hashes leave out: {"/planted": {"lock": "rsltrace.ros.locks.SimLock"}}' in shown
 
 
 @pytest.mark.ros
