@@ -5,12 +5,13 @@
 
 PYTHON ?= python3
 VENV ?= .venv
+ROS ?= ros,dev-ros
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: rclpy-tests demo test lint types architecture unit setup docs samples bench pictures clean
+.PHONY: demo test test-kilted rclpy-tests lint types architecture unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -19,7 +20,7 @@ $(INSTALLED): pyproject.toml
 		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
 	@echo "setting up $(VENV) (once, about a minute)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[ros,view,graph,remote,rerun,dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,graph,remote,rerun,dev]'
 	@touch $@
 
 demo: $(INSTALLED)
@@ -45,12 +46,18 @@ architecture: $(INSTALLED)
 	$(BIN)/lint-imports
 
 unit: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto $(PYTEST)
 
 # rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
 RCLPY ?=
 rclpy-tests: $(INSTALLED)
 	$(BIN)/python tests/rclpy_suite --rclpy $(RCLPY)
+
+# The tests that run nodes, on the next release of ROS 2, in an environment of its own.
+KILTED := VENV=.venv-kilted ROS=ros-kilted,dev-ros-kilted
+KILTED_TESTS ?=
+test-kilted:
+	@$(MAKE) --no-print-directory $(KILTED) unit PYTEST="$(KILTED_TESTS)"
 
 # docs/jobs.md is made from the models of rsltrace.job; a test fails when it is stale.
 docs: $(INSTALLED)

@@ -103,6 +103,12 @@ class _ActionHandle(Destroyable):
         self.parts.append(part)
         return part
 
+    def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
+        """Publish service events of its three services (ROS 2 Kilted and later)."""
+        for part in self.parts:
+            if isinstance(part, _GoalService | _GoalClient):
+                part.configure_introspection(clock, qos, state)
+
     def find_waitable(self) -> Any:
         """Return the rclpy object around this handle, or None if its node is not being run."""
         if self.node.wrapper is not None:

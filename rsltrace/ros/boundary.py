@@ -13,6 +13,7 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import SetupError, UnsupportedError
@@ -35,6 +36,7 @@ from rsltrace.ros.qos_status import (
     LivelinessChangedStatus,
     MatchedStatus,
 )
+from rsltrace.ros.release import check_release
 from rsltrace.ros.services import (
     ClientHandle,
     RequestId,
@@ -151,9 +153,19 @@ class Boundary:
             self.core.main_context = context
         return context
 
-    def Node(self, *arguments: Any) -> NodeHandle:  # noqa: N802
-        name, namespace, context, cli_args, use_global, rosout = arguments
-        return NodeHandle(self, self.core, name, namespace, context, cli_args, use_global, rosout)
+    def Node(  # noqa: N802
+        self,
+        name: str,
+        namespace: str,
+        context: ContextHandle,
+        cli_args: list[str] | None,
+        use_global: bool,
+        rosout: bool,
+        rosout_qos: Any = None,  # from ROS 2 Kilted on
+    ) -> NodeHandle:
+        return NodeHandle(
+            self, self.core, name, namespace, context, cli_args, use_global, rosout, rosout_qos
+        )
 
     def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
         return PublisherHandle(node.core, node, *arguments)
@@ -342,6 +354,26 @@ def _endpoint_info(endpoint: Any, endpoint_type: int, message_type: Any) -> dict
     }
 
 
+# The classes of the objects that the boundary makes, by their names in rclpy's extension.
+_HANDLES: dict[str, type] = {
+    "ActionClient": ActionClientHandle,
+    "ActionGoalHandle": GoalHandle,
+    "ActionServer": ActionServerHandle,
+    "Client": ClientHandle,
+    "Clock": ClockHandle,
+    "ClockEvent": ClockEventHandle,
+    "Context": ContextHandle,
+    "EventHandle": EventHandle,
+    "GuardCondition": GuardConditionHandle,
+    "LifecycleStateMachine": StateMachineHandle,
+    "Node": NodeHandle,
+    "Publisher": PublisherHandle,
+    "Service": ServiceHandle,
+    "Subscription": SubscriptionHandle,
+    "Timer": TimerHandle,
+    "TypeDescriptionService": TypeDescriptionServiceHandle,
+}
+
 _installed: Boundary | None = None
 
 
@@ -360,7 +392,10 @@ def boundary() -> Boundary:
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
                 f"({error})"
             ) from error
-        _installed = Boundary(singleton.rclpy_implementation)
+        real = singleton.rclpy_implementation
+        ours = Boundary(real)
+        check_release(real, ours, _HANDLES, Path(singleton.__file__).parents[1])
+        _installed = ours
     return _installed
 
 

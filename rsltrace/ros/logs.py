@@ -48,11 +48,13 @@ class Logs:
         self._echo = echo
         self._nodes: dict[str, NodeHandle] = {}
 
-    def attach(self, node: NodeHandle) -> None:
-        """Give a node its /rosout publisher."""
+    def attach(self, node: NodeHandle, qos: Any = None) -> None:
+        """Give a node its /rosout publisher, with the usual QoS profile unless it says another."""
         from rcl_interfaces.msg import Log
 
-        node.rosout = RosoutHandle(self._core, node, Log, TOPIC_ROSOUT, QOS_ROSOUT)
+        node.rosout = RosoutHandle(
+            self._core, node, Log, TOPIC_ROSOUT, QOS_ROSOUT if qos is None else qos
+        )
         self._nodes[node.logger_name()] = node
 
     def detach(self, node: NodeHandle) -> None:

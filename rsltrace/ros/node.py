@@ -39,6 +39,7 @@ class NodeHandle(EntityHandle):
         cli_args: Sequence[str] | None,
         use_global_arguments: bool,
         enable_rosout: bool,
+        rosout_qos: Any = None,
     ) -> None:
         real = boundary.real
         if real.rclpy_get_validation_error_for_node_name(node_name) is not None:
@@ -84,7 +85,7 @@ class NodeHandle(EntityHandle):
         core.graph.nodes.append(self)
         core.current_node = self
         if enable_rosout:
-            core.logs.attach(self)
+            core.logs.attach(self, rosout_qos)
 
     def _renamed(self, name: str, namespace: str) -> tuple[str, str]:
         outer = self._outer_names()

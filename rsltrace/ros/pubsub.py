@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.errors import UnsupportedError
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.ros.blocking import wait
@@ -213,8 +214,18 @@ class SubscriptionHandle(Receiver):
     kind = EntityKind.SUBSCRIPTION
     lists = "subscriptions"
 
-    def __init__(self, core: Core, node: NodeHandle, msg_type: Any, topic: str, qos: Any) -> None:
+    def __init__(
+        self,
+        core: Core,
+        node: NodeHandle,
+        msg_type: Any,
+        topic: str,
+        qos: Any,
+        content_filter: Any = None,
+    ) -> None:
         self.topic = node.resolve(topic, service=False)
+        if content_filter is not None:
+            self.set_content_filter(*content_filter)
         codec = codec_for(msg_type)
         self.type_name = codec.type_name
         self._msg_type = msg_type
@@ -273,6 +284,22 @@ class SubscriptionHandle(Receiver):
     def get_topic_name(self) -> str:
         """Return the resolved topic."""
         return self.topic
+
+    def is_cft_enabled(self) -> bool:
+        """Return False: there are no content filters."""
+        return False
+
+    def set_content_filter(self, expression: str, parameters: list[str]) -> None:
+        """Refuse: DDS's filter language is not spoken here (ROS 2 Kilted and later)."""
+        raise UnsupportedError(
+            f"the subscription of {self.topic} has a content filter ({expression!r}), which cannot "
+            "be simulated by this version of rsltrace: compare in the callback instead"
+        )
+
+    def get_content_filter(self) -> Any:
+        """Refuse, as rclpy does for a subscription without a content filter."""
+        assert self.node is not None
+        raise self.node.boundary.real.RCLError("content filter topic is not enabled")
 
     def get_publisher_count(self) -> int:
         """Count the connected publishers."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import struct
+from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.loop.timer import TimerState
@@ -48,6 +51,7 @@ class TimerHandle(EntityHandle):
         )
         self._callback: Any = None
         self._coroutine = False
+        self._info: str | None = None
 
     def activate(self) -> None:
         if self.wrapper is not None and not self.state.canceled and not self._destroyed:
@@ -79,7 +83,10 @@ class TimerHandle(EntityHandle):
         if callback is not self._callback:
             self._callback = callback
             self._coroutine = is_coroutine_function(callback)
+            self._info = _info_parameter(callback)
         digest = hash64(_pack_deadline(state.deadline_ns)) if core.recorder is not None else 0
+        if self._info is not None:
+            callback = partial(callback, **{self._info: self._timer_info()})
         state.call(core.loop.now_ns)
         core.loop.timers.ran(state)
         if self._coroutine:
@@ -87,6 +94,15 @@ class TimerHandle(EntityHandle):
             start_coroutine(core, self, _TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             core.execute(self, self.entity_id, self.node, _TIMER, callback, (), NO_EVENT, 0, digest)
+
+    def _timer_info(self) -> Any:
+        from rclpy.timer import TimerInfo
+
+        return TimerInfo(
+            expected_call_time=self.state.deadline_ns,
+            actual_call_time=self.core.loop.now_ns,
+            clock_type=self.wrapper.clock.clock_type,
+        )
 
     def _note(self, operation: int, value: int) -> None:
         if self.wrapper is not None:
@@ -158,3 +174,17 @@ class TimerHandle(EntityHandle):
 
     def _destroy(self) -> None:
         self.core.loop.timers.remove(self.state)
+
+
+def _info_parameter(callback: Any) -> str | None:
+    """Return which parameter of a callback wants a TimerInfo (ROS 2 Kilted and later)."""
+    import rclpy.timer
+
+    wanted = getattr(rclpy.timer, "TimerInfo", None)
+    if wanted is None:
+        return None
+    with suppress(TypeError, ValueError):  # no signature: then it wants none
+        for parameter in inspect.signature(callback).parameters.values():
+            if parameter.annotation == wanted:
+                return parameter.name
+    return None

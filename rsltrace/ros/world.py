@@ -103,6 +103,10 @@ class World:
         self.core.current_handle = None
         self.core.end_runners()
         self.core.executor.shutdown()
+        for node in self.nodes:  # has been destroyed, as far as it could be
+            untrack = getattr(node.context, "untrack_node", None)
+            if untrack is not None:  # from ROS 2 Kilted on, a shutdown destroys nodes once more
+                untrack(node)
         rclpy.try_shutdown()
         # What user code has left behind must meet its finalizers while rclpy is still simulated.
         if self.core.error is not None and self.core.error.__cause__ is not None:

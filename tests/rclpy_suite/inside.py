@@ -69,17 +69,13 @@ def simulate(request: dict[str, Any], reporter: Reporter) -> None:
 
     ended = False
 
-    def program() -> list[Any]:
-        import rclpy.utilities
-
+    def program() -> None:
         nonlocal ended
-        rclpy.utilities.g_default_context = None  # the tests make their own
         run_pytest(request, reporter)
         ended = True
-        return []
 
     folder = Path(request["folder"])
-    job = Job(nodes=[NodeSpec(node=program)], base_dir=folder, start=1.7e9)
+    job = Job(nodes=[NodeSpec(main=program)], base_dir=folder, start=1000.0)
     result = run(job, folder / f"{request['module']}.mcap", force=True)
     if not ended:
         reason = str(result.error) if result.error is not None else result.stop_reason

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -109,8 +110,10 @@ def test_transitions_by_code_and_what_is_not_allowed(simulate: Any) -> None:
         def tick(self) -> None:
             from rclpy.impl.implementation_singleton import rclpy_implementation
 
-            with pytest.raises(rclpy_implementation.RCLError, match="no transition matching 3"):
-                self.trigger_activate()
+            # Jazzy's rclpy raises, later ones return an error.
+            with suppress(rclpy_implementation.RCLError):
+                assert self.trigger_activate() is TransitionCallbackReturn.ERROR
+            assert self._state_machine.current_state == (1, "unconfigured")
             seen.append(self.trigger_configure())
             seen.append(self.trigger_activate())
             seen.append(self.trigger_shutdown())

@@ -75,13 +75,13 @@ def test_mains_spin_and_are_told_to_end_as_by_ctrl_c(simulate: Any) -> None:
 
     def listen() -> None:
         try:
-            with Context() as context:
-                rclpy.init(context=context) if not context.ok() else None
-                node = Node("other", context=context)
-                node.create_subscription(UInt64, "numbers", lambda m: log.append(m.data), 10)
-                executor = SingleThreadedExecutor(context=context)
-                executor.add_node(node)
-                executor.spin()
+            context = Context()
+            rclpy.init(context=context)
+            node = Node("other", context=context)
+            node.create_subscription(UInt64, "numbers", lambda m: log.append(m.data), 10)
+            executor = SingleThreadedExecutor(context=context)
+            executor.add_node(node)
+            executor.spin()
         except (KeyboardInterrupt, ExternalShutdownException) as error:
             ends.append(f"listen: {type(error).__name__}")
 

@@ -57,7 +57,7 @@ def test_timers_on_each_kind_of_clock_fire_on_time(simulate: Any) -> None:
         def __init__(self) -> None:
             super().__init__("timers")
             for kind in ("SYSTEM_TIME", "STEADY_TIME", "ROS_TIME"):
-                clock = Clock(clock_type=ClockType[kind])
+                clock = Clock(clock_type=getattr(ClockType, kind))
                 self.create_timer(1.0, lambda k=kind: seen.append((k, self.now())), clock=clock)
 
         def now(self) -> int:

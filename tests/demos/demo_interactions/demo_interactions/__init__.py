@@ -1,0 +1,1 @@
+"""Services, actions and lifecycle nodes, as ordinary programs."""

@@ -1,0 +1,1 @@
+"""Topics and parameters, as ordinary programs."""
