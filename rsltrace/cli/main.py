@@ -22,6 +22,7 @@ EXIT_BROKEN_PIPE = 141
 
 _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
+    "init": "Write a commented first job, from bags and nodes.",
     "check": "Check a job and show its graph, without running it.",
     "schema": "Print the JSON Schema of a job file, for editors.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",

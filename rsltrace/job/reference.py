@@ -107,7 +107,7 @@ def _entry(key: str, field: FieldInfo) -> list[str]:
     if field.is_required():
         facts.append("required")
     elif default is not None and default not in ({}, []):
-        facts.append(f"default `{_flow(default)}`")
+        facts.append(f"default `{flow(default)}`")
     out += [f"*{'; '.join(facts)}*", ""]
     if field.examples:
         out += ["```yaml", *(_example(key, value) for value in field.examples), "```", ""]
@@ -136,7 +136,7 @@ def _words(schema: dict[str, Any], field: FieldInfo | None = None) -> str:
             options.append(TIME_SCHEMA)
         return " or ".join(dict.fromkeys(_words(option) for option in options))
     if "enum" in schema:
-        return " or ".join(f"`{_flow(choice)}`" for choice in schema["enum"])
+        return " or ".join(f"`{flow(choice)}`" for choice in schema["enum"])
     kind = schema.get("type")
     if kind == "array":
         items = schema.get("items") or {}
@@ -160,10 +160,10 @@ def _words(schema: dict[str, Any], field: FieldInfo | None = None) -> str:
 
 
 def _example(key: str, value: Any) -> str:
-    return f"{key}: {_flow(value)}"
+    return f"{key}: {flow(value)}"
 
 
-def _flow(value: Any) -> str:
+def flow(value: Any) -> str:
     """Return a value as YAML on one line."""
     yaml = YAML()
     yaml.default_flow_style = True

@@ -53,7 +53,7 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
         start_offset_ns=spec.start_offset_ns,
         duration_ns=spec.duration_ns,
         recover=True,
-        skip=_never_plays,
+        skip=never_plays,
     ) as bag:
         _check_names(job, index, bag)
         yield BagInput(
@@ -70,7 +70,7 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
         )
 
 
-def _never_plays(topic: StoredTopic) -> bool:
+def never_plays(topic: StoredTopic) -> bool:
     """Services and actions are recorded as topics that only their own middleware may fill."""
     return _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
 

@@ -1,0 +1,141 @@
+"""``rsltrace init``: a first job, written from what there is: bags, nodes, or nothing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.errors import BagError, OutputError
+from rsltrace.model.stamp import format_duration, format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.job.look import Found
+
+_HEAD = """\
+# yaml-language-server: $schema=job.schema.json
+# A job of rsltrace. `rsltrace schema > job.schema.json` lets editors complete and check it,
+# `rsltrace check {name}` shows what it means, `rsltrace record {name}` runs it.
+# Every key is explained in docs/jobs.md.
+"""
+_PLACES = (".", "src", "scripts", "..")
+
+
+@click.command()
+@click.argument(
+    "job", type=click.Path(path_type=Path, dir_okay=False), default="job.yaml", required=False
+)
+@click.option(
+    "--from",
+    "sources",
+    multiple=True,
+    metavar="BAG|MODULE:CLASS",
+    help="A bag to play, or a node to run; may be given several times.",
+)
+def init(job: Path, sources: tuple[str, ...]) -> None:
+    """Write a commented first job to JOB (job.yaml), from bags and nodes.
+
+    Of a bag it lists the topics, their types and how long it is, of a node the parameters that
+    its source declares. Nothing is imported or run. A file that exists is left alone.
+    """
+    if job.exists():
+        raise OutputError(f"{job} exists; name another file, or remove it")
+    folder = job.parent
+    bags = [source for source in sources if ":" not in source or Path(source).exists()]
+    nodes = [_look(source, folder) for source in sources if source not in bags]
+    text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes))
+    try:
+        with job.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise OutputError(f"{job} cannot be written: {error.strerror or error}") from error
+    from rsltrace.job import load_job
+
+    if sources:
+        load_job(job)  # what was written must be a job
+    click.echo(f"wrote {job}; next: rsltrace check {job}", err=True)
+
+
+def _look(target: str, folder: Path) -> Found:
+    from rsltrace.job.look import look_up
+
+    places = [folder / place for place in _PLACES]
+    return look_up(target, [place for place in places if place.is_dir()])
+
+
+def _job_text(job: Path, bags: list[str], nodes: list[Found]) -> Iterator[str]:
+    yield _HEAD.format(name=job)
+    # A key without a value is a mistake, so of a job of bags alone this is a comment.
+    yield "\n# nodes:\n" if bags and not nodes else "\nnodes:\n"
+    for node in nodes:
+        yield from _node_text(node)
+    if not nodes:
+        start = "#   - " if bags else "  - "
+        yield f"{start}node: my_package.my_module:MyNode  # module:Class of a Node\n"
+        yield "#     name: another_name\n#     parameters: {rate: 10.0}\n"
+        yield "#     remappings: {odom: /robot/odom}\n"
+    folders = {os.path.relpath(n.folder, job.parent) for n in nodes if n.folder is not None}
+    if folders - {"."}:
+        yield f"search_path: [{', '.join(['.', *sorted(folders - {'.'})])}]\n"
+    elif not nodes:
+        yield "# search_path: [., ../src]  # where modules are, before Python's own path\n"
+    yield "\n"
+    if bags:
+        yield "bags:\n"
+        yield from bags
+    else:
+        yield "# bags: [path/to/bag]  # recordings to play in\n"
+    yield "\n"
+    if bags:
+        yield "# stop: {duration: 60s}  # without it, the end of the bags ends the run\n"
+    else:
+        yield "stop:\n  duration: 10s  # of simulated time\n"
+    yield "# seed: 1  # of whatever is random\n"
+    yield "# record: {exclude: [/camera/*]}  # payloads to leave out; hashes are always kept\n"
+
+
+def _node_text(node: Found) -> Iterator[str]:
+    yield f"  - node: {node.target}\n"
+    known = {name: value for name, value in node.parameters.items() if value is not None}
+    if known:
+        yield "    # parameters:  # as declared in its source\n"
+        yield from (f"    #   {name}: {_yaml(value)}\n" for name, value in known.items())
+    others = sorted(set(node.parameters) - set(known))
+    if others:
+        yield f"    # more parameters: {', '.join(others)}\n"
+
+
+def _yaml(value: Any) -> str:
+    from rsltrace.job.reference import flow
+
+    return flow(list(value) if isinstance(value, tuple) else value)
+
+
+def _bag_text(source: str, folder: Path) -> str:
+    from rsltrace.bag import open_bag
+    from rsltrace.run.bags import never_plays
+
+    try:
+        with open_bag(source, recover=True, skip=never_plays) as bag:
+            path = os.path.relpath(source, folder).replace(os.sep, "/")
+            length = format_duration(bag.end_ns - bag.start_ns)
+            lines = [
+                f"  - path: {_yaml(path)}",
+                f"    # from {format_seconds(bag.recording_start_ns)} s on, {length} long",
+                *(f"    # note: {note}" for note in bag.notes),
+                "    topics:",
+            ]
+            width = max(len(topic.name) for topic in bag.topics)
+            lines += [
+                f"      - {t.name:<{width}}  # {t.type_name}, {t.message_count} messages"
+                for t in bag.topics
+            ]
+            if bag.skipped:
+                lines.append(f"    # not played: {', '.join(bag.skipped)}")
+            lines += ["    # rate: 1.0", "    # remappings: {/recorded: /other}"]
+            return "\n".join(lines) + "\n"
+    except BagError as error:
+        raise BagError(f"{error} (a node is named as module:Class)") from None

@@ -1,0 +1,127 @@
+"""``rsltrace init``: what it writes is a job that runs, and it runs nothing itself."""
+
+from __future__ import annotations
+
+import sqlite3
+import struct
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.errors import JobError
+from rsltrace.job import load_job
+from rsltrace.job.look import look_up
+
+NODE = """
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+IMPORTED = open('imported', 'w').close()
+DEFAULT = 3
+
+class Hearer(Node):
+    def __init__(self):
+        super().__init__('hearer')
+        self.declare_parameter('rate', 10.0)
+        self.declare_parameter('name', value='x: y')
+        self.declare_parameter('computed', DEFAULT)
+        self.declare_parameters('deep', [('a', 1), ('b', [1.0, 2.0])])
+        self.declare_parameters('', [('c',)])
+        self.create_subscription(UInt64, '/n', lambda message: None, 10)
+"""
+
+
+def write_bag(path: Path) -> None:
+    db = sqlite3.connect(path)
+    db.executescript(
+        "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT,"
+        " serialization_format TEXT, offered_qos_profiles TEXT);"
+        "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
+        " data BLOB);"
+        "INSERT INTO topics VALUES (1, '/n', 'std_msgs/msg/UInt64', 'cdr', '');"
+        "INSERT INTO topics VALUES (2, '/go/_action/status', 'x/msg/Y', 'cdr', '');"
+    )
+    for i in range(3):
+        data = b"\0\1\0\0" + struct.pack("<Q", i)
+        db.execute("INSERT INTO messages VALUES (?, 1, ?, ?)", (i + 1, (5 + i) * 10**9, data))
+    db.commit()
+    db.close()
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "src" / "robot").mkdir(parents=True)
+    (tmp_path / "src" / "robot" / "__init__.py").touch()
+    (tmp_path / "src" / "robot" / "nodes.py").write_text(NODE)
+    write_bag(tmp_path / "a.db3")
+    return tmp_path
+
+
+def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
+    done = rsltrace("init", "--from", "a.db3", "--from", "robot.nodes:Hearer")
+    assert (done.returncode, done.stdout) == (0, "")
+    assert done.stderr == "wrote job.yaml; next: rsltrace check job.yaml\n"
+    assert not (folder / "imported").exists()
+    text = (folder / "job.yaml").read_text()
+    assert text.startswith("# yaml-language-server: $schema=")
+    for line in (
+        "    #   rate: 10.0",
+        "    #   name: 'x: y'",
+        "    #   deep.a: 1",
+        "    #   deep.b: [1.0, 2.0]",
+        "    # more parameters: c, computed",
+        "search_path: [., src]",
+        "      - /n  # std_msgs/msg/UInt64, 3 messages",
+        "    # from 5.000000000 s on, 2 s long",
+        "    # not played: /go/_action/status",
+    ):
+        assert line in text.splitlines()
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    assert done.returncode == 0, done.stderr
+    # What it offers as comments is right, too.
+    offered = text.replace("    # parameters:  #", "    parameters:  #").replace(
+        "    #   ", "      "
+    )
+    (folder / "more.yaml").write_text(offered)
+    job = load_job(folder / "more.yaml")
+    assert job.nodes[0].parameters["name"] == "x: y"
+    assert job.nodes[0].parameters["deep.b"] == (1.0, 2.0)
+
+
+@pytest.mark.parametrize("sources", [[], ["--from", "a.db3"], ["--from", "robot.nodes:Hearer"]])
+def test_each_kind_of_first_job_loads(rsltrace: Any, folder: Path, sources: list[str]) -> None:
+    done = rsltrace("init", "sub.yaml", *sources)
+    assert done.returncode == 0, done.stderr
+    load_job(folder / "sub.yaml")
+
+
+def test_a_file_that_exists_is_left_alone(rsltrace: Any, folder: Path) -> None:
+    (folder / "job.yaml").write_text("mine")
+    done = rsltrace("init")
+    assert done.returncode == 2
+    assert "job.yaml exists; name another file, or remove it" in done.stderr
+    assert (folder / "job.yaml").read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("source", "expected"),
+    [
+        ("nowhere", "nowhere: there is no such bag (a node is named as module:Class)"),
+        ("robot.nodes:Herer", "nodes.py has no 'Herer'; did you mean 'Hearer'?"),
+        ("robot.no_nodes:Hearer", "there is no module 'robot.no_nodes' in"),
+        ("robot.nodes:2", "expected module:Class or module:function, got 'robot.nodes:2'"),
+    ],
+)
+def test_what_is_not_there(rsltrace: Any, folder: Path, source: str, expected: str) -> None:
+    done = rsltrace("init", "--from", source)
+    assert done.returncode == 2
+    assert expected in done.stderr
+    assert not (folder / "job.yaml").exists()
+
+
+def test_a_module_on_pythons_own_path(folder: Path) -> None:
+    found = look_up("rclpy.node:Node", [folder])
+    assert found.folder is None
+    (folder / "src" / "robot" / "nodes.py").write_text("class (")
+    with pytest.raises(JobError, match=r"nodes\.py:1: not Python"):
+        look_up("robot.nodes:Hearer", [folder / "src"])
