@@ -210,6 +210,20 @@ class RosArguments:
         # rcl appends where in its own sources the error was raised.
         return re.sub(r", at \S+:\d+", "", text.decode(errors="replace"))
 
+    def log_levels(self) -> dict[str, str]:
+        """Return the names of the levels that ``--log-level`` gives; by logger, ``""`` for all."""
+        levels: dict[str, str] = {}
+        for flag, value in zip(self.arguments, self.arguments[1:], strict=False):
+            if flag == "--log-level":
+                logger, _, level = value.rpartition(":=")
+                levels[logger] = level.upper()
+        return levels
+
+    def rosout(self) -> bool | None:
+        """Return whether nodes shall publish on /rosout, None if nothing is said of it."""
+        said = [a for a in self.arguments if a in ("--enable-rosout-logs", "--disable-rosout-logs")]
+        return said[-1].startswith("--enable") if said else None
+
     def parameters(self, node_fqn: str) -> dict[str, Any]:
         """Return the parameter overrides for a node, later ones over earlier ones.
 

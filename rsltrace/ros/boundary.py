@@ -45,6 +45,7 @@ from rsltrace.ros.services import (
     TypeDescriptionServiceHandle,
 )
 from rsltrace.ros.timers import TimerHandle
+from rsltrace.ros.wait_set import WaitSetHandle
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -208,8 +209,6 @@ class Boundary:
         return StateMachineHandle(self, node.core, node, communicate)
 
     def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
-        from rsltrace.ros.executor import WaitSetHandle
-
         return WaitSetHandle(*arguments)
 
     # -- names and graph -------------------------------------------------------------------------
@@ -372,6 +371,7 @@ _HANDLES: dict[str, type] = {
     "Subscription": SubscriptionHandle,
     "Timer": TimerHandle,
     "TypeDescriptionService": TypeDescriptionServiceHandle,
+    "WaitSet": WaitSetHandle,
 }
 
 _installed: Boundary | None = None

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import Executor
 
-from rsltrace.errors import UnsupportedError
 from rsltrace.ros.blocking import FutureWake, SimEvent, wait
 from rsltrace.ros.own_executors import is_bookkeeping
 from rsltrace.ros.tasks import Resume, create_task
@@ -91,14 +90,4 @@ class SimExecutor(Executor):  # type: ignore[misc]
             wait(self._core, "the run to end", patient=True)
 
 
-class WaitSetHandle:
-    """Stands in for ``_rclpy.WaitSet``; rclpy's executors do without one here."""
-
-    def __init__(self, *args: Any) -> None:
-        raise UnsupportedError(
-            "a wait set of ones own cannot be simulated: let an executor wait "
-            "(wait_for_ready_callbacks of rclpy.executors.Executor)"
-        )
-
-
-__all__ = ["SimExecutor", "WaitSetHandle"]
+__all__ = ["SimExecutor"]

@@ -41,6 +41,14 @@ class GuardConditionHandle(EntityHandle):
             self._cause = (core.loop.events, core.note(OutputKind.GUARD, self.entity_id))
             core.loop.ready.append(self)
 
+    def is_triggered(self) -> bool:
+        """Return whether a trigger has not been handled yet."""
+        return self._triggered
+
+    def take_trigger(self) -> None:
+        """Handle the triggers until now, as a wait set does that has found them."""
+        self._triggered = False
+
     def activate(self) -> None:
         if self._triggered:
             self._cause = (self.core.loop.events, 0)

@@ -66,6 +66,8 @@ class StateMachineHandle(Destroyable):
     """Stands in for ``_rclpy.LifecycleStateMachine``."""
 
     def __init__(self, boundary: Boundary, core: Core, node: NodeHandle, communicate: bool) -> None:
+        if not isinstance(communicate, bool):
+            raise TypeError(f"enable_communication_interface must be a bool, not {communicate!r}")
         super().__init__()
         self._boundary = boundary
         self._state = 1

@@ -69,7 +69,7 @@ class NodeHandle(EntityHandle):
         self.fully_qualified_name = (
             namespace if namespace.endswith("/") else namespace + "/"
         ) + name
-        if core.graph.node_named(self.fully_qualified_name) is not None:
+        if _is_taken(core, self.fully_qualified_name):
             raise _duplicate(core, self.fully_qualified_name)
         super().__init__(core, None)
         self.node = self
@@ -84,8 +84,23 @@ class NodeHandle(EntityHandle):
         self.actions: list[Any] = []
         core.graph.nodes.append(self)
         core.current_node = self
-        if enable_rosout:
+        self._set_log_levels()
+        said = [each.rosout() for each in [*self._outer, self.arguments]]
+        if enable_rosout and next((s for s in reversed(said) if s is not None), True):
             core.logs.attach(self, rosout_qos)
+
+    def _set_log_levels(self) -> None:
+        """Do what ``--log-level`` asks for, for the loggers it names and for this node's."""
+        real = self.boundary.real
+        levels: dict[str, str] = {}
+        for arguments in [*self._outer, self.arguments]:
+            levels.update(arguments.log_levels())
+        everybody = levels.pop("", None)
+        if everybody is not None:  # but not for other programs of the run
+            levels.setdefault(self.logger_name(), everybody)
+        for logger, level in levels.items():
+            number = real.rclpy_logging_severity_level_from_string(level)
+            real.rclpy_logging_set_logger_level(logger, number)
 
     def _renamed(self, name: str, namespace: str) -> tuple[str, str]:
         outer = self._outer_names()
@@ -206,6 +221,19 @@ class NodeHandle(EntityHandle):
 def class_name(cls: type) -> str:
     """Return ``module:Class`` of a node's class."""
     return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _is_taken(core: Core, name: str) -> bool:
+    """Return whether a node of that name is at work.
+
+    In a program's hands a node may be left behind: its context is shut down, or nobody spins it.
+    """
+    return any(
+        node.fully_qualified_name == name
+        and node._context.ok()
+        and (node.wrapper is not None or core.program is core.host)
+        for node in core.graph.nodes
+    )
 
 
 def _duplicate(core: Core, name: str) -> NodeError:

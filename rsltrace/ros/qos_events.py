@@ -84,6 +84,10 @@ class EventHandle(EntityHandle):
             self._cause = (self.core.loop.events, 0)
             self.core.loop.ready.append(self)
 
+    def has_news(self) -> bool:
+        """Return whether there is a status to take."""
+        return self._events.news(self._name)
+
     def take_event(self) -> Any:
         """Return the status, or None if there is nothing new."""
         return self._events.take(self._name)

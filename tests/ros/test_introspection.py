@@ -231,3 +231,58 @@ def test_a_node_may_be_destroyed_twice(simulate: Callable[..., Any]) -> None:
         return Node("here")
 
     simulate(node, duration=0.1)
+
+
+def test_log_levels_and_rosout_as_ros_arguments_say(simulate: Callable[..., Any]) -> None:
+    def node(name: str, *words: str) -> Callable[[], Node]:
+        def make() -> Node:
+            made = Node(name, cli_args=["--ros-args", *words])
+            made.get_logger().debug(f"debug of {name}")
+            made.get_logger().info(f"info of {name}")
+            made.get_logger().get_child("part").debug(f"debug of a part of {name}")
+            return made
+
+        return make
+
+    run = simulate(
+        node("plain"),
+        node("wordy", "--log-level", "debug"),
+        node("other"),
+        node("named", "--log-level", "named.part:=debug", "--log-level", "warn"),
+        node("silent", "--disable-rosout-logs"),
+        node("again", "--disable-rosout-logs", "--enable-rosout-logs"),
+        duration=0.1,
+    )
+    assert run.logs() == [
+        "info of plain",
+        "debug of wordy",
+        "info of wordy",
+        "debug of a part of wordy",
+        "info of other",
+        "debug of a part of named",
+        "info of again",
+    ]
+
+
+def test_a_name_is_free_again_when_nobody_is_at_work_under_it(simulate: Callable[..., Any]) -> None:
+    from rsltrace import NodeSpec
+    from rsltrace.errors import RunError
+
+    seen: list[str] = []
+
+    def program() -> None:
+        contexts = [rclpy.Context() for _ in range(2)]
+        for context in contexts:
+            rclpy.init(context=context)
+        Node("left", context=contexts[0])  # nobody spins it
+        left = Node("left", context=contexts[1])
+        executor = rclpy.executors.SingleThreadedExecutor(context=contexts[1])
+        executor.add_node(left)
+        executor.spin_once(timeout_sec=0.1)
+        with pytest.raises(RunError, match="already a node named /left"):
+            Node("left", context=contexts[0])
+        contexts[1].try_shutdown()
+        seen.append(Node("left", context=contexts[0]).get_fully_qualified_name())
+
+    simulate(NodeSpec(main=program), duration=1)
+    assert seen == ["/left"]

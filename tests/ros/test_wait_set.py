@@ -1,0 +1,153 @@
+"""Wait sets of user code, and ``wait_for_message``, in simulated time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.wait_for_message import wait_for_message
+from std_msgs.msg import UInt64
+from std_srvs.srv import Trigger
+
+pytestmark = pytest.mark.ros
+
+
+class Counter(Node):
+    def __init__(self) -> None:
+        super().__init__("counter")
+        self.publisher = self.create_publisher(UInt64, "count", 10)
+        self.count = 0
+        self.create_timer(1.0, self.tick)
+
+    def tick(self) -> None:
+        self.count += 1
+        self.publisher.publish(UInt64(data=self.count))
+
+
+def seconds(node: Node) -> float:
+    return float(node.get_clock().now().nanoseconds) / 1e9
+
+
+def main_spec(function: Callable[[], None]) -> Any:
+    from rsltrace import NodeSpec
+
+    return NodeSpec(main=function)
+
+
+def test_waiting_for_a_message_takes_simulated_time(simulate: Callable[..., Any]) -> None:
+    seen: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("waiter")
+        for topic, limit in (("count", -1), ("count", 5.0), ("nothing", 2.5), ("count", 0.0)):
+            found, message = wait_for_message(UInt64, node, topic, time_to_wait=limit)
+            seen.append((found, message.data if found else None, seconds(node)))
+        seen.append(len(list(node.subscriptions)))
+
+    simulate(Counter, main_spec(program), duration=10)
+    assert seen == [(True, 1, 1.0), (True, 2, 2.0), (False, None, 4.5), (False, None, 4.5), 0]
+
+
+def test_waiting_for_a_message_inside_a_callback(simulate: Callable[..., Any]) -> None:
+    """The node's executor has the new subscription, too; who waits gets the message first."""
+    seen: list[Any] = []
+
+    class Waiter(Node):
+        def __init__(self) -> None:
+            super().__init__("waiter")
+            self.once = self.create_timer(1.5, self.look)
+
+        def look(self) -> None:
+            self.once.cancel()
+            found, message = wait_for_message(UInt64, self, "count", time_to_wait=5.0)
+            seen.append((found, message.data, seconds(self)))
+
+    simulate(Counter, Waiter, duration=4)
+    assert seen == [(True, 2, 2.0)]
+
+
+def test_a_message_that_never_comes_is_a_deadlock(simulate: Callable[..., Any]) -> None:
+    from rsltrace.errors import DeadlockError
+
+    def program() -> None:
+        rclpy.init()
+        wait_for_message(UInt64, Node("waiter"), "nothing")
+
+    with pytest.raises(DeadlockError, match=r"a wait set of /waiter: subscription /nothing"):
+        simulate(main_spec(program))
+
+
+def test_a_wait_set_of_everything(simulate: Callable[..., Any]) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("all")
+        real = rclpy_implementation
+        subscription = node.create_subscription(UInt64, "count", lambda m: None, 10)
+        client = node.create_client(Trigger, "there")
+        service = node.create_service(Trigger, "here", lambda request, response: response)
+        guard = node.create_guard_condition(lambda: None)
+        timer = node.create_timer(0.25, lambda: None)
+        wait_set = real.WaitSet(1, 1, 1, 1, 1, 0, node.context.handle)
+
+        def look(limit_ns: int) -> list[str]:
+            wait_set.clear_entities()
+            kinds = {
+                "subscription": wait_set.add_subscription(subscription.handle),
+                "guard_condition": wait_set.add_guard_condition(guard.handle),
+                "timer": wait_set.add_timer(timer.handle),
+                "client": wait_set.add_client(client.handle),
+                "service": wait_set.add_service(service.handle),
+            }
+            wait_set.wait(limit_ns)
+            ready = [kind for kind, index in kinds.items() if wait_set.is_ready(kind, index)]
+            assert ready == [kind for kind in kinds if wait_set.get_ready_entities(kind)]
+            log.append((seconds(node), ready))
+            return ready
+
+        look(0)
+        guard.trigger()
+        look(-1)
+        look(100_000_000)
+        look(-1)
+        timer.cancel()
+        for _ in range(3):
+            kinds = look(2_000_000_000)
+            if "service" in kinds:
+                _, header = service.handle.service_take_request(Trigger.Request)
+                service.handle.service_send_response(Trigger.Response(), header.request_id)
+            if "subscription" in kinds:
+                subscription.handle.take_message(UInt64, False)
+            if "service" in kinds:
+                client.handle.send_request(Trigger.Request())
+        assert client.handle.take_response(Trigger.Response)[1] is not None
+        with pytest.raises(IndexError):
+            wait_set.is_ready("timer", 1)
+
+    class Other(Node):
+        def __init__(self) -> None:
+            super().__init__("other")
+            self.create_service(Trigger, "there", lambda request, response: response)
+            self.asker = self.create_client(Trigger, "here")
+            self.once = self.create_timer(0.6, self.ask)
+
+        def ask(self) -> None:
+            self.once.cancel()
+            self.asker.call_async(Trigger.Request())
+
+    simulate(Counter, Other, main_spec(program), duration=10)
+    assert log == [
+        (0.0, []),
+        (0.0, ["guard_condition"]),
+        (0.1, []),
+        (0.25, ["timer"]),
+        (0.6, ["service"]),
+        (0.6, ["client"]),
+        (0.6, ["client"]),
+    ]
