@@ -117,6 +117,17 @@ class _ActionHandle(Destroyable):
                     return waitable
         return None
 
+    def waits_for(self, future: Any) -> str:
+        """Say what would complete a future, if it is a client's own."""
+        waitable = self.find_waitable()
+        for what in ("goal", "result", "cancel"):
+            pending = getattr(waitable, f"_pending_{what}_requests", {})
+            if future in pending.values():
+                servers = len(self.core.graph.services(f"{self.name}/_action/send_goal"))
+                answer = "the result of a goal" if what == "result" else f"the answer to a {what}"
+                return f"{answer}, of action {self.name} ({servers} servers)"
+        return ""
+
     async def execute(self, part: _Part) -> None:
         """Do what rclpy's executors do for a waitable of which ``part`` is ready."""
         waitable = part.wrapper

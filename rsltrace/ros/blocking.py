@@ -149,7 +149,8 @@ class Wait:
                 "callback keeps a mutually exclusive group busy, so give the client, timer or "
                 "subscription it waits for a callback group of its own"
             )
-        return f"{self.describe()} waits for {self.what}{hint}{where}"
+        what = self.core.called_service(self.stack.gr_frame) or self.what
+        return f"{self.describe()} waits for {what}{hint}{where}"
 
 
 def wait(

@@ -12,7 +12,6 @@ import sys
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -74,10 +73,6 @@ _PASSED_THROUGH = (
     "rclpy_logging_shutdown"
 ).split()
 
-_LATER = {
-    "EventsExecutor": "rclpy's EventsExecutor",
-}
-
 
 class Boundary:
     """Stands in for the module ``rclpy._rclpy_pybind11``; ``core`` is the world of the moment."""
@@ -102,8 +97,6 @@ class Boundary:
         for name in ("liveliness_lost", "message_lost", "offered_deadline_missed"):
             setattr(self, f"rmw_{name}_status_t", CountStatus)
         self.rmw_requested_deadline_missed_status_t = CountStatus
-        for name, feature in _LATER.items():
-            setattr(self, name, partial(_unsupported, feature))
 
     # -- the world of the moment ---------------------------------------------------------------
 
@@ -210,6 +203,12 @@ class Boundary:
 
     def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
         return WaitSetHandle(*arguments)
+
+    def EventsExecutor(self, context: Any) -> Any:  # noqa: N802
+        """Return an executor that behaves as rclpy's: here all of them run on events."""
+        from rclpy.executors import SingleThreadedExecutor
+
+        return SingleThreadedExecutor(context=context)
 
     # -- names and graph -------------------------------------------------------------------------
 
@@ -333,10 +332,6 @@ class Boundary:
 
     def unregister_sigint_guard_condition(self, guard: Any) -> None:
         pass
-
-
-def _unsupported(feature: str, *arguments: Any, **kwargs: Any) -> Any:
-    raise UnsupportedError(f"{feature} cannot be simulated by this version of rsltrace")
 
 
 def _endpoint_info(endpoint: Any, endpoint_type: int, message_type: Any) -> dict[str, Any]:

@@ -14,6 +14,7 @@ import uuid
 from _thread import get_ident
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from greenlet import getcurrent, greenlet
@@ -110,6 +111,7 @@ class Core:
         self.suspended: dict[TaskRun, None] = {}
         self.polled: list[TaskRun] = []
         self.polls = 0
+        self.polling = False
         self.poll_stage: tuple[int, int] | None = None
         self.pending: list[EntityHandle | Program | SimThread] = []
         self.unowned: list[EntityHandle | Program | SimThread] = []
@@ -243,7 +245,8 @@ class Core:
     def who_waits(self) -> list[str]:
         """Say of every suspended coroutine and blocked call what it waits for."""
         runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
-        return runs + [blocked.waits_for() for blocked in self.blocked if not blocked.is_patient()]
+        runs += [blocked.waits_for() for blocked in self.blocked if not blocked.is_patient()]
+        return runs + [f"(before: {note})" for note in self.notes] if runs else []
 
     @property
     def entry(self) -> Entry | None:
@@ -336,7 +339,7 @@ class Core:
         if future is None:
             return "something that is not an rclpy Future"
         for client in self.graph.all_clients():
-            if client.wrapper is not None and future in client.wrapper._pending_requests.values():
+            if future in getattr(client.wrapper, "_pending_requests", {}).values():
                 if client.queue:
                     return (
                         f"the response of {client.service}, which has arrived, but its client "
@@ -345,7 +348,23 @@ class Core:
                     )
                 servers = len(self.graph.services(client.service))
                 return f"the response of {client.service} ({servers} servers)"
+        for action in (action for node in self.graph.nodes for action in node.actions):
+            what: str = action.waits_for(future)
+            if what:
+                return what
         return "a Future that nobody completes"
+
+    def called_service(self, frame: FrameType | None) -> str:
+        """Say which service a stack waits for in ``Client.call``; empty if it is not there."""
+        from rclpy.client import Client
+
+        while frame is not None:
+            if frame.f_code is Client.call.__code__:
+                service = frame.f_locals["self"].handle.service
+                servers = len(self.graph.services(service))
+                return f"the response to a service call, of {service} ({servers} servers)"
+            frame = frame.f_back
+        return ""
 
     # -- callback groups -----------------------------------------------------------------------
 

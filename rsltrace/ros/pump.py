@@ -23,7 +23,7 @@ POLL_NS = 1_000_000
 """What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
 
 
-_FUTURE = "a future to be completed"
+_WORK = "work for its executor"
 
 
 class Pump:
@@ -96,10 +96,10 @@ class Pump:
                 return self._handler(*taken)
             if until_ns is None:
                 patient = _is_always(condition) and not self.core.in_callback()
-                what = "work for its executor" if _is_always(condition) else _FUTURE
+                what = _WORK if _is_always(condition) else _Awaited(self.core, condition)
                 self._wait(None, what=what, patient=patient)
             elif loop.now_ns < until_ns:
-                self._wait(until_ns - loop.now_ns, what="work for its executor")
+                self._wait(until_ns - loop.now_ns, what=_WORK)
             elif timeout_ns or looked:
                 raise executors.TimeoutException
             else:
@@ -112,7 +112,7 @@ class Pump:
         again, self._looked_ns = self._looked_ns == now_ns, now_ns
         return POLL_NS if again else 0
 
-    def _wait(self, for_ns: int | None, *, what: str, patient: bool = False) -> None:
+    def _wait(self, for_ns: int | None, *, what: object, patient: bool = False) -> None:
         wait(self.core, what, until=self._waits.append, for_ns=for_ns, quiet=True, patient=patient)
         self._waits = [blocked for blocked in self._waits if blocked in self.core.blocked]
 
@@ -163,6 +163,17 @@ class Pump:
         failure, core.raised = core.raised, None
         if failure is not None:
             raise failure
+
+
+class _Awaited:
+    """Says which future a spin waits for, when somebody asks."""
+
+    def __init__(self, core: Core, condition: Callable[[], bool]) -> None:
+        self._core = core
+        self._future = getattr(condition, "__self__", None)
+
+    def __str__(self) -> str:
+        return f"a future to be completed: {self._core.graph_name_of_future(self._future)}"
 
 
 def _is_stale(item: Any) -> bool:

@@ -107,7 +107,8 @@ class TaskRun:
         self._awaited = awaited_future(task._handler)
         if self._awaited is None:
             core.polled.append(self)
-            if not core.loop.idle:
+            if not core.polling:
+                core.polling = True
                 core.loop.idle.append(partial(poll, core))
         else:
             self._awaited.add_done_callback(Resume(self))

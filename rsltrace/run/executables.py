@@ -11,10 +11,12 @@ import difflib
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
@@ -22,34 +24,69 @@ from rsltrace.job import NodeSpec
 _ELF = b"\x7fELF"
 
 
-def main_of(spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
-    """Return what ``sys.argv[0]`` shall be, and the function to call.
+class Mains:
+    """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
 
-    :raises JobError: if there is no such thing, or it is not Python.
-    """
-    from rsltrace.ros.world import load_target
+    def __init__(self) -> None:
+        self._packages: set[str] = set()
 
-    if spec.executable is not None:
-        return spec.executable.partition("/")[2], find_executable(spec.executable, where=where)
-    assert spec.main is not None
-    if not isinstance(spec.main, str):
+    def find(self, spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
+        """Return what ``sys.argv[0]`` shall be, and the function to call.
+
+        :raises JobError: if there is no such thing, or it is not Python.
+        """
+        if spec.executable is not None:
+            found = find_executable(spec.executable, where=where)
+            name = spec.executable.partition("/")[2]
+            return name, self._load(found, where) if isinstance(found, str) else found
+        assert spec.main is not None
+        if isinstance(spec.main, str):
+            name = spec.main.partition(":")[0].rpartition(".")[2]
+            return name, self._load(spec.main, where)
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
-    function: Callable[[], object] = load_target(spec.main, where=where)
-    return spec.main.partition(":")[0].rpartition(".")[2], function
+
+    def _load(self, target: str, where: str) -> Callable[[], object]:
+        from rsltrace.ros.world import load_target
+
+        package = re.split("[.:]", target)[0]
+        again = package in self._packages
+        self._packages.add(package)
+        with _own_copy(package) if again else nullcontext():
+            function: Callable[[], object] = load_target(target, where=where)
+        return function
 
 
-def find_executable(target: str, *, where: str) -> Callable[[], object]:
-    """Return the function that runs ``package/name``.
+@contextmanager
+def _own_copy(package: str) -> Iterator[None]:
+    """Import a package once more than it is: who has it already keeps what it has."""
+
+    def modules() -> dict[str, ModuleType]:
+        return {
+            name: module
+            for name, module in sys.modules.items()
+            if name == package or name.startswith(package + ".")
+        }
+
+    before = modules()
+    for name in before:
+        del sys.modules[name]
+    try:
+        yield
+    finally:
+        for name in modules():
+            del sys.modules[name]
+        sys.modules.update(before)
+
+
+def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
+    """Return what runs ``package/name``: a function, or its name (``module:function``).
 
     :raises JobError: if the package or the executable is unknown, or not Python.
     """
-    from rsltrace.ros.world import load_target
-
     package, _, name = target.partition("/")
     scripts = _console_scripts(package)
     if name in scripts:
-        function: Callable[[], object] = load_target(scripts[name], where=where)
-        return function
+        return scripts[name]
     files = _installed_files(package)
     if name in files:
         return partial(_run_script, _python_script(files[name], target, where), files[name])
@@ -149,4 +186,4 @@ def _run_script(text: str, path: Path) -> None:
     exec(code, {"__name__": "__main__", "__file__": str(path), "__builtins__": __builtins__})
 
 
-__all__ = ["find_executable", "main_of"]
+__all__ = ["Mains", "find_executable"]

@@ -29,7 +29,7 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.executables import main_of
+from rsltrace.run.executables import Mains
 from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
@@ -259,6 +259,7 @@ def _prepare(job: Job) -> list[Entry]:
     from rsltrace.ros.world import Entry, load_target, ros_arguments
 
     entries = []
+    mains = Mains()
     for index, spec in enumerate(job.nodes):
         where = locate(job, ("nodes", index, spec.kind))
         arguments = ros_arguments(
@@ -272,7 +273,7 @@ def _prepare(job: Job) -> list[Entry]:
         make: Any
         argv = None
         if isinstance(spec.arguments, tuple) or spec.node is None:
-            name, make = main_of(spec, where=where)
+            name, make = mains.find(spec, where=where)
             argv = [name, *spec.arguments]
         else:
             target = spec.node

@@ -348,3 +348,43 @@ def test_a_run_without_recording_has_as_many_events(record_it: bool, tmp_path: A
 
     job = Job(nodes=[main_spec(program)], stop=StopSpec(duration=5), base_dir=tmp_path)
     assert record(job, tmp_path / "run.mcap" if record_it else None).events == 7
+
+
+def test_wait_for_message_in_a_main_and_in_a_callback(simulate: Any) -> None:
+    from rclpy.wait_for_message import wait_for_message
+
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("waits")
+        ok, message = wait_for_message(UInt64, node, "numbers")
+        log.append((ok, message.data, seconds(node)))
+        log.append(wait_for_message(UInt64, node, "silence", time_to_wait=0.25))
+        log.append(seconds(node))
+
+    class Asks(Node):
+        def __init__(self) -> None:
+            super().__init__("asks")
+            self.once = self.create_timer(1.2, self.tick)
+
+        def tick(self) -> None:
+            self.once.cancel()
+            log.append(wait_for_message(UInt64, self, "numbers")[1].data)
+
+    simulate(Counter, Asks, main_spec(program), duration=3)
+    assert log == [(True, 1, 0.5), (False, None), 0.75, 3]
+
+
+def test_the_events_executor(simulate: Any) -> None:
+    events_executor = pytest.importorskip("rclpy.experimental.events_executor")
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        executor = events_executor.EventsExecutor()
+        executor.add_node(listener(log))
+        executor.spin()
+
+    simulate(Counter, main_spec(program), duration=1)
+    assert log == [(1, 0.5), (2, 1.0)]
