@@ -11,6 +11,7 @@ from rsltrace.job.names import check_field_path, check_glob, check_topic
 from rsltrace.job.node import Target, check_callable_target
 from rsltrace.job.part import Part, check, flag, items, part, positive_time, text, whole
 from rsltrace.job.problems import Problem
+from rsltrace.job.sizes import parse_size
 from rsltrace.job.times import parse_time
 
 TimeLike = str | int | float
@@ -72,6 +73,13 @@ class StopSpec(Part):
         examples=["2s"],
     )
 
+    size: Annotated[int | None, check(parse_size, optional=True)] = Field(
+        default=None,
+        description="When the trace's file has become so large (checked between time steps; what "
+        "is still in memory comes on top).",
+        examples=["500MiB"],
+    )
+
     if TYPE_CHECKING:
 
         def __init__(
@@ -86,6 +94,7 @@ class StopSpec(Part):
             function: Target | None = None,
             quiescence: TimeLike | None = None,
             quiescence_ns: int | None = None,
+            size: int | str | None = None,
         ) -> None: ...
 
 

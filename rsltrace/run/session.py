@@ -34,7 +34,7 @@ from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
-from rsltrace.run.stopping import end_ns_of, stop_conditions
+from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -163,6 +163,8 @@ class Session:
             write_job(writer, job)
             writer.add_metadata(METADATA_ENVIRONMENT, environment())
             writer.add_metadata(METADATA_SOURCES, sources(job))
+            if job.stop.size is not None:
+                loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
         if observer.interrupt is not None:
             observer.interrupt(loop.stop)
         stack.enter_context(quiet_gc())

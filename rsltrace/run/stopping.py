@@ -7,8 +7,10 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from rsltrace.job import Job, locate
+from rsltrace.job.sizes import format_size
 from rsltrace.loop.stop import (
     Progress,
+    Stop,
     StopCondition,
     stop_after_events,
     stop_at,
@@ -63,6 +65,15 @@ def stop_conditions(
         yield stop_when(_within(outside_events, function), name)
 
 
+def stop_at_size(size: int, written: Callable[[], int]) -> StopCondition:
+    """Stop once ``written()`` bytes are as many as ``size``."""
+
+    def condition(progress: Progress) -> Stop | None:
+        return Stop(f"a trace of {format_size(size)}") if written() >= size else None
+
+    return condition
+
+
 def _within(
     context: _Context, function: Callable[[Progress], object]
 ) -> Callable[[Progress], object]:
@@ -75,4 +86,6 @@ def _within(
 
 def has_stop(job: Job) -> bool:
     """Return whether the job says itself when it ends; otherwise its bags do."""
-    return job.stop.topic is not None or any(True for _ in stop_conditions(job, 0))
+    if job.stop.topic is not None or job.stop.size is not None:
+        return True
+    return any(True for _ in stop_conditions(job, 0))

@@ -139,6 +139,11 @@ class TraceWriter:
         """Size of the file so far; what still waits in memory is not counted."""
         return self._stream.bytes_written
 
+    @property
+    def size(self) -> int:
+        """How many bytes are in the file; what is still collected for a chunk is not."""
+        return self._stream.bytes_written
+
     def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
         """Write a metadata record, its keys sorted: equal mappings give equal bytes."""
         if name == METADATA_ENVIRONMENT:

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
-from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
+from rsltrace.job import BagSpec, Job, NodeSpec, QosSpec, RecordSpec, StopSpec, TopicStop, load_job
 from rsltrace.job.schema import job_schema
 
 SCHEMA = jsonschema.Draft202012Validator(job_schema())
@@ -62,9 +62,29 @@ stops = st.builds(
     topic=st.none() | st.builds(TopicStop, name=topics, exit_code=st.none() | plain_names),
     function=st.none() | targets,
     quiescence_ns=st.none() | st.integers(1, 2**63 - 1),
+    size=st.none() | st.integers(1, 2**63 - 1),
 )
 bags = st.builds(
-    BagSpec, path=st.just("bag"), topics=globs, exclude=globs, start_offset_ns=times_ns
+    BagSpec,
+    path=st.just("bag"),
+    topics=globs,
+    exclude=globs,
+    start_offset_ns=times_ns,
+    duration_ns=st.none() | st.integers(1, 2**63 - 1),
+    at_ns=st.none() | times_ns,
+    rate=st.floats(0, exclude_min=True, allow_nan=False, allow_infinity=False),
+    loop=st.just(False) | st.integers(1, 2**63 - 1),
+    by=st.sampled_from(["log_time", "publish_time", "header_stamp"]),
+    remappings=st.dictionaries(topics, topics, max_size=2),
+    qos=st.dictionaries(
+        topics,
+        st.builds(
+            QosSpec,
+            reliability=st.sampled_from([None, "reliable", "best_effort"]),
+            depth=st.none() | st.integers(1, 2**31 - 1),
+        ),
+        max_size=2,
+    ),
 )
 jobs = st.fixed_dictionaries(
     {
@@ -160,6 +180,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
             "topic": None,
             "function": None,
             "quiescence_ns": None,
+            "size": None,
         },
         "seed": 0,
         "timer_ties": "creation",

@@ -45,6 +45,14 @@ def test_stop_conditions(record_job: Any, stop: str, end_s: int, reason: str) ->
         assert kinds.count("timer") == kinds.count("subscription") == end_s - 10
 
 
+def test_a_trace_that_is_large_enough_ends_the_run(record_job: Any) -> None:
+    code = "class Fast(Talker):\n    def __init__(self):\n        super().__init__(0.001)\n"
+    result = record_job("nodes: [{node: nodes_under_test:Fast}]\nstop: {size: 200kB}\n", code)
+    assert result.error is None
+    assert result.stop_reason == "a trace of 200kB"
+    assert 200_000 <= result.path.stat().st_size < 800_000
+
+
 def test_the_exit_code_may_come_from_a_message(record_job: Any) -> None:
     code = (
         "class Judge(Node):\n"
