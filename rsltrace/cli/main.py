@@ -23,6 +23,7 @@ EXIT_BROKEN_PIPE = 141
 _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
     "init": "Write a commented first job, from bags and nodes.",
+    "verify": "Record a job many times in unlike surroundings and compare.",
     "check": "Check a job and show its graph, without running it.",
     "schema": "Print the JSON Schema of a job file, for editors.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",
@@ -96,6 +97,10 @@ def cli() -> None:
 
 def main() -> NoReturn:
     """Run the command line and exit."""
+    if sys.argv[1:2] == ["record"]:
+        from rsltrace.guard.pin import pin
+
+        pin()
     cli.main(prog_name="rsltrace")
     raise AssertionError("click exits")
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.errors import JobError, NodeError
+from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -67,6 +68,8 @@ def record(
     from rsltrace.run import Observer, run
 
     loaded = _changed(load_job(job, overrides=overrides), seed=seed, until=until)
+    if not loaded.guard.enabled:
+        unpin()
     path = output or default_output(job)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(

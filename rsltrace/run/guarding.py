@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
+from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.randomness import begin_shared
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount
@@ -82,6 +83,7 @@ class Guarding:
 def guarding(stack: ExitStack, job: Job) -> Guarding:
     """Put the replacements in place until ``stack`` ends."""
     if job.guard.enabled:
+        stack.enter_context(pinned_place())
         stack.enter_context(installed())
     return Guarding(job)
 

@@ -11,6 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rsltrace._version import __version__
+from rsltrace.guard.pin import numerics, pinned_values
 from rsltrace.job import Job
 from rsltrace.run.process import user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
@@ -69,4 +70,4 @@ def environment() -> dict[str, str]:
             values[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return values
+    return {**values, **pinned_values(), "numerics": numerics()}

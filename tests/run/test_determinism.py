@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-import random
-import shutil
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+
+from rsltrace.run.perturb import KERNEL, Recorded, Surroundings, record_in, surroundings
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -58,47 +56,17 @@ class Mixed(Node):
     def got(self, message):
         self.declare_parameter(f'seen_{self.n}', message.latitude)
 """
-# What each process does to its heap before anything else, so that fresh memory is never zero.
-DIRTY = """
-import random, sys, runpy
-noise = [bytes([random.randrange(1, 256)]) * random.randrange(8, 5000) for _ in range(3000)]
-del noise[::2]
-sys.argv = ['rsltrace'] + sys.argv[1:]
-runpy.run_module('rsltrace', run_name='__main__')
-"""
 
 
-def perturbed(index: int, job: Path, out: Path) -> str:
-    """Run the job in its own world; return the last line of stdout."""
-    chance = random.Random(index)
-    folder = out / f"cwd{index}" / ("x" * chance.randrange(1, 60))
-    folder.mkdir(parents=True)
-    env = {
-        **os.environ,
-        "PYTHONHASHSEED": str(chance.randrange(2**32)),
-        "LC_ALL": chance.choice(["C", "C.UTF-8", "de_DE.UTF-8", "tr_TR.UTF-8", "POSIX"]),
-        "LANG": chance.choice(["C", "ja_JP.UTF-8"]),
-        "TZ": chance.choice(["UTC", "Asia/Kathmandu", "America/St_Johns", "Pacific/Apia"]),
-        "HOME": str(folder),
-        "PADDING": "p" * chance.randrange(4000),
-    }
-    command = [sys.executable, "-c", DIRTY, "record", str(job), "-o", str(out / f"{index}.mcap")]
-    if index % 3 == 0 and shutil.which("setarch"):
-        command = ["setarch", "-R", *command]
-    if index % 4 == 1 and shutil.which("nice"):
-        command = ["nice", "-n", str(chance.randrange(1, 6)), *command]
-    done = subprocess.run(
-        [*command, "--quiet"],
-        cwd=folder,
-        env=env,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert list(folder.iterdir()) == [], "a run leaves nothing behind but its trace"
-    return done.stdout.splitlines()[-1]
+def recorded(number: int, job: Path, out: Path) -> Recorded:
+    """Record the job in surroundings of its own."""
+    values = dict(surroundings(number).values)
+    values.pop(KERNEL, None)  # the trace says which one it was
+    done = record_in(Surroundings(number, values), job, out)
+    assert done.exit_code == 0, done.errors
+    left = [path for path in out.rglob("*.cwd/**/*") if path.is_file()]
+    assert left == [], "a run leaves nothing behind but its trace"
+    return done
 
 
 def test_one_digest_and_identical_files_whatever_surrounds_the_run(tmp_path: Path) -> None:
@@ -106,16 +74,10 @@ def test_one_digest_and_identical_files_whatever_surrounds_the_run(tmp_path: Pat
     (tmp_path / "extra.py").write_text(EXTRA)
     job = tmp_path / "job.yaml"
     job.write_text(JOB.replace("NETWORK", str(network)))
-    load = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    try:
-        with ThreadPoolExecutor(max_workers=2) as pool:
-            lines = set(pool.map(lambda index: perturbed(index, job, tmp_path), range(RUNS)))
-    finally:
-        load.kill()
-        load.wait()
-    assert len(lines) == 1, lines
-    files = {hashlib.sha256(path.read_bytes()).hexdigest() for path in tmp_path.glob("*.mcap")}
-    assert len(list(tmp_path.glob("*.mcap"))) == RUNS
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        runs = list(pool.map(lambda number: recorded(number, job, tmp_path), range(RUNS)))
+    assert len({run.digest for run in runs}) == 1, runs
+    files = {hashlib.sha256(run.path.read_bytes()).hexdigest() for run in runs}
     assert len(files) == 1
 
 
@@ -129,5 +91,5 @@ def test_the_check_above_would_notice(tmp_path: Path) -> None:
         "        self.get_logger().info(' '.join({'a', 'b', 'c', 'd', 'e', 'f'}))\n"
     )
     job = tmp_path / "job.yaml"
-    job.write_text("nodes: [{node: 'extra:Mixed'}]\nstop: {duration: 1s}\n")
-    assert len({perturbed(index, job, tmp_path) for index in range(4)}) > 1
+    job.write_text("nodes: [{node: 'extra:Mixed'}]\nstop: {duration: 1s}\nguard: false\n")
+    assert len({recorded(number, job, tmp_path).digest for number in range(4)}) > 1
