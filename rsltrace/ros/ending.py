@@ -37,11 +37,10 @@ def end_program(program: Program, error: BaseException | None) -> None:
     program.ended = True
     _stop_threads(program)
     failed = _judge(program, error)
-    spun = any(node.mailbox is not None for node in _nodes(program))
     idle = [node.fully_qualified_name for node in _nodes(program) if node.wrapper is None]
     at = format_seconds(core.loop.now_ns)
     if not core.ending and not core.closing and not failed and not program.exit_code:
-        if not spun:
+        if not program.spun:
             never = f": no callback of {', '.join(idle)} has run" if idle else ""
             core.notes.append(f"{program.name} ended at {at} s without ever spinning{never}")
         else:

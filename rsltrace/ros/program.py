@@ -52,6 +52,8 @@ class Program:
         self.failures: list[Failure] = []
         self.stack: greenlet | None = None
         self.begun = False
+        self.spun = False
+        """Whether an executor of this program has looked for work."""
         self.ended = False
         self.exit_code = 0
         self._main = None if entry is None else entry.make

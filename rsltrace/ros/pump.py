@@ -80,6 +80,7 @@ class Pump:
         from rclpy import executors
         from rclpy.utilities import timeout_sec_to_nsec
 
+        self.core.program.spun = True
         timeout_ns = timeout_sec_to_nsec(getattr(timeout, "timeout", timeout))
         loop = self.core.loop
         until_ns = None if timeout_ns < 0 else loop.now_ns + timeout_ns

@@ -388,3 +388,16 @@ def test_the_events_executor(simulate: Any) -> None:
 
     simulate(Counter, main_spec(program), duration=1)
     assert log == [(1, 0.5), (2, 1.0)]
+
+
+def test_a_main_that_has_cleaned_up_has_spun_all_the_same(simulate: Any) -> None:
+    def program() -> None:
+        rclpy.init()
+        node = rclpy.create_node("tidy")
+        rclpy.spin_once(node, timeout_sec=0.5)
+        node.destroy_node()
+        rclpy.shutdown()
+
+    recorded = simulate(main_spec(program), duration=2)
+    (note,) = recorded.result.notes
+    assert note.endswith("program ended at 0.500000000 s")

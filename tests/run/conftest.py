@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import subprocess
 import sys
@@ -12,6 +13,15 @@ from typing import Any
 import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+if "demo_packages" not in sys.modules:  # tests are imported without their folder
+    _spec = importlib.util.spec_from_file_location(
+        "demo_packages", Path(__file__).with_name("demo_packages.py")
+    )
+    assert _spec is not None
+    assert _spec.loader is not None
+    sys.modules["demo_packages"] = importlib.util.module_from_spec(_spec)
+    _spec.loader.exec_module(sys.modules["demo_packages"])
 
 TALKER = """
 from rclpy.node import Node

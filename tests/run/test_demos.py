@@ -1,0 +1,111 @@
+"""Programs that know nothing of rsltrace do in a simulation what they do over DDS.
+
+The packages under ``tests/demos`` are run both ways: each program natively as a process, and all of
+them together as the executables of a job. Every program logs what it does, and the census logs who
+offers which topic and service.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import random
+import subprocess
+import sys
+from collections import defaultdict
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import demo_packages as demos
+import pytest
+
+import rsltrace
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.slow,
+    pytest.mark.skipif(
+        importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs"
+    ),
+]
+
+RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "100")), 20)
+
+
+@pytest.fixture(scope="module")
+def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return demos.install_demos(tmp_path_factory.mktemp("demos"))
+
+
+def job_text(prefix: Path, *programs: tuple[str, ...]) -> str:
+    lines = ["nodes:"]
+    for name, *arguments in programs:
+        entry = f"executable: {demos.package_of(name)}/{name}, arguments: [{', '.join(arguments)}]"
+        lines.append(f"  - {{{entry}}}")
+    return "\n".join([*lines, f"search_path: [{prefix}]", "stop: {duration: 30s}", ""])
+
+
+def record(job: Path, output: Path, **environment: str) -> str:
+    """Record with the command, in a process of its own; return the line with the digest."""
+    done = subprocess.run(
+        [sys.executable, "-m", "rsltrace", "record", str(job), "-o", str(output), "--quiet"],
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout.splitlines()[-1]
+
+
+def logs_of(path: Path) -> dict[str, list[str]]:
+    logs: defaultdict[str, list[str]] = defaultdict(list)
+    with rsltrace.Trace.open(path) as trace:
+        for _, _, data in trace.messages("/rosout"):
+            record = trace.decode("/rosout", data)
+            logs[record.name].append(record.msg)
+    return dict(logs)
+
+
+def everybody(prefix: Path, folder: Path) -> Path:
+    """Write the job of all servers and clients."""
+    job = folder / "demos.yaml"
+    job.write_text(job_text(prefix, *((name,) for name in (*demos.SERVERS, *demos.CLIENTS))))
+    return job
+
+
+def test_programs_do_what_they_do_over_dds(prefix: Path, tmp_path: Path) -> None:
+    natively = demos.run_natively(prefix, tmp_path / "native")
+    # Over DDS the census was taken before the clients came; so here.
+    census = tmp_path / "census.yaml"
+    census.write_text(job_text(prefix, *((name,) for name in demos.SERVERS), demos.CENSUS))
+    record(census, tmp_path / "census.mcap")
+    record(everybody(prefix, tmp_path), tmp_path / "demos.mcap")
+    ours = logs_of(tmp_path / "demos.mcap")
+    ours["census"] = logs_of(tmp_path / "census.mcap")["census"]
+    assert ours == natively
+    # The comparison is worth something: everybody has said what it is there for.
+    silent = {"adder"}
+    assert set(ours) == {*demos.SERVERS, *demos.CLIENTS, "census"} - silent
+    assert ours["listener"][-1] == "141 letters"
+    assert ours["fibonacci_client"][-1] == "9: canceled []"
+    assert "camera serves /camera/change_state lifecycle_msgs/srv/ChangeState" in ours["census"]
+
+
+def test_one_digest_whatever_surrounds_the_run(prefix: Path, tmp_path: Path) -> None:
+    job = everybody(prefix, tmp_path)
+
+    def perturbed(index: int) -> str:
+        chance = random.Random(index)
+        return record(
+            job,
+            tmp_path / f"{index}.mcap",
+            PYTHONHASHSEED=str(chance.randrange(2**32)),
+            TZ=chance.choice(["UTC", "Asia/Kathmandu", "Pacific/Apia"]),
+            LC_ALL=chance.choice(["C", "C.UTF-8", "POSIX"]),
+            PADDING="p" * chance.randrange(4000),
+        )
+
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        lines = set(pool.map(perturbed, range(RUNS)))
+    assert len(lines) == 1, lines
