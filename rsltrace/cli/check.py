@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.record import SET
+from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.text import table
 from rsltrace.errors import EXIT_USAGE, NodeError, OutputError, RunError
 from rsltrace.model.printable import printable
@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from rsltrace.run.checking import Checked
 
 
-@click.command()
-@click.argument("job", type=click.Path(path_type=Path))
-@SET
+@click.command(cls=RosArgsCommand)
+@job_options
 @click.option(
     "--format",
     "form",
@@ -42,9 +41,15 @@ if TYPE_CHECKING:
     "--all", "everything", is_flag=True, help="With what every node has: /rosout, parameters, …"
 )
 def check(
-    job: Path, overrides: tuple[str, ...], form: str, graph: Path | None, everything: bool
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
+    overrides: tuple[str, ...],
+    form: str,
+    graph: Path | None,
+    everything: bool,
 ) -> int:
-    """Check JOB and print what it means: the job with all its parts, and the graph of its nodes.
+    """Check JOB (or a launch file) and print what it means: all of the job, and its nodes' graph.
 
     The nodes are constructed (so their constructors run), the loop never is: what a node creates
     later, in a callback, is not seen.
@@ -53,10 +58,9 @@ def check(
     publisher and a subscription apart, a subscription or a client without anybody at the other
     end), 2 if the job cannot run.
     """
-    from rsltrace.job import load_job
     from rsltrace.run.checking import check_job
 
-    loaded = load_job(job, overrides=overrides)
+    loaded, _ = job_of(words, launch, skip, overrides)
     try:
         checked = check_job(loaded, everything=everything)
     except RunError as error:
@@ -67,11 +71,11 @@ def check(
     if graph is not None:
         _draw(checked, graph)
     if form == "json":
-        click.echo(json.dumps(_values(loaded, checked), indent=2))
+        click.echo(json.dumps(_values(checked.job, checked), indent=2))
     else:
         for note in checked.notes:
             click.echo(f"rsltrace: note: {note}", err=True)
-        click.echo("\n".join(map(printable, _text(loaded, checked))))
+        click.echo("\n".join(map(printable, _text(checked.job, checked))))
     return 1 if checked.overview.problems else 0
 
 

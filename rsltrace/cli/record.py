@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import JobError, NodeError
 from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
@@ -23,18 +24,8 @@ if TYPE_CHECKING:
     from rsltrace.run import RunResult
 
 
-SET = click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.",
-)
-"""Loads a job with other values; list entries by number, by name, or + for a new one."""
-
-
-@click.command()
-@click.argument("job", type=click.Path(path_type=Path))
+@click.command(cls=RosArgsCommand)
+@job_options
 @click.option(
     "-o",
     "--output",
@@ -45,32 +36,42 @@ SET = click.option(
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
-@SET
+@click.option("--print-job", is_flag=True, help="Print the job as YAML instead of running it.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
 def record(
-    job: Path,
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
     output: Path | None,
     force: bool,
     seed: int | None,
     until: str | None,
     as_json: bool,
     overrides: tuple[str, ...],
+    print_job: bool,
     quiet: bool,
 ) -> None:
-    """Run JOB (a job.yaml) deterministically and record its trace.
+    """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
+
+    \b
+      rsltrace record job.yaml -o run.mcap --ros-args -p ekf:rate:=20
+      rsltrace record --launch robot.launch.xml world:=lab --until 60
 
     The nodes' log records go to stderr. The last line on stdout is
     "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
     The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
     130 or 143 if interrupted.
     """
-    from rsltrace.job import load_job
     from rsltrace.run import Observer, run
 
-    loaded = _changed(load_job(job, overrides=overrides), seed=seed, until=until)
+    job, named = job_of(words, launch, skip, overrides)
+    loaded = _changed(job, seed=seed, until=until)
+    if print_job:
+        _print_job(loaded)
+        return
     if not loaded.guard.enabled:
         unpin()
-    path = output or default_output(job)
+    path = output or default_output(named)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(
             loaded,
@@ -83,9 +84,21 @@ def record(
     sys.exit(result.exit_code)
 
 
+def _print_job(job: Job) -> None:
+    from rsltrace.launch import expand
+    from rsltrace.run.executables import why_not
+
+    expanded = expand(job, why_not=why_not)
+    for note in expanded.notes:
+        _note(note)
+    click.echo(expanded.job.to_yaml(), nl=False)
+
+
 def default_output(job: Path) -> Path:
-    """Return the trace's name for a job file: ``demo/job.yaml`` → ``demo.mcap``, here."""
-    stem = job.resolve().parent.name if job.stem == "job" else job.stem
+    """Return the trace's name for a job file, here: ``demo/job.yaml`` or ``demo.launch.xml`` →
+    ``demo.mcap``."""
+    stem = job.name.split(".launch.")[0] if ".launch." in job.name else job.stem
+    stem = job.resolve().parent.name if stem == "job" else stem
     return Path(f"{stem or 'run'}.mcap")
 
 

@@ -11,7 +11,8 @@ if TYPE_CHECKING:
     from rsltrace.job.bag import BagSpec, QosSpec
     from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.job import Job
-    from rsltrace.job.load import load_job, locate
+    from rsltrace.job.launch_spec import LaunchSpec
+    from rsltrace.job.load import job_from_text, load_job, locate
     from rsltrace.job.node import NodeSpec
     from rsltrace.job.spec import RecordSpec, StopSpec, TopicStop
 
@@ -19,12 +20,14 @@ _HOMES = {
     "BagSpec": "bag",
     "GuardSpec": "guard",
     "Job": "job",
+    "LaunchSpec": "launch_spec",
     "NodeSpec": "node",
     "QosSpec": "bag",
     "RecordSpec": "spec",
     "SourceSpec": "guard",
     "StopSpec": "spec",
     "TopicStop": "spec",
+    "job_from_text": "load",
     "load_job": "load",
     "locate": "load",
     "policy_of": "guard",
@@ -34,12 +37,14 @@ __all__ = [
     "BagSpec",
     "GuardSpec",
     "Job",
+    "LaunchSpec",
     "NodeSpec",
     "QosSpec",
     "RecordSpec",
     "SourceSpec",
     "StopSpec",
     "TopicStop",
+    "job_from_text",
     "load_job",
     "locate",
     "policy_of",

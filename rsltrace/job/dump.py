@@ -48,6 +48,8 @@ def job_resolved(job: Job) -> dict[str, Any]:
     values["search_path"] = [_relative(job, path) for path in job.search_path]
     for node, spec in zip(values["nodes"], job.nodes, strict=True):
         node["parameter_files"] = [_relative(job, path) for path in spec.parameter_files]
+    for launch, launch_spec in zip(values["launch"], job.launch, strict=True):
+        launch["file"] = _relative(job, launch_spec.file)
     for bag, bag_spec in zip(values["bags"], job.bags, strict=True):
         bag["path"] = _relative(job, bag_spec.path)
     values["guard"] = resolved_guard(job.guard)

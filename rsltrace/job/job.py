@@ -14,9 +14,10 @@ from rsltrace.job.bag import BagSpec
 from rsltrace.job.delay import DelaysSpec
 from rsltrace.job.distribution import files_of
 from rsltrace.job.guard import GuardSpec, guard_part
+from rsltrace.job.launch_spec import LaunchSpec
 from rsltrace.job.node import NodeSpec, check_path
-from rsltrace.job.part import Part, check, items, one_of, parts, text, whole
-from rsltrace.job.problems import Loc, Problem, Problems
+from rsltrace.job.part import Part, attach, check, items, one_of, parts, text, whole
+from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.spec import RecordSpec, StopSpec, TimeLike
 from rsltrace.job.times import format_time, parse_time
 
@@ -26,6 +27,15 @@ LIVELOCK_LIMIT = 100_000
 
 def _folder(value: object) -> Path:
     return Path(os.path.abspath(check_path(value)))
+
+
+def _word(value: object) -> str:
+    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
+        raise Problem(f"expected a word of a command line, got {describe(value)}")
+    return str(getattr(value, "text", value))
+
+
+attach(_word, schema={"type": ["string", "number"]})
 
 
 class Job(Part):
@@ -42,6 +52,18 @@ class Job(Part):
         default=(),
         description="The nodes to run, constructed in this order.",
         examples=[[{"node": "my_robot.ekf:EkfNode", "parameters": {"frequency": 50.0}}]],
+    )
+    launch: Annotated[tuple[LaunchSpec, ...], parts("file")] = Field(
+        default=(),
+        description="Launch files whose nodes are part of the job, after those of `nodes`; a path "
+        "stands for `{file: ...}`.",
+        examples=[["bringup.launch.xml", {"file": "nav.launch.yaml", "arguments": {"map": "lab"}}]],
+    )
+    ros_arguments: Annotated[tuple[str, ...], check(items(_word))] = Field(
+        default=(),
+        description="ROS arguments for all nodes, which have the last word: what would follow "
+        "`--ros-args` on a command line.",
+        examples=[["-p", "ekf:rate:=50", "-r", "scan:=/front/scan"]],
     )
     search_path: Annotated[tuple[str, ...], check(items(check_path))] = Field(
         default=(".",),
@@ -125,6 +147,8 @@ class Job(Part):
             self,
             *,
             nodes: Sequence[NodeSpec | dict[str, Any]] = (),
+            launch: Sequence[LaunchSpec | dict[str, Any] | str] = (),
+            ros_arguments: Sequence[str] = (),
             search_path: Sequence[str | os.PathLike[str]] = (".",),
             start: TimeLike | None = None,
             start_ns: int | None = None,
@@ -204,9 +228,12 @@ class Job(Part):
                 )
 
     def _something_to_run(self) -> Iterator[Problem]:
-        if not self.nodes and not self.bags:
+        if not self.nodes and not self.bags and not self.launch:
             place = ("nodes",) if "nodes" in self.model_fields_set else ()
-            yield Problem("a job needs at least one node (nodes:) or bag (bags:)", place)
+            yield Problem(
+                "a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)",
+                place,
+            )
 
     def _times_in_order(self) -> Iterator[Problem]:
         start_ns, construct_ns, stop_ns = self.start_ns, self.construct_time_ns, self.stop.time_ns
@@ -272,6 +299,11 @@ class Job(Part):
             if not path.is_file():
                 what = "is not a file" if path.exists() else "there is no such file"
                 yield Problem(f"{file!r}: {what}", place)
+        for index, launch in enumerate(self.launch):
+            if not self.resolve(launch.file).is_file():
+                yield Problem(
+                    f"{launch.file!r}: there is no such launch file", ("launch", index, "file")
+                )
         for index, bag in enumerate(self.bags):
             if not self.resolve(bag.path).exists():
                 message = f"{bag.path!r}: there is no such bag{self._near(bag.path)}"

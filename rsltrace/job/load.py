@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -29,8 +29,25 @@ def load_job(path: str | os.PathLike[str], *, overrides: Sequence[str] = ()) -> 
     mistakes are reported together, in the order of the file.
     """
     name = os.fspath(path)
-    composed = compose(name, _parse, [("--set", override) for override in overrides])
-    base_dir = os.path.dirname(os.path.abspath(name))
+    return _load(name, os.path.dirname(os.path.abspath(name)), _parse, overrides)
+
+
+def job_from_text(
+    text: str, name: str, folder: str | os.PathLike[str], *, overrides: Sequence[str] = ()
+) -> Job:
+    """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``."""
+    base_dir = os.path.abspath(folder)
+
+    def read(other: str) -> YamlSource:
+        return parse_yaml(text, name, folder=base_dir) if other == name else _parse(other)
+
+    return _load(name, base_dir, read, overrides)
+
+
+def _load(
+    name: str, base_dir: str, read: Callable[[str], YamlSource], overrides: Sequence[str]
+) -> Job:
+    composed = compose(name, read, [("--set", override) for override in overrides])
     given = plain(composed.root, base_dir)
     assert isinstance(given, dict)
 

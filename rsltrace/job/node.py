@@ -233,6 +233,10 @@ class NodeSpec(Part):
         "from the job's `guard`.",
         examples=[{"random": "allow"}],
     )
+    # Not a key of a job file: where the entry came from, if not from the job itself.
+    origin: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None, exclude=True, repr=False
+    )
 
     if TYPE_CHECKING:
 
@@ -249,6 +253,7 @@ class NodeSpec(Part):
             remappings: dict[str, str] = ...,
             arguments: dict[str, Any] | Sequence[str] = ...,
             on_exception: Literal["stop", "log"] = "stop",
+            origin: str | None = None,
             guard: GuardSpec | dict[str, Any] | bool | None = None,
         ) -> None: ...
 

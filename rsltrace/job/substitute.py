@@ -90,7 +90,7 @@ class Substitution:
             return self._env(written, item, *arguments)
         if name == "var":
             return self._var(written, item, arguments[0])
-        prefix = _prefix(arguments[0])
+        prefix = package_prefix(arguments[0])
         if prefix is None:
             raise _error(
                 item,
@@ -181,7 +181,7 @@ def _error(item: Item, written: str, message: str) -> JobError:
     return place.error(message)
 
 
-def _prefix(package: str) -> Path | None:
+def package_prefix(package: str) -> Path | None:
     """Return the prefix a package is installed in: ament's, or that of wheels."""
     entries = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     for prefix in [*filter(None, entries), sys.prefix]:

@@ -317,15 +317,17 @@ def ros_arguments(
     parameter_files: Sequence[Path],
     remappings: dict[str, str],
     where: str,
+    for_all: Sequence[str] = (),
 ) -> list[RosArguments]:
-    """Return what ``ros2 run`` would be given for a node of a job, as two argument lists.
+    """Return what ``ros2 run`` would be given for a node of a job, as lists of arguments.
 
     The job's own parameters are a list of their own: rcl would let a file's entry for one node
-    win over a parameter given for all.
+    win over a parameter given for all. ``for_all`` are the job's arguments for all nodes: their
+    names go before the node's own (the first rule counts), their parameters after.
 
     :raises JobError: if rcl refuses them (a broken parameter file); it begins with ``where``.
     """
-    arguments: list[str] = []
+    arguments = list(for_all)
     if name is not None:
         arguments += ["-r", f"__node:={name}"]
     if namespace is not None:
@@ -338,7 +340,8 @@ def ros_arguments(
     for key, value in parameters.items():
         own += ["-p", f"{key}:={_yaml_value(value)}"]
     try:
-        return [RosArguments(["--ros-args", *part]) for part in (arguments, own)]
+        lists = (arguments, own, for_all) if for_all else (arguments, own)
+        return [RosArguments(["--ros-args", *part]) for part in lists]
     except InvalidArgumentsError as error:
         raise JobError(str(error), where=where) from error
 

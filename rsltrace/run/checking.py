@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 class Checked:
     """A job that could run: when it starts (simulated ns), its graph, and notes on its bags."""
 
+    job: Job
     start_ns: int
     overview: Overview
     notes: tuple[str, ...]
@@ -42,4 +43,4 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
         found = overview(session.world.core, everything=everything)
         session.stop = Stop("checked")
         session.finish()
-        return Checked(session.start_ns, found, tuple(notes))
+        return Checked(session.job, session.start_ns, found, tuple(notes))

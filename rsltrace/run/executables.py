@@ -78,6 +78,15 @@ def _own_copy(package: str) -> Iterator[None]:
         sys.modules.update(before)
 
 
+def why_not(package: str, name: str) -> str | None:
+    """Return why an executable cannot run here, or None if it can; nothing is imported."""
+    try:
+        find_executable(f"{package}/{name}", where="")
+    except JobError as error:
+        return str(error)
+    return None
+
+
 def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     """Return what runs ``package/name``: a function, or its name (``module:function``).
 
@@ -89,7 +98,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         return scripts[name]
     files = _installed_files(package)
     if name in files:
-        return partial(_run_script, _python_script(files[name], target, where), files[name])
+        return files[name], _python_script(files[name], target, where)
     known = _packages()
     if not scripts and not files and package not in known:
         raise JobError(

@@ -25,7 +25,8 @@ _GC_EVERY_EVENTS = 10_000
 class Observer:
     """Hooks for whoever watches a run. ``progress`` gets (simulated ns, end ns or None, events)
     about every thousand events; ``interrupt`` gets a function that ends the run properly;
-    ``note`` gets what somebody should know before the run begins (a bag that was cut off)."""
+    ``note`` gets what somebody should know before the run begins (a bag that was cut off,
+    what of a launch file is left out)."""
 
     progress: Callable[[int, int | None, int], None] | None = None
     interrupt: Callable[[Callable[[Stop], None]], None] | None = None

@@ -14,8 +14,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import BagError, RunError
+from rsltrace.errors import BagError, JobError, RunError
 from rsltrace.job import Job, locate, policy_of
+from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
@@ -29,7 +30,7 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.executables import Mains
+from rsltrace.run.executables import Mains, why_not
 from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
@@ -124,12 +125,14 @@ class Session:
     def _open(self, stack: ExitStack) -> None:
         from rsltrace.ros.world import World
 
+        expanded = expand(self.job, why_not=why_not)
+        self.job = expanded.job
         job, observer = self.job, self._observer
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
         if observer.note is not None:
-            for note in notes_of(self._bags):
+            for note in (*expanded.notes, *notes_of(self._bags)):
                 observer.note(note)
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
@@ -262,8 +265,9 @@ def _prepare(job: Job) -> list[Entry]:
 
     entries = []
     mains = Mains()
+    for_all = _arguments_for_all(job)
     for index, spec in enumerate(job.nodes):
-        where = locate(job, ("nodes", index, spec.kind))
+        where = spec.origin or locate(job, ("nodes", index, spec.kind))
         arguments = ros_arguments(
             name=spec.name,
             namespace=spec.namespace,
@@ -271,6 +275,7 @@ def _prepare(job: Job) -> list[Entry]:
             parameter_files=[job.resolve(path) for path in spec.parameter_files],
             remappings=spec.remappings,
             where=where,
+            for_all=for_all,
         )
         make: Any
         argv = None
@@ -293,3 +298,23 @@ def _prepare(job: Job) -> list[Entry]:
             )
         )
     return entries
+
+
+def _arguments_for_all(job: Job) -> list[str]:
+    """Return the ROS arguments of all nodes, the paths in them absolute.
+
+    :raises JobError: if rcl refuses them.
+    """
+    words = list(job.ros_arguments)
+    for index, word in enumerate(words[:-1]):
+        if word == "--params-file":
+            words[index + 1] = str(job.resolve(words[index + 1]))
+    if words:
+        from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
+
+        try:
+            RosArguments(["--ros-args", *words])
+        except InvalidArgumentsError as error:
+            where = locate(job, ("ros_arguments",))
+            raise JobError(f"ros_arguments (--ros-args): {error}", where=where) from None
+    return words

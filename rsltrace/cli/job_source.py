@@ -1,0 +1,124 @@
+"""The job that a command line means: a job file, launch files, ``--set``, ``--ros-args``."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from rsltrace.job import Job
+
+_META = "rsltrace.ros_args"
+
+
+class RosArgsCommand(click.Command):
+    """A command that takes ``--ros-args … [--]`` anywhere, as ROS programs do."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Set the ROS arguments aside before click sees them."""
+        own, ctx.meta[_META] = split_ros_arguments(args)
+        return super().parse_args(ctx, own)
+
+
+def split_ros_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own words, and those between each ``--ros-args`` and ``--`` (or the end).
+
+    A ``--`` that ends no ROS arguments stays.
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for word in words:
+        if word == "--ros-args":
+            inside = True
+        elif word == "--" and inside:
+            inside = False
+        else:
+            (ros if inside else own).append(word)
+    return own, ros
+
+
+def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Add what ``job_of`` needs to a command: ``words``, ``launch``, ``skip``, ``overrides``."""
+    for decorate in reversed(
+        (
+            click.argument("words", nargs=-1, metavar="[JOB] [NAME:=VALUE]..."),
+            click.option(
+                "--launch",
+                type=click.Path(path_type=Path),
+                help="Run the nodes of a launch file; NAME:=VALUE are its arguments.",
+            ),
+            click.option(
+                "--skip-unsupported",
+                "skip",
+                is_flag=True,
+                help="Leave out what of the launch file cannot be simulated.",
+            ),
+            click.option(
+                "--set",
+                "overrides",
+                multiple=True,
+                metavar="KEY=VALUE",
+                help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.",
+            ),
+            click.option(
+                "--ros-args",
+                is_flag=True,
+                expose_value=False,
+                help="What follows, up to --, are ROS arguments for all nodes: -p, -r, "
+                "--params-file.",
+            ),
+        )
+    ):
+        function = decorate(function)
+    return function
+
+
+def job_of(
+    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]
+) -> tuple[Job, Path]:
+    """Return the job, and the path of the file that names it.
+
+    :raises click.UsageError: if the words do not fit together.
+    :raises JobError: if the job is wrong.
+    """
+    from rsltrace.job import job_from_text, load_job
+
+    files = [word for word in words if ":=" not in word]
+    given = dict(word.split(":=", 1) for word in words if ":=" in word)
+    if len(files) > 1:
+        raise click.UsageError(f"one JOB at a time, here are {' and '.join(files)}")
+    if not files and launch is None:
+        raise click.UsageError("Missing argument 'JOB' (or --launch FILE).")
+    if launch is None and (given or skip):
+        what = f"{next(iter(given))}:=… is a launch argument" if given else "--skip-unsupported"
+        raise click.UsageError(f"{what}: give the launch file with --launch FILE")
+    if launch is not None and launch.suffix == ".mcap":
+        raise click.UsageError(f"{launch} is no launch file")
+    named = Path(files[0]) if files else launch
+    assert named is not None
+    changes = list(overrides)
+    if launch is not None:
+        spec: dict[str, Any] = {"file": str(launch), "arguments": given}
+        if skip:
+            spec["skip_unsupported"] = True
+        changes.append(f"launch.+={json.dumps(spec, ensure_ascii=False)}")
+    ros = click.get_current_context().meta.get(_META, [])
+    changes += [f"ros_arguments.+={json.dumps(word)}" for word in _with_paths(ros, named.parent)]
+    if files:
+        return load_job(named, overrides=changes), named
+    return job_from_text("{}", str(named), named.parent, overrides=changes), named
+
+
+def _with_paths(words: Sequence[str], folder: Path) -> list[str]:
+    """Return ROS arguments with the paths in them as seen from a job's folder."""
+    found = list(words)
+    for index, word in enumerate(found[:-1]):
+        if word == "--params-file":
+            found[index + 1] = os.path.relpath(found[index + 1], folder)
+    return found

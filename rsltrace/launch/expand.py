@@ -1,0 +1,65 @@
+"""A job with launch files becomes a job without: their nodes, spelt out."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from rsltrace.errors import JobError
+from rsltrace.job import Job, LaunchSpec, NodeSpec, locate
+from rsltrace.launch import ros_launch
+from rsltrace.launch.model import Argument, Launched
+from rsltrace.launch.reader import read_launch_file
+from rsltrace.launch.specs import node_specs
+
+
+@dataclass(frozen=True)
+class Expanded:
+    """A job without launch files, and what of them it leaves out or has no use for."""
+
+    job: Job
+    notes: tuple[str, ...] = ()
+
+
+def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
+    """Return a job whose launch files have become nodes.
+
+    A Python launch file is a program, and is run to do so. ``why_not(package, executable)`` says
+    why an executable cannot be simulated, if it cannot.
+
+    :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
+    """
+    if not job.launch:
+        return Expanded(job)
+    nodes: list[NodeSpec] = list(job.nodes)
+    notes: list[str] = []
+    for spec in job.launch:
+        launched = _read(job, spec)
+        nodes += node_specs(launched, skip_unsupported=spec.skip_unsupported, why_not=why_not)
+        notes += [f"left out: {item}" for item in launched.unsupported]
+        notes += launched.ignored
+    if not nodes and not job.bags:
+        where = locate(job, ("launch", 0, "file"))
+        raise JobError("the launch file starts nothing that can be simulated", where=where)
+    return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
+
+
+def _read(job: Job, spec: LaunchSpec) -> Launched:
+    path = job.resolve(spec.file)
+    read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
+    launched = read(path, spec.arguments)
+    _check_known(spec.arguments, launched.arguments, spec.file)
+    return launched
+
+
+def _check_known(arguments: Mapping[str, str], known: Mapping[str, Argument], where: str) -> None:
+    """Raise ``JobError`` if an argument is given that no launch file declares."""
+    for name in arguments:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            listed = "".join(f"\n  {argument}" for argument in known.values()) or " none"
+            raise JobError(
+                f"unknown launch argument {name!r}{hint}\nthere are:{listed}", where=where
+            )

@@ -1,0 +1,69 @@
+"""What reading a launch file gives: nodes to simulate, and what cannot be simulated."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rsltrace.launch.scope import Parameters
+
+
+@dataclass(frozen=True, slots=True)
+class LaunchedNode:
+    """A node that a launch file starts.
+
+    ``executable`` is that of ``package``; a component has a ``plugin`` instead. ``name`` and
+    ``namespace`` are None where the launch file leaves them to the node. ``where`` is
+    ``file:line:column``, as far as it is known.
+    """
+
+    where: str
+    package: str
+    executable: str = ""
+    plugin: str = ""
+    name: str | None = None
+    namespace: str | None = None
+    parameters: Parameters = ()
+    remappings: tuple[tuple[str, str], ...] = ()
+    arguments: tuple[str, ...] = ()
+    ros_arguments: tuple[str, ...] = ()
+
+    @property
+    def title(self) -> str:
+        """How to call it in a message."""
+        what = f"{self.package}/{self.executable or self.plugin}"
+        return f"{what} ({self.name})" if self.name else what
+
+
+@dataclass(frozen=True, slots=True)
+class Unsupported:
+    """Something in a launch file that cannot be simulated, and why."""
+
+    where: str
+    what: str
+    why: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.what}: {self.why}"
+
+
+@dataclass(frozen=True, slots=True)
+class Argument:
+    """A declared launch argument; ``default`` is as written, None for a required one."""
+
+    name: str
+    default: str | None = None
+    description: str = ""
+
+    def __str__(self) -> str:
+        value = "required" if self.default is None else f"default {self.default!r}"
+        return f"{self.name} ({value}{', ' + self.description if self.description else ''})"
+
+
+@dataclass(slots=True)
+class Launched:
+    """All of a launch file. ``ignored`` is what has no meaning in a simulation, for information."""
+
+    nodes: list[LaunchedNode] = field(default_factory=list)
+    unsupported: list[Unsupported] = field(default_factory=list)
+    ignored: list[str] = field(default_factory=list)
+    arguments: dict[str, Argument] = field(default_factory=dict)

@@ -1,0 +1,243 @@
+"""Launch files evaluated by ROS's own ``launch`` and ``launch_ros``, without starting anything.
+
+The description is visited as a launch service would, so arguments, conditions, groups, includes,
+opaque functions and substitutions mean what they mean there. Where a process would be started, what
+it would be started with is noted instead.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from rsltrace.errors import JobError
+from rsltrace.launch.model import Argument, Launched, LaunchedNode, Unsupported
+from rsltrace.launch.parameter_files import parameters_for
+from rsltrace.launch.scope import ParameterFile, Parameters
+
+_NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
+_PROCESS = "other programs do not run in a simulation"
+_FRONT_ENDS = {".xml": "launch_xml", ".yaml": "launch_yaml", ".yml": "launch_yaml"}
+
+
+def can_read(path: Path) -> bool:
+    """Return whether ROS's launch is installed, with what this kind of launch file needs."""
+    needed = ["launch", "launch_ros", _FRONT_ENDS.get(path.suffix, "launch")]
+    return all(find_spec(name) is not None for name in needed)
+
+
+def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
+    """Return what a launch file would start, given ``name:=value`` arguments.
+
+    :raises JobError: with what launch says is wrong.
+    """
+    from launch import LaunchContext
+    from launch.actions import IncludeLaunchDescription
+    from launch.launch_description_sources import AnyLaunchDescriptionSource
+
+    with _own_environment():
+        context = LaunchContext(argv=[])
+        context.launch_configurations.update(arguments)
+        visitor = _Visitor(context, path)
+        try:
+            visitor.visit(IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path))))
+        except JobError:
+            raise
+        except Exception as error:
+            raise JobError(f"{type(error).__name__}: {error}", where=visitor.where()) from error
+    return visitor.launched
+
+
+@contextmanager
+def _own_environment() -> Iterator[None]:
+    """Take back what launch actions do to this process's environment."""
+    saved = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(saved)
+
+
+class _Visitor:
+    def __init__(self, context: Any, path: Path) -> None:
+        self.launched = Launched()
+        self._context = context
+        self._path = path
+
+    def where(self) -> str:
+        """Return the launch file that is being evaluated: launch keeps no lines."""
+        return str(self._context.get_locals_as_dict().get("current_launch_file_path", self._path))
+
+    def visit(self, entity: Any) -> None:
+        """Do what an entity does, and its sub-entities, except for starting processes."""
+        from launch import Action
+        from launch.actions import DeclareLaunchArgument
+
+        if isinstance(entity, Action):
+            if entity.condition is not None and not entity.condition.evaluate(self._context):
+                return
+            if self._is_noted(entity):
+                return
+            if isinstance(entity, DeclareLaunchArgument):
+                self._declare(entity)
+        for inner in entity.visit(self._context) or ():
+            self.visit(inner)
+
+    def _is_noted(self, action: Any) -> bool:
+        """Note a node or what cannot be simulated; return whether it was one of these."""
+        from launch import actions
+        from launch_ros.actions import ComposableNodeContainer, LoadComposableNodes, Node, RosTimer
+
+        if isinstance(action, ComposableNodeContainer):
+            self._components(getattr(action, f"_ComposableNodeContainer{_DESCRIPTIONS}") or ())
+        elif isinstance(action, LoadComposableNodes):
+            self._components(getattr(action, f"_LoadComposableNodes{_DESCRIPTIONS}") or ())
+        elif isinstance(action, Node):
+            self._node(action)
+        elif isinstance(action, actions.ExecuteLocal):
+            command = getattr(action, "cmd", None) or [["?"]]
+            words = " ".join(self._text(word) for word in command)
+            self._refuse(f"process {words!r}", _PROCESS)
+        elif isinstance(
+            action,
+            (actions.TimerAction, RosTimer, actions.RegisterEventHandler, actions.EmitEvent),
+        ):
+            self._refuse(type(action).__name__, _NOT_IN_A_RUN)
+        elif isinstance(action, actions.OpaqueCoroutine):
+            self._refuse("OpaqueCoroutine", "it runs beside processes, which there are none of")
+        else:
+            return False
+        return True
+
+    def _refuse(self, what: str, why: str) -> None:
+        self.launched.unsupported.append(Unsupported(self.where(), what, why))
+
+    def _declare(self, action: Any) -> None:
+        default = action.default_value
+        text = None if default is None else "".join(part.describe() for part in default)
+        argument = Argument(action.name, text, action.description or "")
+        self.launched.arguments.setdefault(action.name, argument)
+
+    # -- nodes -------------------------------------------------------------------------------------
+
+    def _node(self, node: Any) -> None:
+        package = self._optional(node.node_package)
+        executable = self._text(node.node_executable)
+        if package is None:
+            self._refuse(f"process {executable!r}", "it belongs to no package")
+            return
+        node._perform_substitutions(self._context)
+        name = node._Node__expanded_node_name
+        own_name = None if name == node.UNSPECIFIED_NODE_NAME else name.lstrip("/")
+        namespace = node.expanded_node_namespace
+        own_namespace = None if namespace == node.UNSPECIFIED_NODE_NAMESPACE else namespace
+        if getattr(node, "_LifecycleNode__autostart", False):
+            self._refuse(
+                f"autostart of {package}/{executable}",
+                "nobody changes the states of lifecycle nodes here: let a node of the job do it",
+            )
+        self.launched.nodes.append(
+            LaunchedNode(
+                where=self.where(),
+                package=package,
+                executable=executable,
+                name=own_name,
+                namespace=own_namespace or None,
+                parameters=self._parameters(node, own_name, own_namespace),
+                remappings=tuple((a, b) for a, b in node.expanded_remapping_rules or ()),
+                arguments=self._words(node._Node__arguments),
+                ros_arguments=self._words(node._Node__ros_arguments),
+            )
+        )
+
+    def _words(self, words: Any) -> tuple[str, ...]:
+        return tuple(self._text(word) for word in words or ())
+
+    def _parameters(self, node: Any, name: str | None, namespace: str | None) -> Parameters:
+        full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
+        found: list[ParameterFile | dict[str, Any]] = []
+        shared = self._context.launch_configurations.get("global_params") or ()
+        found += [{item[0]: item[1]} for item in shared if isinstance(item, tuple)]
+        for text, is_file in node._Node__expanded_parameter_arguments or ():
+            if not is_file:
+                key, _, value = text.partition(":=")
+                from rsltrace.launch.values import yaml_value
+
+                found.append({key: yaml_value(value)})
+            elif Path(text).parent == Path(tempfile.gettempdir()):
+                # What was given as values, launch has written to a file of its own.
+                found.append(parameters_for(text, full_name))
+                Path(text).unlink(missing_ok=True)
+            else:
+                found.append(ParameterFile(text))
+        return tuple(found)
+
+    def _components(self, descriptions: Any) -> None:
+        for description in descriptions:
+            condition = description.condition()
+            if condition is None or condition.evaluate(self._context):
+                self._component(description)
+
+    def _component(self, description: Any) -> None:
+        from launch_ros.utilities import make_namespace_absolute, prefix_namespace
+
+        configurations = self._context.launch_configurations
+        namespace = make_namespace_absolute(
+            prefix_namespace(
+                configurations.get("ros_namespace"), self._optional(description.node_namespace)
+            )
+        )
+        remappings = list(configurations.get("ros_remaps") or ())
+        remappings += [(self._text(a), self._text(b)) for a, b in description.remappings or ()]
+        self.launched.nodes.append(
+            LaunchedNode(
+                where=self.where(),
+                package=self._text(description.package),
+                plugin=self._text(description.node_plugin),
+                name=self._optional(description.node_name),
+                namespace=namespace or None,
+                parameters=self._component_parameters(description),
+                remappings=tuple(remappings),
+            )
+        )
+
+    def _component_parameters(self, description: Any) -> Parameters:
+        from launch_ros.utilities import evaluate_parameters
+
+        found: list[ParameterFile | dict[str, Any]] = []
+        for item in self._context.launch_configurations.get("global_params") or ():
+            if isinstance(item, tuple):
+                found.append({item[0]: item[1]})
+            else:
+                found.append(ParameterFile(os.path.abspath(item)))
+        for given in evaluate_parameters(self._context, description.parameters or ()):
+            if isinstance(given, dict):
+                found.append({str(name): _plain(value) for name, value in given.items()})
+            elif isinstance(given, Path):
+                found.append(ParameterFile(str(given)))
+            else:
+                name, value = given.evaluate(self._context)
+                found.append({name: _plain(value)})
+        return tuple(found)
+
+    def _text(self, substitutions: Any) -> str:
+        from launch.utilities import normalize_to_list_of_substitutions, perform_substitutions
+
+        listed = normalize_to_list_of_substitutions(substitutions)
+        return str(perform_substitutions(self._context, listed))
+
+    def _optional(self, substitutions: Any) -> str | None:
+        return None if substitutions is None else self._text(substitutions)
+
+
+_DESCRIPTIONS = "__composable_node_descriptions"
+
+
+def _plain(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value

@@ -1,0 +1,162 @@
+"""From what a launch file starts to entries of a job."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from rsltrace.errors import JobError
+from rsltrace.job import NodeSpec
+from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
+from rsltrace.launch.parameter_files import flat, parameters_for
+from rsltrace.launch.scope import ParameterFile
+from rsltrace.launch.values import inferred
+
+_LISTED_MAX = 30
+
+
+def node_specs(
+    launched: Launched,
+    *,
+    skip_unsupported: bool,
+    why_not: Callable[[str, str], str | None],
+) -> list[NodeSpec]:
+    """Return the nodes as entries of a job; ``launched.unsupported`` grows by what is left out.
+
+    ``why_not(package, executable)`` says why an executable cannot be simulated.
+
+    :raises JobError: with everything that cannot be simulated, unless that is to be skipped.
+    """
+    specs = []
+    for node in launched.nodes:
+        why = _why_not(node, why_not)
+        if why is not None:
+            launched.unsupported.append(Unsupported(node.where, node.title, why))
+        else:
+            specs.append(_spec(node))
+    launched.unsupported.sort(key=_position)
+    if launched.unsupported and not skip_unsupported:
+        listed = launched.unsupported[:_LISTED_MAX]
+        more = len(launched.unsupported) - len(listed)
+        lines = "".join(f"\n  {item}" for item in listed) + (f"\n  and {more} more" if more else "")
+        raise JobError(
+            f"not all of the launch file can be simulated; --skip-unsupported (skip_unsupported: "
+            f"true in a job) leaves this out:{lines}"
+        )
+    return specs
+
+
+def _position(item: Unsupported) -> tuple[str, list[int]]:
+    file, *numbers = item.where.split(":")
+    return file, [int(number) for number in numbers if number.isdigit()]
+
+
+def _why_not(node: LaunchedNode, of_executable: Callable[[str, str], str | None]) -> str | None:
+    if not node.plugin:
+        return of_executable(node.package, node.executable)
+    if "::" in node.plugin:
+        return "it is a C++ component: only Python nodes can be simulated"
+    if "." not in node.plugin and ":" not in node.plugin:
+        return "a Python component is written module.Class, or module:Class"
+    return None
+
+
+def _spec(node: LaunchedNode) -> NodeSpec:
+    words, ros_words = _split(node.arguments)
+    given = _RosWords([*node.ros_arguments, *ros_words], node.where)
+    name = given.name or node.name
+    namespace = given.namespace or node.namespace
+    full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
+    files, parameters = _in_order([*node.parameters, *given.parameters], full_name)
+    remappings = dict(reversed([*node.remappings, *given.remappings]))  # the first one counts
+    values: dict[str, Any] = {
+        "name": name,
+        "namespace": namespace,
+        "parameters": parameters,
+        "parameter_files": files,
+        "remappings": dict(reversed(remappings.items())),
+        "origin": node.where,
+    }
+    try:
+        if node.plugin:
+            module, _, attribute = node.plugin.replace(":", ".").rpartition(".")
+            return NodeSpec(node=f"{module}:{attribute}", **values)
+        target = f"{node.package}/{node.executable}"
+        return NodeSpec(executable=target, arguments=words, **values)
+    except JobError as error:
+        raise JobError(str(error).removeprefix("NodeSpec: "), where=node.where) from None
+
+
+def _in_order(
+    parameters: Sequence[ParameterFile | dict[str, Any]], full_name: str | None
+) -> tuple[list[str], dict[str, Any]]:
+    """Return files and values such that each parameter has the value given last.
+
+    A job's values win over its files, so a value that a later file gives again is left out.
+    """
+    files: list[str] = []
+    values: dict[str, Any] = {}
+    for item in parameters:
+        if isinstance(item, ParameterFile):
+            files.append(item.path)
+            for name in parameters_for(item.path, full_name):
+                values.pop(name, None)
+        else:
+            values.update(flat(item))
+    return files, values
+
+
+def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Return a program's own words, and those between ``--ros-args`` and ``--``."""
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for word in arguments:
+        if word == "--ros-args":
+            inside = True
+        elif word == "--" and inside:
+            inside = False
+        else:
+            (ros if inside else own).append(word)
+    return own, ros
+
+
+class _RosWords:
+    """What ``--ros-args`` words say about one node."""
+
+    def __init__(self, words: Sequence[str], where: str) -> None:
+        self.name: str | None = None
+        self.namespace: str | None = None
+        self.parameters: list[ParameterFile | dict[str, Any]] = []
+        self.remappings: list[tuple[str, str]] = []
+        self._where = where
+        rest = list(words)
+        while rest:
+            option = rest.pop(0)
+            if option in ("--ros-args", "--"):
+                continue
+            if option in ("--enable-rosout-logs", "--disable-rosout-logs") or option.startswith(
+                ("--enable-", "--disable-")
+            ):
+                continue
+            if not rest:
+                raise JobError(f"the ROS argument {option} has no value", where=where)
+            self._add(option, rest.pop(0))
+
+    def _add(self, option: str, value: str) -> None:
+        if option in ("--log-level", "--log-file-name", "--log-config-file", "-e", "--enclave"):
+            return
+        if option == "--params-file":
+            self.parameters.append(ParameterFile(value))
+            return
+        name, assigned, to = value.partition(":=")
+        if option not in ("-r", "--remap", "-p", "--param") or not assigned:
+            raise JobError(f"unknown ROS argument {option} {value}", where=self._where)
+        if option in ("-p", "--param"):
+            self.parameters.append({name: inferred(to)})
+        elif name in ("__node", "__name"):
+            self.name = to
+        elif name == "__ns":
+            self.namespace = to
+        else:
+            self.remappings.append((name, to))

@@ -1,0 +1,166 @@
+"""What the substitutions of launch files stand for, without ROS's launch."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+from rsltrace.job.substitute import package_prefix
+from rsltrace.launch.expression import evaluate
+from rsltrace.launch.scope import Values
+from rsltrace.launch.template import Call, Template, parse_template
+
+_TRUE, _FALSE = ("true", "1"), ("false", "0")
+
+_REFUSED = {
+    "command": "reading a launch file runs no commands",
+    "param": "a parameter's value is not known before the nodes run",
+    "launch_log_dir": "a simulation writes no log files",
+    "log_dir": "a simulation writes no log files",
+}
+
+
+def truth(text: str) -> bool:
+    """Return a condition's value, as launch reads it.
+
+    :raises ValueError: if it is none of true, 1, false, 0.
+    """
+    word = text.strip().lower()
+    if word in _TRUE:
+        return True
+    if word in _FALSE:
+        return False
+    raise ValueError(f"expected true, 1, false or 0, got {text!r}")
+
+
+class Substitutions:
+    """Replaces ``$(…)`` by the ``values`` of the moment; ``file`` is the launch file being read."""
+
+    def __init__(self, values: Values, file: Path) -> None:
+        self.values = values
+        self.file = file
+        self._anonymous: dict[str, str] = {}
+        self._known: dict[str, tuple[int, int, Callable[..., str]]] = {
+            "var": (1, 2, self._var),
+            "env": (1, 2, self._env),
+            "optenv": (1, 2, lambda name, default="": self._env(name, default)),
+            "dirname": (0, 0, lambda: str(self.file.parent)),
+            "filename": (0, 0, lambda: str(self.file)),
+            "find-pkg-share": (1, 1, lambda package: str(_prefix(package) / "share" / package)),
+            "find-pkg-prefix": (1, 1, lambda package: str(_prefix(package))),
+            "exec-in-pkg": (2, 2, _executable_in_package),
+            "find-exec": (1, 1, _find_executable),
+            "file-content": (1, 1, _file_content),
+            "anon": (1, 1, self._anon),
+            "eval": (1, 99, lambda *words: str(evaluate(" ".join(words)))),
+            "not": (1, 1, lambda a: _word(not truth(a))),
+            "and": (2, 2, lambda a, b: _word(truth(a) and truth(b))),
+            "or": (2, 2, lambda a, b: _word(truth(a) or truth(b))),
+            "any": (0, 99, lambda *words: _word(any(map(truth, words)))),
+            "all": (0, 99, lambda *words: _word(all(map(truth, words)))),
+            "equals": (2, 2, lambda a, b: _word(_equal(a, b))),
+            "not-equals": (2, 2, lambda a, b: _word(not _equal(a, b))),
+            "if": (2, 3, lambda a, yes, no="": yes if truth(a) else no),
+        }
+
+    def text(self, written: str) -> str:
+        """Return a text with every substitution in it replaced.
+
+        :raises ValueError: if one is wrong; the message begins with it as it is written.
+        """
+        return self._evaluate(parse_template(written)) if written else ""
+
+    def _evaluate(self, template: Template) -> str:
+        return "".join(part if isinstance(part, str) else self._call(part) for part in template)
+
+    def _call(self, call: Call) -> str:
+        if call.name in _REFUSED:
+            raise ValueError(f"{call.written}: {_REFUSED[call.name]}; give the value itself")
+        if call.name not in self._known:
+            near = difflib.get_close_matches(call.name, self._known, n=1)
+            there = f"there are {', '.join(self._known)}"
+            hint = f"did you mean $({near[0]} …)?" if near else there
+            raise ValueError(f"{call.written} is no substitution; {hint}")
+        least, most, function = self._known[call.name]
+        if not least <= len(call.arguments) <= most:
+            number = f"{least}" if least == most else f"{least} to {most}"
+            raise ValueError(
+                f"{call.written}: {call.name} takes {number} values, here are "
+                f"{len(call.arguments)} (quote a value with blanks in it)"
+            )
+        arguments = [self._evaluate(argument) for argument in call.arguments]
+        try:
+            return function(*arguments)
+        except (ValueError, OSError) as error:
+            said = str(error)
+            raise ValueError(said if said.startswith("$(") else f"{call.written}: {said}") from None
+
+    def _var(self, name: str, default: str | None = None) -> str:
+        value = self.values.configurations.get(name, default)
+        if value is None:
+            names = sorted(self.values.configurations)
+            near = difflib.get_close_matches(name, names, n=1)
+            there = f"there are {', '.join(names)}" if names else "none is declared"
+            hint = f"did you mean {near[0]!r}?" if near else there
+            raise ValueError(f"there is no launch argument {name!r}; {hint}")
+        return value
+
+    def _env(self, name: str, default: str | None = None) -> str:
+        value = self.values.environment.get(name, default)
+        if value is None:
+            raise ValueError(
+                f"the environment variable {name} is not set: set it, or give a default, "
+                f"$(env {name} default)"
+            )
+        return value
+
+    def _anon(self, name: str) -> str:
+        # ROS appends host, process and a random number; here runs must not differ.
+        return self._anonymous.setdefault(name, f"{name}_{len(self._anonymous) + 1}")
+
+
+def _word(value: bool) -> str:
+    return str(value).lower()
+
+
+def _equal(a: str, b: str) -> bool:
+    def plain(text: str) -> str | float:
+        if text.lower() in ("true", "false"):
+            return text.lower()
+        try:
+            return float(text)
+        except ValueError:
+            return text
+
+    return plain(a) == plain(b)
+
+
+def _prefix(package: str) -> Path:
+    prefix = package_prefix(package)
+    if prefix is None:
+        raise ValueError(
+            f"there is no ROS package {package!r} in AMENT_PREFIX_PATH: install it, or source the "
+            "workspace that has it"
+        )
+    return prefix
+
+
+def _executable_in_package(executable: str, package: str) -> str:
+    path = _prefix(package) / "lib" / package / executable
+    if not path.exists():
+        raise ValueError(f"package {package!r} has no executable {executable!r}")
+    return str(path)
+
+
+def _find_executable(name: str) -> str:
+    path = shutil.which(name)
+    if path is None:
+        raise ValueError(f"there is no executable {name!r} in PATH")
+    return os.path.abspath(path)
+
+
+def _file_content(path: str) -> str:
+    return Path(path).read_text(encoding="utf-8")

@@ -1,0 +1,214 @@
+"""Launch files and ROS arguments on the command line and in jobs, run to the end."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsltrace import Job, Trace
+from rsltrace.errors import JobError
+from rsltrace.job import LaunchSpec, load_job
+
+pytestmark = pytest.mark.ros
+
+NODES = """
+from rclpy.node import Node
+from std_msgs.msg import String
+
+class Talker(Node):
+    def __init__(self):
+        super().__init__('talker')
+        self.declare_parameter('rate', 1.0)
+        self.declare_parameter('word', 'hello')
+        self.publisher = self.create_publisher(String, 'chatter', 10)
+        self.create_timer(1.0 / self.get_parameter('rate').value, self.tick)
+
+    def tick(self):
+        self.publisher.publish(String(data=self.get_parameter('word').value))
+"""
+
+LAUNCH = """<launch>
+  <arg name="word" default="hi" description="what to say"/>
+  <group><push_ros_namespace namespace="robot"/>
+    <node_container pkg="rclpy_components" exec="container" name="c" namespace="">
+      <composable_node pkg="demo" plugin="demo_nodes.Talker" name="talk">
+        <param name="rate" value="4.0"/><param name="word" value="$(var word)"/>
+        <remap from="chatter" to="/chat"/>
+      </composable_node>
+    </node_container>
+  </group>
+  <node pkg="rviz2" exec="rviz2"/>
+</launch>
+"""
+
+JOB = "nodes: [{node: demo_nodes:Talker, parameters: {rate: 2.0}}]\nstop: {duration: 2s}\n"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "demo_nodes.py").write_text(NODES)
+    (tmp_path / "demo.launch.xml").write_text(LAUNCH)
+    (tmp_path / "job.yaml").write_text(JOB)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def rsltrace(folder: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
+    def call(*arguments: object) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, "-m", "rsltrace", *map(str, arguments)],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            cwd=folder,
+            env=dict(os.environ),
+            check=False,
+        )
+
+    return call
+
+
+def topics(path: Path) -> dict[str, int]:
+    """Return how many messages were published on each topic of the nodes' own."""
+    with Trace.open(path) as trace:
+        names = [entity.name for entity in trace.entities.values()]
+        assert trace.complete
+        events = [trace.event(i) for i in range(trace.event_count)]
+        timers = sum(event.kind.label == "timer" for event in events)
+    return {name: timers for name in names if name in ("/chat", "/chatter", "/other")}
+
+
+def test_record_a_launch_file(rsltrace: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    refused = rsltrace("record", "--launch", "demo.launch.xml", "--until", "2")
+    assert refused.returncode == 2
+    assert "demo.launch.xml:11:3: rviz2/rviz2: there is no package 'rviz2'" in refused.stderr
+    assert not Path("demo.mcap").exists()
+
+    launch = ("record", "--launch", "demo.launch.xml", "--skip-unsupported", "--until", "2")
+    done = rsltrace(*launch, "word:=there")
+    assert (done.returncode, topics(Path("demo.mcap"))) == (0, {"/chat": 8}), done.stderr
+    assert "note: left out: demo.launch.xml:11:3: rviz2/rviz2" in done.stderr
+
+    other = rsltrace(*launch, "word:=here", "-o", "other.mcap")
+    assert other.stdout.split()[1] != done.stdout.split()[1]
+
+    unknown = rsltrace(*launch, "wrd:=here", "-o", "unknown.mcap")
+    assert unknown.returncode == 2
+    assert unknown.stderr.splitlines() == [
+        "rsltrace: error: demo.launch.xml: unknown launch argument 'wrd'; did you mean 'word'?",
+        "there are:",
+        "  word (default 'hi', what to say)",
+    ]
+
+
+def test_print_job_gives_a_job_that_does_the_same(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
+) -> None:
+    launch = ("--launch", "demo.launch.xml", "--skip-unsupported", "--until", "2")
+    first = rsltrace("record", *launch)
+    (folder / "printed.yaml").write_text(rsltrace("record", *launch, "--print-job").stdout)
+    second = rsltrace("record", "printed.yaml")
+    assert first.stdout == second.stdout
+
+
+def test_a_launch_file_in_a_job(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
+) -> None:
+    (folder / "both.yaml").write_text(
+        JOB
+        + "launch:\n  - {file: demo.launch.xml, arguments: {word: five}, skip_unsupported: true}\n"
+    )
+    done = rsltrace("record", "both.yaml")
+    assert topics(Path("both.mcap")) == {"/chat": 12, "/chatter": 12}, done.stderr
+    with Trace.open("both.mcap") as trace:
+        assert '"launch": []' in trace.job["resolved"]
+        assert '"name": "talk"' in trace.job["resolved"]
+
+    also = rsltrace("record", "job.yaml", "--launch", "demo.launch.xml", "--skip-unsupported",
+                    "word:=five", "-o", "also.mcap")  # fmt: skip
+    assert also.stdout == done.stdout
+
+
+def test_words_that_do_not_fit_together(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]],
+) -> None:
+    for arguments, message in [
+        ((), "Missing argument 'JOB' (or --launch FILE)"),
+        (("a.yaml", "b.yaml"), "one JOB at a time, here are a.yaml and b.yaml"),
+        (("job.yaml", "a:=1"), "a:=… is a launch argument: give the launch file with --launch"),
+        (("job.yaml", "--skip-unsupported"), "--skip-unsupported: give the launch file"),
+        (("--launch", "no.xml"), "there is no such launch file"),
+    ]:
+        done = rsltrace("record", *arguments)
+        assert done.returncode == 2
+        assert message in done.stderr
+
+
+def test_launch_specs_in_python(folder: Path) -> None:
+    job = Job(launch=[LaunchSpec(file="demo.launch.xml", arguments={"word": 1.5, "b": True})])
+    assert job.launch[0].arguments == {"word": "1.5", "b": "true"}
+    assert load_job(_write(folder / "again.yaml", job.to_yaml())).launch == job.launch
+    with pytest.raises(JobError, match="there is no such launch file"):
+        Job(launch=["nothing.xml"])
+
+
+def _write(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+# -- --ros-args ------------------------------------------------------------------------------------
+
+
+def test_ros_arguments_have_the_last_word(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
+) -> None:
+    (folder / "sub").mkdir()
+    (folder / "sub" / "p.yaml").write_text("talker: {ros__parameters: {word: filed, rate: 8.0}}\n")
+    cases: list[tuple[list[str], dict[str, int]]] = [
+        ([], {"/chatter": 4}),
+        (["--ros-args", "-p", "rate:=5.0"], {"/chatter": 10}),
+        (["--ros-args", "-p", "talker:rate:=5.0", "-p", "no:rate:=9.0"], {"/chatter": 10}),
+        (["--ros-args", "-r", "chatter:=/other", "--", "--quiet"], {"/other": 4}),
+        (["--ros-args", "-r", "talker:chatter:=/other"], {"/other": 4}),
+        (["--ros-args", "--params-file", "sub/p.yaml"], {"/chatter": 16}),
+        (["--ros-args", "--params-file", "sub/p.yaml", "-p", "rate:=1.0"], {"/chatter": 2}),
+    ]
+    for arguments, expected in cases:
+        done = rsltrace("record", "job.yaml", "--force", *arguments)
+        assert (done.returncode, topics(Path(f"{folder.name}.mcap"))) == (0, expected), (
+            arguments,
+            done.stderr,
+        )
+
+
+def test_ros_arguments_win_over_names_given_in_the_job(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
+) -> None:
+    (folder / "named.yaml").write_text(
+        "nodes: [{node: demo_nodes:Talker, name: mine, remappings: {chatter: /chat}}]\n"
+        "stop: {duration: 1s}\n"
+        "ros_arguments: [-r, chatter:=/other, -r, __ns:=/space]\n"
+    )
+    assert rsltrace("record", "named.yaml").returncode == 0
+    with Trace.open("named.mcap") as trace:
+        names = {entity.name for entity in trace.entities.values()}
+    assert {"/other", "/space/mine"} <= names
+
+
+def test_wrong_ros_arguments(rsltrace: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+    for words, message in [
+        (["-p", "rate"], "ros_arguments (--ros-args): "),
+        (["--params-file", "none.yaml"], "none.yaml"),
+        (["--bogus"], "unknown ROS arguments"),
+    ]:
+        done = rsltrace("record", "job.yaml", "--ros-args", *words)
+        assert done.returncode == 2
+        assert message in done.stderr
+        assert "Traceback" not in done.stderr
