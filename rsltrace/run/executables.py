@@ -98,7 +98,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         return scripts[name]
     files = _installed_files(package)
     if name in files:
-        return files[name], _python_script(files[name], target, where)
+        return partial(_run_script, _python_script(files[name], target, where), files[name])
     known = _packages()
     if not scripts and not files and package not in known:
         raise JobError(
