@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from rsltrace.job.bag import BagSpec
+from rsltrace.job.clocks import ClockSpec
 from rsltrace.job.delay import DelaysSpec
 from rsltrace.job.distribution import files_of
 from rsltrace.job.guard import GuardSpec, guard_part
@@ -18,6 +19,13 @@ from rsltrace.job.launch_spec import LaunchSpec
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, attach, check, items, one_of, parts, text, whole
 from rsltrace.job.problems import Loc, Problem, Problems, describe
+from rsltrace.job.scheduling import (
+    ExecutionSpec,
+    ExecutorSpec,
+    PolicySpec,
+    executors_part,
+    policy_part,
+)
 from rsltrace.job.spec import RecordSpec, StopSpec, TimeLike
 from rsltrace.job.times import format_time, parse_time
 
@@ -46,7 +54,11 @@ class Job(Part):
     ``base_dir`` (an absolute path; the current folder when built in Python): see ``resolve``.
     """
 
-    TIMES: ClassVar[dict[str, str]] = {"start": "start_ns", "construct_time": "construct_time_ns"}
+    TIMES: ClassVar[dict[str, str]] = {
+        "start": "start_ns",
+        "construct_time": "construct_time_ns",
+        "min_time_step": "min_time_step_ns",
+    }
 
     nodes: Annotated[tuple[NodeSpec, ...], parts()] = Field(
         default=(),
@@ -131,6 +143,38 @@ class Job(Part):
         examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
     )
 
+    policy: Annotated[PolicySpec | None, policy_part()] = Field(
+        default=None,
+        description="Which of the callbacks that are ready runs next; without it, first come, "
+        "first served, and timers last.",
+        examples=["rate_monotonic", {"recorded": "run1.mcap"}],
+    )
+    min_time_step_ns: Annotated[int, check(parse_time)] = Field(
+        default=0,
+        alias="min_time_step",
+        description="Simulated time moves on by this much at least; what is due in between runs "
+        "late.",
+        examples=["1ms"],
+    )
+    executors: Annotated[tuple[ExecutorSpec, ...] | None, executors_part()] = Field(
+        default=None,
+        description="Simulated executors, whose workers a callback occupies while it runs or "
+        "waits. `single_threaded`: one with one worker for all nodes; `per_node`: one for each, "
+        "which nodes that are not listed have, too.",
+        examples=["single_threaded", [{"nodes": ["/camera", "/detector"], "workers": 2}]],
+    )
+    execution: ExecutionSpec | None = Field(
+        default=None,
+        description="How long callbacks take: their executor is busy for so long, and what they "
+        "send leaves when they are over.",
+        examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
+    )
+    clocks: Annotated[tuple[ClockSpec, ...], parts()] = Field(
+        default=(),
+        description="Clocks of nodes that do not show simulated time, as real ones do not.",
+        examples=[[{"node": "/lidar", "offset": "-20ms", "drift": "50ppm"}]],
+    )
+
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(
         default_factory=Path.cwd, exclude=True, repr=False
@@ -162,6 +206,12 @@ class Job(Part):
             record: RecordSpec | dict[str, Any] = ...,
             guard: GuardSpec | dict[str, Any] | bool = ...,
             delay: DelaysSpec | dict[str, Any] | None = None,
+            policy: PolicySpec | dict[str, Any] | str | None = None,
+            min_time_step: TimeLike = 0,
+            min_time_step_ns: int = 0,
+            executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,
+            execution: ExecutionSpec | dict[str, Any] | None = None,
+            clocks: Sequence[ClockSpec | dict[str, Any]] = (),
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,
@@ -202,6 +252,9 @@ class Job(Part):
     def model_files(self) -> Iterator[tuple[Loc, str]]:
         """Yield (place in the job, path) of the files that its delays come from."""
         yield from files_of(self.delay, ("delay",))
+        yield from files_of(self.execution, ("execution",))
+        if self.policy is not None and self.policy.recorded is not None:
+            yield ("policy", "recorded"), self.policy.recorded
 
     @model_validator(mode="after")
     def _check_whole(self) -> Job:
@@ -211,6 +264,7 @@ class Job(Part):
             *self._distinct_names(),
             *self._bags_end(),
             *self._paths_exist(),
+            *self._ties_are_decided_once(),
         ]
         if problems:
             raise Problems(problems)
@@ -279,6 +333,18 @@ class Job(Part):
         if not close:
             return ""
         return f"; did you mean {os.path.join(os.path.dirname(path), close[0])!r}?"
+
+    def _ties_are_decided_once(self) -> Iterator[Problem]:
+        if self.timer_ties == "heap" and not (
+            (self.policy is None or self.policy.order == "fifo")
+            and self.executors is None
+            and self.execution is None
+        ):
+            yield Problem(
+                "heap is the order of RSLCPP's timers, which a policy, executors or execution "
+                "times do not go with: leave it out",
+                ("timer_ties",),
+            )
 
     def _paths_exist(self) -> Iterator[Problem]:
         for index, folder in enumerate(self.search_path):

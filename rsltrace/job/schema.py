@@ -144,13 +144,16 @@ class _Maker:
         facts: Schema = {}
         for item in metadata:
             function = getattr(item, "func", None)
-            for name in ("schema", "shorthand", "entry_shorthand", "value_shorthand"):
+            for name in ("schema", "shorthand", "entry_shorthand", "value_shorthand", "words"):
                 value = getattr(function, name, None)
                 if value is not None:
                     facts[name] = value
         if "schema" in facts:
             return dict(facts["schema"])
-        return self._by_type(annotation, facts)
+        schema = self._by_type(annotation, facts)
+        if "words" in facts:  # that stand for a whole list
+            return {"anyOf": [{"enum": list(facts["words"])}, schema]}
+        return schema
 
     def _by_type(self, annotation: Any, facts: Schema) -> Schema:
         origin, arguments = get_origin(annotation), get_args(annotation)

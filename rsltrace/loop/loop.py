@@ -54,7 +54,8 @@ class EventLoop:
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
     next one (None: nothing is left); it may switch to another stack and so pause the run. When it
-    returns True, something may have been made ready meanwhile, and the loop looks again.
+    returns True, something may have been made ready meanwhile, and the loop looks again. Time moves
+    on by ``min_step_ns`` at least; what is due in between runs late.
     """
 
     def __init__(
@@ -74,6 +75,8 @@ class EventLoop:
         self.tasks: deque[Dispatchable] = deque()
         self.idle: list[Callable[[], bool]] = []
         self.timers = timers
+        self.first_timer = timers.first
+        self.min_step_ns = 0
         self.stop_conditions = stop_conditions
         self.gate: Callable[[int | None], bool] | None = None
         self.stopped: Stop | None = None
@@ -115,7 +118,7 @@ class EventLoop:
     def run(self) -> Stop:
         """Run until something stops the run, and say what."""
         quiet_ns = quiet_until_ns(self.stop_conditions)
-        scheduled, first = self._scheduled, self.timers.first
+        scheduled, first = self._scheduled, self.first_timer
         while True:
             self.run_step()
             if self.stopped is not None:  # by an event, or by a signal at any time
@@ -137,11 +140,18 @@ class EventLoop:
             if self.events >= self._pause_events and self._between_steps is not None:
                 self._pause_events = self._between_steps()
             if next_ns > self.now_ns:
+                if self.min_step_ns:
+                    next_ns = self._stepped(next_ns, quiet_ns)
                 self.now_ns = next_ns
+
+    def _stepped(self, next_ns: int, end_ns: int) -> int:
+        """Return the next time if time moves on by no less than ``min_step_ns``."""
+        at_least_ns = self.now_ns + self.min_step_ns
+        return max(next_ns, min(at_least_ns, end_ns) if end_ns > next_ns else at_least_ns)
 
     def next_ns(self) -> int | None:
         """Return when the next timer or release is due, or None if there is neither."""
-        timer = self.timers.first()
+        timer = self.first_timer()
         scheduled = self._scheduled
         if timer is None:
             return scheduled[0][0] if scheduled else None

@@ -33,6 +33,9 @@ class TimerQueue(Protocol):
     def first(self) -> TimerState | None:
         """Return the timer that is due first, or None."""
 
+    def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
+        """Return the timers that are due, in order, and the one that will be next."""
+
 
 class CreationOrderQueue:
     """Smallest (deadline, creation order) first. O(log n) for every change."""
@@ -78,6 +81,26 @@ class CreationOrderQueue:
             heappop(heap)
         return None
 
+    def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
+        heap = self._heap
+        due: list[tuple[int, int, TimerState]] = []
+        after: tuple[int, int, TimerState] | None = None
+        places = [0]
+        while places:
+            place = places.pop()
+            if place >= len(heap):
+                continue
+            entry = heap[place]
+            valid = entry[2].ticket is entry
+            if entry[0] <= now_ns or not valid:
+                if valid:
+                    due.append(entry)
+                places += (2 * place + 1, 2 * place + 2)
+            elif after is None or entry[:2] < after[:2]:
+                after = entry
+        due.sort(key=lambda entry: entry[:2])
+        return [entry[2] for entry in due], None if after is None else after[2]
+
 
 class HeapOrderQueue:
     """Equal deadlines in the order of libstdc++'s heap algorithms, as rclcpp uses them.
@@ -117,6 +140,11 @@ class HeapOrderQueue:
 
     def first(self) -> TimerState | None:
         return self._heap[0] if self._heap else None
+
+    def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
+        in_order = sorted(self._heap, key=lambda timer: (timer.deadline_ns, timer.order))
+        due = [timer for timer in in_order if timer.deadline_ns <= now_ns]
+        return due, in_order[len(due)] if len(due) < len(in_order) else None
 
     def _sift_up(self, hole: int, top: int, timer: TimerState) -> None:
         heap = self._heap

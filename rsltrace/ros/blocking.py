@@ -74,6 +74,12 @@ class Wait:
         self._end_group = core.on_end
         self._cause = (NO_EVENT, 0)
         self._input_hash = 0
+        self._busy_ns = core.busy_ns
+
+    @property
+    def entity_id(self) -> int:
+        """The entity whose callback waits."""
+        return self._event[1]
 
     @property
     def waiting(self) -> bool:
@@ -130,6 +136,7 @@ class Wait:
         core.node_arguments = self._arguments
         core.on_end = self._end_group
         core.quiet = self.quiet
+        core.busy_ns = self._busy_ns
         if self.program is not core.program:
             self.program.enter()
 

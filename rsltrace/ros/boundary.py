@@ -114,6 +114,18 @@ class Boundary:
         """Return simulated time, or the last one between runs."""
         return self._last_now_ns if self._core is None else self._core.loop.now_ns
 
+    def shown_ns(self, owner: str | None) -> int:
+        """Return what the clock of a node shows; without an owner, that of the present node."""
+        core = self._core
+        if core is None or core.clocks is None:
+            return self.now_ns()
+        return core.clocks.shows(owner or self.current_node_name(), core.loop.now_ns)
+
+    def current_node_name(self) -> str | None:
+        """Return the name of the node whose callback or constructor runs, if any does."""
+        node = self._core.current_node if self._core is not None else None
+        return None if node is None else node.fully_qualified_name
+
     def enter(self, core: Core) -> None:
         """Make ``core`` the world that new entities join."""
         if self._core is not None:

@@ -1,4 +1,4 @@
-"""Clocks: ROS, system and steady time are all simulated time."""
+"""Clocks: ROS, system and steady time are all simulated time, as each node's clock shows it."""
 
 from __future__ import annotations
 
@@ -32,12 +32,13 @@ class ClockHandle(Destroyable):
         self.clock_type = clock_type
         self._override = False
         self._callbacks: list[tuple[Any, bool, int, int]] = []
+        self._owner: str | None = self.boundary.current_node_name()
         if clock_type == self.boundary.ClockType.ROS_TIME:
             self.boundary.ros_clocks.append(weakref.ref(self))
 
     def get_now(self) -> _Now:
-        """Return simulated time."""
-        return _Now(self.boundary.now_ns())
+        """Return simulated time, or what the clock of this node's computer shows instead."""
+        return _Now(self.boundary.shown_ns(self._owner))
 
     def get_ros_time_override_is_enabled(self) -> bool:
         """Return whether ``use_sim_time`` switched this clock; it shows simulated time anyway."""
@@ -108,7 +109,7 @@ class ClockEventHandle:
         return self._event.is_set()
 
     def _wait_until(self, clock: Any, until: Any) -> bool:
-        left_ns = until.nanoseconds - self.boundary.now_ns()
+        left_ns = until.nanoseconds - clock.get_now().nanoseconds
         return left_ns <= 0 or self._event.wait_ns(left_ns)
 
     wait_until_steady = _wait_until

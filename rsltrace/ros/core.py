@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.links import Network
     from rsltrace.ros.logs import Logs
     from rsltrace.ros.node import NodeHandle
+    from rsltrace.ros.node_clocks import NodeClocks
     from rsltrace.ros.stating import NodeState
     from rsltrace.ros.tasks import TaskRun
     from rsltrace.ros.threads import SimThread
@@ -69,7 +70,9 @@ class Core:
         self.graph: Graph
         self.executor: SimExecutor
         self.network: Network | None = None
+        self.clocks: NodeClocks | None = None
         self.busy_ns = 0
+        self.took_ns = 0
         self.current_node: NodeHandle | None = None
         self.current_entity = 0
         self.current_handle: Dispatchable | None = None

@@ -19,7 +19,10 @@ class GuardContext:
 
     def now_ns(self) -> int:
         """Return simulated time."""
-        return self._core.loop.now_ns
+        core = self._core
+        if core.clocks is None or core.current_node is None:
+            return core.loop.now_ns
+        return core.clocks.shows(core.current_node.fully_qualified_name, core.loop.now_ns)
 
     def node(self) -> str:
         """Return the node whose code runs, or the entry whose constructor has made none yet."""

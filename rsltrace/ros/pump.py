@@ -159,8 +159,11 @@ class Pump:
     def _run(self, mailbox: Mailbox, item: Dispatchable) -> None:
         """Run one callback as an event, on the stack that spins."""
         core = self.core
+        core.took_ns = 0
         with set_aside(core):
             mailbox.run(item)
+        if core.took_ns:
+            wait(core, "its callback to take its time", for_ns=core.took_ns, quiet=True)
         failure, core.raised = core.raised, None
         if failure is not None:
             raise failure

@@ -14,9 +14,11 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.chance.clock import ClockModel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.model.event import EventKind
 from rsltrace.model.finding import Policy
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
@@ -27,8 +29,10 @@ from rsltrace.ros.ending import end_programs
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
+from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
+from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
 from rsltrace.ros.threads import cooperative_threads
 
 
@@ -134,6 +138,18 @@ class World:
             yield
         finally:
             self.core.importing = False
+
+    def use_clocks(self, rules: tuple[tuple[str, ClockModel], ...], start_ns: int) -> None:
+        """Let the clocks of some nodes (globs) be wrong. Before the first node is made."""
+        if rules:
+            self.core.clocks = NodeClocks(rules, seed=self.core.seed, start_ns=start_ns)
+
+    def use_scheduling(self, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        """Let a plan say what runs when, and how long it takes. Before the first node is made."""
+        Scheduling(self.core, loop, plan)
+        if plan.execution and self.core.network is None:
+            # What a callback sends leaves when it is over: that takes links.
+            self.use_network(NetworkPlan())
 
     # -- the stages of a run ---------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from rsltrace.errors import BagError, JobError, RunError
 from rsltrace.job import Job, locate, policy_of
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.finding import GuardCount
@@ -30,11 +31,13 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
+from rsltrace.run.clocks import clocks_of
 from rsltrace.run.executables import Mains, why_not
 from rsltrace.run.guarding import entry_key, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
+from rsltrace.run.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
@@ -138,7 +141,8 @@ class Session:
         self.end_ns = end_ns_of(job, self.start_ns)
         stack.enter_context(search_path(job))
         self._guarded = guarding(stack, job)
-        self.loop = loop = EventLoop(
+        kind = OrderedLoop if is_ordered(job) else EventLoop
+        self.loop = loop = kind(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
@@ -147,9 +151,14 @@ class Session:
         self.world = world = stack.enter_context(
             World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
+        loop.min_step_ns = job.min_time_step_ns
         plan = network_plan(job, self.start_ns)
         if plan is not None:
             world.use_network(plan)
+        if isinstance(loop, OrderedLoop):
+            with self._guarded.engaged():
+                world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
+        world.use_clocks(clocks_of(job), self.start_ns)
         self._guarded.begin(world.core)
         with self._guarded.engaged():
             loop.stop_conditions = tuple(

@@ -188,6 +188,11 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "bags": [],
         "record": {"payloads": True, "topics": ["*"], "exclude": []},
         "delay": None,
+        "policy": None,
+        "min_time_step_ns": 0,
+        "executors": None,
+        "execution": None,
+        "clocks": [],
         "guard": {
             "enabled": True,
             "state": "false",

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -54,7 +55,8 @@ class Mixed(Node):
         self.executor.create_task(lambda: self.get_logger().info(f'{self.n} {answer.message}'))
 
     def got(self, message):
-        self.declare_parameter(f'seen_{self.n}', message.latitude)
+        if not self.has_parameter(f'seen_{self.n}'):
+            self.declare_parameter(f'seen_{self.n}', message.latitude)
 """
 
 
@@ -93,3 +95,48 @@ def test_the_check_above_would_notice(tmp_path: Path) -> None:
     job = tmp_path / "job.yaml"
     job.write_text("nodes: [{node: 'extra:Mixed'}]\nstop: {duration: 1s}\nguard: false\n")
     assert len({recorded(number, job, tmp_path).digest for number in range(4)}) > 1
+
+
+POLICIES = {
+    "fifo": "policy: fifo\nexecutors: [{workers: 3}]",
+    "priority": "policy: {priority: [{node: /node_b, priority: 2}, {group_of: /t1, priority: 1}]}",
+    "rate_monotonic": "policy: rate_monotonic",
+    "permutation": "policy: permutation",
+    "own": "policy: {function: 'extra:LastFirst'}",
+    "slow": "policy: rate_monotonic\nexecution: {default: {gamma: {mean: 100us, sd: 50us}}}\n"
+    "delay: {default: {lognormal: {median: 1ms, sigma: 0.5}, drop: 0.1, duplicate: 0.05}}\n"
+    "clocks: [{node: '*', offset: -1ms, random_jumps: {every: 100ms, most: 5ms}}]",
+}
+LAST_FIRST = """
+class LastFirst:
+    def choose(self, ready, moment):
+        return len(ready) - 1
+"""
+
+
+def digests(tmp_path: Path, keys: str, runs: int) -> dict[str, Path]:
+    """Record under a policy in several surroundings; return the digests, and a trace of each."""
+    (tmp_path / "extra.py").write_text(EXTRA + LAST_FIRST)
+    job = tmp_path / "job.yaml"
+    network = ROOT / "examples" / "rslcpp_determinism"
+    text = JOB.replace("NETWORK", str(network)).replace("2s", "1s")
+    job.write_text(text + keys + "\n")
+    with ThreadPoolExecutor(max_workers=2) as pool:
+        done = list(pool.map(lambda number: recorded(number, job, tmp_path), range(runs)))
+    return {run.digest: run.path for run in done}
+
+
+def test_one_digest_under_every_policy(tmp_path: Path) -> None:
+    found = {}
+    for name, keys in POLICIES.items():
+        folder = tmp_path / name
+        folder.mkdir()
+        traces = digests(folder, keys, min(RUNS, 20))
+        assert len(traces) == 1, (name, traces)
+        found.update({name: next(iter(traces.items()))})
+    assert len({digest for digest, _ in found.values()}) == len(POLICIES), "each is another order"
+    folder = tmp_path / "recorded"
+    folder.mkdir()
+    digest, trace = found["permutation"]
+    shutil.copy(trace, folder / "order.mcap")
+    assert set(digests(folder, "policy: {recorded: order.mcap}", min(RUNS, 20))) == {digest}

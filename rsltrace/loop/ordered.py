@@ -1,0 +1,186 @@
+"""The loop of jobs that say who runs next: policies, simulated executors, execution times.
+
+It keeps the rules of ``loop.py`` except for the order: timers that are due are candidates beside
+what is ready, a policy chooses, and an executor all of whose workers are busy waits. A loop of its
+own, so that the plain one does not pay for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from heapq import heappop
+from typing import Any
+
+from rsltrace.errors import RunError
+from rsltrace.loop.loop import Dispatchable, EventLoop
+from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy
+from rsltrace.loop.timer import TimerState
+
+
+@dataclass(eq=False)
+class Workers:
+    """A simulated executor: how many callbacks it can run at once, and how many are running."""
+
+    name: str
+    count: int = 1
+    running: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """What the loop has to know of something that may run.
+
+    ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
+    exclusive callback group, or None.
+    """
+
+    candidate: Candidate
+    workers: Workers | None
+    exclusive: object | None
+
+
+class Charge:
+    """How long the callback under way will have taken; the middleware adds to it."""
+
+    __slots__ = ("duration_ns",)
+
+    def __init__(self) -> None:
+        self.duration_ns = 0
+
+
+class _Waiting:
+    """Stands in for the plain loop's queues: what became ready, in order of arrival."""
+
+    def __init__(self, place: Callable[[Dispatchable], Place], runs: Callable[[Place], bool]):
+        self.places: list[Place] = []
+        self._place = place
+        self._runs = runs
+
+    def append(self, item: Dispatchable) -> None:
+        self.places.append(self._place(item))
+
+    def appendleft(self, item: Dispatchable) -> None:
+        self.places.insert(0, self._place(item))
+
+    def extend(self, items: Iterable[Dispatchable]) -> None:
+        for item in items:
+            self.append(item)
+
+    def popleft(self) -> Dispatchable:
+        item: Dispatchable = self.places.pop(0).candidate.item
+        return item
+
+    def runnable(self) -> Iterator[Place]:
+        return filter(self._runs, self.places)
+
+    def __bool__(self) -> bool:
+        return any(True for _ in self.runnable())
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+
+class OrderedLoop(EventLoop):
+    """An event loop with a policy. ``place`` describes what may run; the middleware sets it."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self.policy: Policy = Fifo()
+        self.place: Callable[[Dispatchable], Place]
+        self.charge = Charge()
+        self._held: dict[object, None] = {}
+        self._ready = _Waiting(lambda item: self.place(item), self._runs)
+        self._tasks = _Waiting(lambda item: self.place(item), self._runs)
+        self.ready = self._ready  # type: ignore[assignment]
+        self.tasks = self._tasks  # type: ignore[assignment]
+        self.first_timer = self._next_timer
+
+    def _next_timer(self) -> TimerState | None:
+        """Return the timer that is due next; those that are overdue wait for a worker."""
+        due, after = self.timers.due(self.now_ns)
+        if any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
+            return due[0]
+        return after
+
+    def run_step(self) -> None:
+        """Run everything that is due at the present time and finds a worker."""
+        now_ns = self.now_ns
+        scheduled = self._scheduled
+        limit = self.events + self._livelock_limit
+        while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
+            heappop(scheduled)[3]()
+        while not self._interrupt:
+            place = self._next()
+            if place is not None:
+                self._dispatch(place)
+            elif not self.idle or not self._run_idle():
+                break
+            if self.events >= limit:
+                self._livelock(now_ns)
+
+    def _next(self) -> Place | None:
+        """Take out what runs next: tasks first, as rclpy has it, then what the policy chooses."""
+        for place in self._tasks.runnable():
+            self._tasks.places.remove(place)
+            return place
+        waiting = list(self._ready.runnable())
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        places = waiting + [place for place in timers if self._runs(place)]
+        if not places:
+            return None
+        moment = Moment(self.now_ns, self.events)
+        choice = self._chosen([place.candidate for place in places], moment)
+        place = places[choice]
+        if choice < len(waiting):
+            for index, other in enumerate(self._ready.places):
+                if other is place:
+                    del self._ready.places[index]
+                    break
+        return place
+
+    def _chosen(self, ready: list[Candidate], moment: Moment) -> int:
+        name = type(self.policy).__qualname__
+        try:
+            choice = self.policy.choose(ready, moment)
+        except RunError:
+            raise
+        except Exception as error:
+            raise RunError(
+                f"the policy {name} raised {type(error).__qualname__}: {error}"
+            ) from error
+        if not isinstance(choice, int) or not 0 <= choice < len(ready):
+            raise RunError(
+                f"the policy {name} chose {choice!r} of {len(ready)}: choose must return the index "
+                "of one of those that are ready"
+            )
+        return choice
+
+    def _runs(self, place: Place) -> bool:
+        workers = place.workers
+        if workers is not None and workers.running >= workers.count:
+            return False
+        return place.exclusive is None or place.exclusive not in self._held
+
+    def _dispatch(self, place: Place) -> None:
+        """Run an event; its worker is busy until it is over, and for as long as it takes."""
+        workers = place.workers
+        item: Dispatchable = place.candidate.item
+        if workers is None:
+            item.dispatch()
+            return
+        charge = self.charge = Charge()
+        workers.running += 1
+        item.dispatch()  # comes back later in time if the callback has waited for something
+        if charge.duration_ns == 0:
+            workers.running -= 1
+            return
+        if place.exclusive is not None:
+            self._held[place.exclusive] = None
+
+        def over() -> None:
+            workers.running -= 1
+            self._held.pop(place.exclusive, None)
+
+        self.schedule(self.now_ns + charge.duration_ns, over)

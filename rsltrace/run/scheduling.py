@@ -1,0 +1,130 @@
+"""From a job's ``policy:``, ``executors:`` and ``execution:`` to the plan that a world follows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.chance.stream import Stream
+from rsltrace.errors import JobError, TraceError
+from rsltrace.job import Job, locate
+from rsltrace.loop.policy import (
+    Fifo,
+    Permutation,
+    Policy,
+    Priority,
+    PriorityRule,
+    RateMonotonic,
+    Recorded,
+    RecordedEvent,
+)
+from rsltrace.model.event import EventKind
+from rsltrace.run.network import distribution_of
+from rsltrace.trace.reader import Trace
+
+if TYPE_CHECKING:
+    from rsltrace.ros.scheduling import SchedulingPlan
+
+
+def is_ordered(job: Job) -> bool:
+    """Whether a job needs more than the plain loop."""
+    policy = job.policy
+    fifo = policy is None or policy.order == "fifo"
+    return not fifo or job.executors is not None or job.execution is not None
+
+
+def scheduling_plan(job: Job, start_ns: int, stack: ExitStack) -> SchedulingPlan:
+    """Return the plan of a job. A recording that it follows stays open as long as ``stack``.
+
+    :raises JobError: if the recording cannot be read, or the policy's class cannot be made.
+    """
+    from rsltrace.ros.scheduling import ExecutionRule, ExecutorRule, SchedulingPlan
+
+    rules = []
+    if job.execution is not None:
+        for spec in job.execution.entities:
+            rules.append(ExecutionRule(spec.node, spec.entity, distribution_of(job, spec)))
+        for name, by_node in job.execution.nodes.items():
+            rules.append(ExecutionRule(name, None, distribution_of(job, by_node)))
+        if job.execution.default is not None:
+            rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
+    return SchedulingPlan(
+        policy=_policy(job, stack),
+        executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
+        occupies=job.executors is not None or job.execution is not None,
+        execution=tuple(rules),
+        seed=job.seed,
+        start_ns=start_ns,
+    )
+
+
+def _policy(job: Job, stack: ExitStack) -> Policy:
+    spec = job.policy
+    if spec is None or spec.order == "fifo":
+        return Fifo()
+    if spec.order == "rate_monotonic":
+        return RateMonotonic()
+    if spec.order == "permutation":
+        return Permutation(Stream(job.seed, "permutation"))
+    if spec.priority is not None:
+        rules = [PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in spec.priority]
+        return Priority(rules)
+    if spec.recorded is not None:
+        return _recorded(job, job.resolve(spec.recorded), stack)
+    return _own(job, spec.function)
+
+
+def _recorded(job: Job, path: Path, stack: ExitStack) -> Policy:
+    where = locate(job, ("policy", "recorded"))
+    try:
+        trace = stack.enter_context(Trace.open(path))
+        trace.check()
+    except TraceError as error:
+        raise JobError(str(error), where=where) from None
+    events = _events(trace)
+    seen: list[RecordedEvent] = []
+
+    def event(index: int) -> RecordedEvent | None:
+        while len(seen) <= index:
+            following = next(events, None)
+            if following is None or following.kind == EventKind.SHUTDOWN:
+                return None
+            seen.append(following)
+        return seen[index]
+
+    return Recorded(event, path.name)
+
+
+def _events(trace: Trace) -> Iterator[RecordedEvent]:
+    names = {}
+    for entity in trace.entities.values():
+        node = trace.node_of(entity).name if entity.node else ""
+        names[entity.id] = f"{node}: {entity.kind.label} {entity.name}"
+    for rows in trace.events():
+        for stamp, kind, entity_id in zip(
+            rows["stamp"].tolist(), rows["kind"].tolist(), rows["entity"].tolist(), strict=True
+        ):
+            yield RecordedEvent(stamp, kind, entity_id, names.get(entity_id, "the run"))
+
+
+def _own(job: Job, function: Any) -> Policy:
+    where = locate(job, ("policy", "function"))
+    if isinstance(function, str):
+        from rsltrace.ros.world import load_target
+
+        function = load_target(function, where=where)
+    try:
+        policy: Any = function()
+    except Exception as error:
+        raise JobError(
+            f"the policy cannot be made: {type(error).__qualname__}: {error}", where=where
+        ) from error
+    if not callable(getattr(policy, "choose", None)):
+        raise JobError(
+            f"a {type(policy).__qualname__} has no method choose(ready, moment): see "
+            "docs/policies.md",
+            where=where,
+        )
+    return policy  # type: ignore[no-any-return]
