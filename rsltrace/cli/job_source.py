@@ -80,7 +80,10 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def job_of(
-    words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]
+    words: Sequence[str],
+    launch: Path | None,
+    skip: bool,
+    overrides: Sequence[str | tuple[str, str]],
 ) -> tuple[Job, Path]:
     """Return the job, and the path of the file that names it.
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
-from rsltrace.errors import JobError, NodeError
+from rsltrace.errors import NodeError
 from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
@@ -64,8 +64,8 @@ def record(
     """
     from rsltrace.run import Observer, run
 
-    job, named = job_of(words, launch, skip, overrides)
-    loaded = _changed(job, seed=seed, until=until)
+    changes = _all_overrides(overrides, seed, until)
+    loaded, named = job_of(words, launch, skip, changes)
     if print_job:
         _print_job(loaded)
         return
@@ -102,20 +102,17 @@ def default_output(job: Path) -> Path:
     return Path(f"{stem or 'run'}.mcap")
 
 
-def _changed(job: Job, *, seed: int | None, until: str | None) -> Job:
-    """Return the job with the command line's values in place of its own."""
-    changes: dict[str, Any] = {}
+def _all_overrides(
+    overrides: tuple[str, ...], seed: int | None, until: str | None
+) -> list[str | tuple[str, str]]:
+    """Return what the command line says of the job, the short options last."""
+    found: list[str | tuple[str, str]] = list(overrides)
     if seed is not None:
-        changes["seed"] = seed
+        found.append(("--seed", f"seed={seed}"))
     if until is not None:
-        from rsltrace.job import StopSpec
-
-        try:
-            given = StopSpec(time=f"{until}s" if until[-1:].isdigit() else until)
-        except JobError as error:
-            raise JobError(str(error).replace("StopSpec: time", "--until", 1)) from None
-        changes["stop"] = job.stop.model_copy(update={"time_ns": given.time_ns})
-    return job.model_copy(update=changes) if changes else job
+        time = f"{until}s" if until[-1:].isdigit() else until
+        found.append(("--until", f"stop.time={json.dumps(time)}"))
+    return found
 
 
 def _note(text: str) -> None:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.job import Job
     from rsltrace.job.launch_spec import LaunchSpec
-    from rsltrace.job.load import job_from_text, load_job, locate
+    from rsltrace.job.load import job_from_text, load_job, locate, showing_line
     from rsltrace.job.node import NodeSpec
     from rsltrace.job.spec import RecordSpec, StopSpec, TopicStop
 
@@ -30,6 +30,7 @@ _HOMES = {
     "job_from_text": "load",
     "load_job": "load",
     "locate": "load",
+    "showing_line": "load",
     "policy_of": "guard",
 }
 
@@ -48,6 +49,7 @@ __all__ = [
     "load_job",
     "locate",
     "policy_of",
+    "showing_line",
 ]
 
 

@@ -127,7 +127,7 @@ def compose(
     composed.root = _with_others(composed.root, name, read, early, [], composed)
     for label, override in overrides:
         composed.root = apply_override(composed.root, label, override, folder=os.getcwd())
-        composed.overrides.append(f"{label} {override}" if label == "--set" else label)
+        composed.overrides.append(f"{label} {override}")
     values = dict(composed.root.value)
     variables = values.get("vars")
     late = Substitution(variables.value if variables is not None and _is_mapping(variables) else {})

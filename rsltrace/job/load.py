@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -17,14 +18,17 @@ from rsltrace.job.problems import Problem, format_loc, problems_of, unknown_key
 from rsltrace.job.tree import Item, Place, YamlSource, place_at, plain
 from rsltrace.job.yaml_source import parse_yaml
 
+Overrides = Sequence["str | tuple[str, str]"]
+
 SIZE_MAX = 16 << 20
 """A job file of more bytes is something else."""
 
 
-def load_job(path: str | os.PathLike[str], *, overrides: Sequence[str] = ()) -> Job:
+def load_job(path: str | os.PathLike[str], *, overrides: Overrides = ()) -> Job:
     """Return the job in the YAML file ``path``; relative paths in it start at its folder.
 
-    ``overrides`` are ``key=value`` texts as of ``--set``. Imports neither rclpy nor user code.
+    ``overrides`` are ``key=value`` texts as of ``--set``, or pairs of what messages call one and
+    the text. Imports neither rclpy nor user code.
     Raises ``JobError`` with ``file:line:column``, the line itself and what is expected; several
     mistakes are reported together, in the order of the file.
     """
@@ -33,7 +37,7 @@ def load_job(path: str | os.PathLike[str], *, overrides: Sequence[str] = ()) -> 
 
 
 def job_from_text(
-    text: str, name: str, folder: str | os.PathLike[str], *, overrides: Sequence[str] = ()
+    text: str, name: str, folder: str | os.PathLike[str], *, overrides: Overrides = ()
 ) -> Job:
     """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``."""
     base_dir = os.path.abspath(folder)
@@ -44,10 +48,9 @@ def job_from_text(
     return _load(name, base_dir, read, overrides)
 
 
-def _load(
-    name: str, base_dir: str, read: Callable[[str], YamlSource], overrides: Sequence[str]
-) -> Job:
-    composed = compose(name, read, [("--set", override) for override in overrides])
+def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides: Overrides) -> Job:
+    labelled = [("--set", text) if isinstance(text, str) else text for text in overrides]
+    composed = compose(name, read, labelled)
     given = plain(composed.root, base_dir)
     assert isinstance(given, dict)
 
@@ -140,12 +143,30 @@ def locate(job: Job, loc: tuple[str | int, ...]) -> str:
     For mistakes that show only when the run begins. A job built in Python has no lines; its parts
     are named instead: ``<python>: nodes[0].node``.
     """
-    if job.composed is not None:
-        place = place_at(job.composed.root, loc)
-    elif job.given_text is not None:
-        root = parse_yaml(job.given_text, job.source_name).root
-        assert root is not None, "the text has been a job"
-        place = place_at(root, loc)
-    else:
+    place = _place(job, loc)
+    if place is None:
         return f"{job.source_name}: {format_loc(loc)}"
     return place.source.where(place.mark)
+
+
+@contextmanager
+def showing_line(job: Job, loc: tuple[str | int, ...]) -> Iterator[None]:
+    """Add the line of the job to a ``JobError`` that is raised about the part at ``loc``."""
+    try:
+        yield
+    except JobError as error:
+        place = _place(job, loc)
+        if place is None or error.where != place.source.where(place.mark):
+            raise
+        message = str(error).removeprefix(f"{error.where}: ")
+        raise place.error(message) from error.__cause__
+
+
+def _place(job: Job, loc: tuple[str | int, ...]) -> Place | None:
+    if job.composed is not None:
+        return place_at(job.composed.root, loc)
+    if job.given_text is None:
+        return None
+    root = parse_yaml(job.given_text, job.source_name).root
+    assert root is not None, "the text has been a job"
+    return place_at(root, loc)

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, JobError, RunError
-from rsltrace.job import Job, locate, policy_of
+from rsltrace.job import Job, locate, policy_of, showing_line
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
@@ -276,25 +276,27 @@ def _prepare(job: Job) -> list[Entry]:
     mains = Mains()
     for_all = _arguments_for_all(job)
     for index, spec in enumerate(job.nodes):
-        where = spec.origin or locate(job, ("nodes", index, spec.kind))
-        arguments = ros_arguments(
-            name=spec.name,
-            namespace=spec.namespace,
-            parameters=spec.parameters,
-            parameter_files=[job.resolve(path) for path in spec.parameter_files],
-            remappings=spec.remappings,
-            where=where,
-            for_all=for_all,
-        )
-        make: Any
+        loc = ("nodes", index, spec.kind)
+        where = spec.origin or locate(job, loc)
         argv = None
-        if isinstance(spec.arguments, tuple) or spec.node is None:
-            name, make = mains.find(spec, where=where)
-            argv = [name, *spec.arguments]
-        else:
-            target = spec.node
-            found = load_target(target, where=where) if isinstance(target, str) else target
-            make = partial(found, **spec.arguments)
+        make: Any
+        with showing_line(job, loc):
+            arguments = ros_arguments(
+                name=spec.name,
+                namespace=spec.namespace,
+                parameters=spec.parameters,
+                parameter_files=[job.resolve(path) for path in spec.parameter_files],
+                remappings=spec.remappings,
+                where=where,
+                for_all=for_all,
+            )
+            if isinstance(spec.arguments, tuple) or spec.node is None:
+                name, make = mains.find(spec, where=where)
+                argv = [name, *spec.arguments]
+            else:
+                target = spec.node
+                found = load_target(target, where=where) if isinstance(target, str) else target
+                make = partial(found, **spec.arguments)
         entries.append(
             Entry(
                 spec.target,

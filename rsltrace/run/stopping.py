@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
-from rsltrace.job import Job, locate
+from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.sizes import format_size
 from rsltrace.loop.stop import (
     Progress,
@@ -59,7 +59,8 @@ def stop_conditions(
         if isinstance(function, str):
             from rsltrace.ros.world import load_target
 
-            function = load_target(function, where=locate(job, ("stop", "function")))
+            with showing_line(job, ("stop", "function")):
+                function = load_target(function, where=locate(job, ("stop", "function")))
         else:
             name = f"{function.__module__}:{function.__qualname__}"
         yield stop_when(_within(outside_events, function), name)
