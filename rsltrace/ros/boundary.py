@@ -81,6 +81,7 @@ class Boundary:
         self.real = real
         self._core: Core | None = None
         self._last_now_ns = 0
+        self._signals = real.SignalHandlerOptions.NO
         self.ros_clocks: list[weakref.ref[ClockHandle]] = []
         for name in _PASSED_THROUGH:
             if hasattr(real, name):
@@ -331,13 +332,13 @@ class Boundary:
     # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
 
     def install_signal_handlers(self, options: Any) -> None:
-        pass
+        self._signals = options
 
     def uninstall_signal_handlers(self) -> None:
-        pass
+        self._signals = self.real.SignalHandlerOptions.NO
 
     def get_current_signal_handlers_options(self) -> Any:
-        return self.real.SignalHandlerOptions.NO
+        return self._signals
 
     def register_sigint_guard_condition(self, guard: Any) -> None:
         pass

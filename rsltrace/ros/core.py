@@ -28,6 +28,7 @@ from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
 from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
 from rsltrace.ros.program import Program, failure_of
+from rsltrace.ros.waitables import OWN_WAITABLES, sync_waitables
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
@@ -302,12 +303,14 @@ class Core:
             if handle.wrapper is None:
                 handle.node = handle.node or node
                 handle.find_wrapper()
+        sync_waitables(self, node)
 
     def deactivate_node(self, node: NodeHandle) -> None:
         """Stop running the callbacks of a node; what it has received stays in its queues."""
         for handle in _handles(node):
             handle.deactivate()
         node.wrapper = None
+        sync_waitables(self, node)
 
     def channel(
         self, topic: str, type_name: str, schema: Callable[[], tuple[str, str]], qos_yaml: str
@@ -510,7 +513,7 @@ def _handles(node: NodeHandle) -> Iterator[Any]:
         for wrapper in getattr(node.wrapper, lists):
             yield wrapper.handle
     for waitable in node.wrapper.waitables:
-        for name in ("_EventHandler__event", "_handle", "_client_handle"):
+        for name in OWN_WAITABLES:
             handle = getattr(waitable, name, None)
             if handle is not None:
                 yield from getattr(handle, "parts", [handle])

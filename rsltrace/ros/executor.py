@@ -9,6 +9,7 @@ from rclpy.executors import Executor
 from rsltrace.ros.blocking import FutureWake, SimEvent, wait
 from rsltrace.ros.own_executors import is_bookkeeping
 from rsltrace.ros.tasks import Resume, create_task
+from rsltrace.ros.waitables import sync_waitables
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -53,7 +54,9 @@ class SimExecutor(Executor):  # type: ignore[misc]
         return list(self._sim_nodes)
 
     def wake(self) -> None:
-        """Do nothing: the loop sees every change at once."""
+        """Look for waitables that have come or gone: the loop sees all other changes at once."""
+        for node in self._sim_nodes:
+            sync_waitables(self._core, node.handle)
 
     def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
         """Wait in simulated time until the future is done; others run meanwhile."""

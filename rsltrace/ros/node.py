@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.mailbox import Mailbox
     from rsltrace.ros.pubsub import PublisherHandle
+    from rsltrace.ros.waitables import UserWaitable
 
 
 class NodeHandle(EntityHandle):
@@ -82,6 +83,8 @@ class NodeHandle(EntityHandle):
         self.rosout: PublisherHandle | None = None
         self.log_exceptions = core.log_exceptions or program.log_exceptions
         self.actions: list[Any] = []
+        self.user_waitables: dict[Any, UserWaitable] = {}
+        self.waitable_count = 0
         core.graph.nodes.append(self)
         core.current_node = self
         self._set_log_levels()

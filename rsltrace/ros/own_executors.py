@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.ros.pump import pump_of
 from rsltrace.ros.tasks import Resume, create_task
+from rsltrace.ros.waitables import sync_waitables
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -69,7 +70,10 @@ def _methods(core: Core, real: dict[str, Any]) -> dict[str, Callable[..., Any]]:
         return list(pump_of(core, self).nodes)
 
     def wake(self: Any) -> None:
-        pump_of(core, self).wake()
+        pump = pump_of(core, self)
+        for node in pump.nodes:
+            sync_waitables(core, node.handle)
+        pump.wake()
 
     def shutdown(self: Any, timeout_sec: float | None = None) -> bool:
         done: bool = real["shutdown"](self, timeout_sec)

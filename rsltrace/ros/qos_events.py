@@ -89,7 +89,7 @@ class EventHandle(EntityHandle):
         return self._events.news(self._name)
 
     def take_event(self) -> Any:
-        """Return the status, or None if there is nothing new."""
+        """Return the status; its changes are those since the last time."""
         return self._events.take(self._name)
 
     def dispatch(self) -> None:
@@ -106,9 +106,9 @@ class EventHandle(EntityHandle):
             core.park(group, lambda: core.loop.ready.appendleft(self))
             return
         self._queued = False
-        status = self.take_event()
-        if status is None:
+        if not self.has_news():
             return
+        status = self.take_event()
         callback = wrapper.callback
         if is_coroutine_function(callback):
             begin(group, wrapper)

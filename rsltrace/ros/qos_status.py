@@ -97,10 +97,8 @@ class EndpointEvents:
         return status is not None and any(getattr(status, field) for field in _changes(status))
 
     def take(self, name: str) -> Any:
-        """Return the status and forget its changes; None if there is nothing new."""
-        if not self.news(name):
-            return None
-        status = self._statuses[name]
+        """Return the status and forget its changes."""
+        status = self._status(name)
         taken = replace(status)
         for field in _changes(status):
             setattr(status, field, 0)

@@ -90,10 +90,7 @@ class WaitSetHandle(Destroyable):
             core = self._core
             until_ns = None if timeout_ns < 0 else core.loop.now_ns + timeout_ns
             news = SimEvent(core, self._wanted())
-            with ExitStack() as stack:
-                for kind, entities in self._entities.items():
-                    for handle in entities:
-                        stack.enter_context(_WATCH[kind](handle, news.set))
+            with self.watched(news.set):
                 while not self._look() and (until_ns is None or core.loop.now_ns < until_ns):
                     news.clear()
                     news.wait_ns(self._patience_ns(until_ns))
@@ -102,6 +99,28 @@ class WaitSetHandle(Destroyable):
         ):
             if found:
                 guard.take_trigger()
+
+    def members(self) -> list[Any]:
+        """Return the entities, in the order in which kinds and entities are looked at."""
+        return [handle for entities in self._entities.values() for handle in entities]
+
+    @contextmanager
+    def watched(self, alarm: Callable[[], None]) -> Iterator[None]:
+        """Within the ``with`` block, call ``alarm`` whenever something comes for an entity."""
+        with ExitStack() as stack:
+            for kind, entities in self._entities.items():
+                for handle in entities:
+                    stack.enter_context(_WATCH[kind](handle, alarm))
+            yield
+
+    def ready_now(self) -> list[tuple[str, Any]]:
+        """Return the kind and the entity of whatever is ready."""
+        return [
+            (kind, handle)
+            for kind, entities in self._entities.items()
+            for handle in entities
+            if not handle._destroyed and _IS_READY[kind](handle)
+        ]
 
     def _look(self) -> bool:
         """See what is ready; return whether anything is."""

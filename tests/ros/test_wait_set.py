@@ -7,9 +7,15 @@ from typing import Any
 
 import pytest
 import rclpy
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from rclpy.task import Future
 from rclpy.wait_for_message import wait_for_message
+from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
@@ -151,3 +157,83 @@ def test_a_wait_set_of_everything(simulate: Callable[..., Any]) -> None:
         (0.6, ["client"]),
         (0.6, ["client"]),
     ]
+
+
+class Both(Waitable):
+    """A waitable of a user's own: ready when a message has come, or its timer is due."""
+
+    def __init__(self, node: Node, log: list[Any]) -> None:
+        super().__init__(MutuallyExclusiveCallbackGroup())
+        self.node, self.log = node, log
+        real = rclpy_implementation
+        qos = QoSProfile(depth=10).get_c_qos_profile()
+        self.subscription = real.Subscription(node.handle, UInt64, "count", qos)
+        self.clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.timer = real.Timer(self.clock.handle, node.context.handle, 400_000_000, True)
+        self.found: list[str] = []
+
+    def add_to_wait_set(self, wait_set: Any) -> None:
+        self.indices = (
+            wait_set.add_subscription(self.subscription),
+            wait_set.add_timer(self.timer),
+        )
+
+    def is_ready(self, wait_set: Any) -> bool:
+        kinds = zip(("subscription", "timer"), self.indices, strict=True)
+        self.found = [kind for kind, index in kinds if wait_set.is_ready(kind, index)]
+        return bool(self.found)
+
+    def take_data(self) -> list[Any]:
+        taken: list[Any] = []
+        if "subscription" in self.found:
+            taken.append(self.subscription.take_message(UInt64, False)[0].data)
+        if "timer" in self.found:
+            self.timer.call_timer()
+            taken.append("timer")
+        return taken
+
+    async def execute(self, taken: list[Any]) -> None:
+        self.log.append((seconds(self.node), taken))
+
+    def get_num_entities(self) -> NumberOfEntities:
+        return NumberOfEntities(1, 0, 1, 0, 0)
+
+
+EXPECTED = [(0.4, ["timer"]), (0.8, ["timer"]), (1.0, [1]), (1.2, ["timer"]), (1.6, ["timer"])]
+
+
+def test_a_waitable_of_a_users_own(simulate: Callable[..., Any]) -> None:
+    log: list[Any] = []
+
+    class Owner(Node):
+        def __init__(self) -> None:
+            super().__init__("owner")
+            self.both = Both(self, log)
+            self.add_waitable(self.both)
+            self.create_timer(1.7, self.stop)
+
+        def stop(self) -> None:
+            self.remove_waitable(self.both)
+
+    run = simulate(Counter, Owner, duration=4)
+    assert log == EXPECTED
+    kinds = [event.kind.label for event in run.events() if event.cause_event != 2**64 - 1]
+    assert "subscription" in kinds
+
+
+def test_a_waitable_that_an_executor_of_ones_own_runs(simulate: Callable[..., Any]) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("owner")
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        both = Both(node, log)
+        node.add_waitable(both)  # the executor has the node already
+        executor.spin_until_future_complete(Future(), timeout_sec=1.7)
+        node.remove_waitable(both)
+        executor.spin_until_future_complete(Future(), timeout_sec=1.7)
+
+    simulate(Counter, main_spec(program), duration=4)
+    assert log == EXPECTED
