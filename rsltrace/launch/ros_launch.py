@@ -19,6 +19,7 @@ from rsltrace.errors import JobError
 from rsltrace.launch.model import Argument, Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.launch.scope import ParameterFile, Parameters
+from rsltrace.launch.values import yaml_value
 
 _NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
 _PROCESS = "other programs do not run in a simulation"
@@ -45,7 +46,9 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
         context.launch_configurations.update(arguments)
         visitor = _Visitor(context, path)
         try:
-            visitor.visit(IncludeLaunchDescription(AnyLaunchDescriptionSource(str(path))))
+            source = AnyLaunchDescriptionSource(str(path))
+            given = list(arguments.items())
+            visitor.visit(IncludeLaunchDescription(source, launch_arguments=given))
         except JobError:
             raise
         except Exception as error:
@@ -167,13 +170,13 @@ class _Visitor:
         for text, is_file in node._Node__expanded_parameter_arguments or ():
             if not is_file:
                 key, _, value = text.partition(":=")
-                from rsltrace.launch.values import yaml_value
-
                 found.append({key: yaml_value(value)})
             elif Path(text).parent == Path(tempfile.gettempdir()):
                 # What was given as values, launch has written to a file of its own.
-                found.append(parameters_for(text, full_name))
-                Path(text).unlink(missing_ok=True)
+                try:
+                    found.append(parameters_for(text, full_name))
+                finally:
+                    Path(text).unlink(missing_ok=True)
             else:
                 found.append(ParameterFile(text))
         return tuple(found)

@@ -5,12 +5,24 @@ from __future__ import annotations
 from typing import Any
 
 from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import YAMLError
+
+
+class _Constructor(SafeConstructor):
+    """Reads what ROS's launch writes, too: it has tuples where a file has lists."""
+
+
+_Constructor.add_constructor(
+    "tag:yaml.org,2002:python/tuple",
+    lambda constructor, node: constructor.construct_sequence(node, deep=True),
+)
 
 
 def yaml_value(text: str) -> Any:
     """Return what YAML 1.1 (that of ROS) reads, or the text itself where it is not YAML."""
     yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _Constructor
     yaml.version = (1, 1)
     try:
         return yaml.load(text)

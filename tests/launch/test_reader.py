@@ -18,66 +18,9 @@ def node_specs(launched: Launched, *, skip_unsupported: bool) -> list[NodeSpec]:
     return specs_of(launched, skip_unsupported=skip_unsupported, why_not=why_not)
 
 
-XML = """
-<launch>
-  <arg name="robot" default="husky" description="which one">
-    <choice value="husky"/><choice value="jackal"/>
-  </arg>
-  <arg name="use_camera" default="true"/>
-  <let name="prefix" value="$(var robot)_sim"/>
-  <set_parameter name="shared" value="7"/>
-  <set_remap from="tf" to="/tf_all"/>
-  <group>
-    <push_ros_namespace namespace="$(var prefix)"/>
-    <node pkg="demo" exec="talker" name="talk" args="--loud 'two words'" output="screen">
-      <param name="rate" value="2.5"/>
-      <param name="text" value="12" type="str"/>
-      <param name="nested">
-        <param name="list" value="[1, 2]"/><param name="on" value="true"/>
-      </param>
-      <remap from="chatter" to="/chat"/>
-    </node>
-    <node pkg="demo" exec="listener" namespace="/abs" unless="$(not $(var use_camera))"/>
-  </group>
-  <node pkg="demo" exec="listener" name="last" if="$(equals $(var robot) jackal)"
-        ros_args="-r __ns:=/given -p a.b:=3 -r x:=y --params-file extra.yaml"/>
-</launch>
-"""
-
-YAML = """
-launch:
-  - arg:
-      name: robot
-      default: husky
-      description: which one
-      choice: [{value: husky}, {value: jackal}]
-  - arg: {name: use_camera, default: 'true'}
-  - let: {name: prefix, value: $(var robot)_sim}
-  - set_parameter: {name: shared, value: 7}
-  - set_remap: {from: tf, to: /tf_all}
-  - group:
-      - push_ros_namespace: {namespace: $(var prefix)}
-      - node:
-          pkg: demo
-          exec: talker
-          name: talk
-          args: --loud 'two words'
-          output: screen
-          param:
-            - {name: rate, value: 2.5}
-            - {name: text, value: '12', type: str}
-            - name: nested
-              param: [{name: list, value: [1, 2]}, {name: on, value: true}]
-          remap: [{from: chatter, to: /chat}]
-      - node: {pkg: demo, exec: listener, namespace: /abs, unless: $(not $(var use_camera))}
-  - node:
-      pkg: demo
-      exec: listener
-      name: last
-      if: $(equals $(var robot) jackal)
-      ros_args: -r __ns:=/given -p a.b:=3 -r x:=y --params-file extra.yaml
-"""
-
+FILES = Path(__file__).parent / "files"
+XML = (FILES / "everything.launch.xml").read_text(encoding="utf-8")
+YAML = (FILES / "everything.launch.yaml").read_text(encoding="utf-8")
 BOTH = pytest.mark.parametrize(("text", "name"), [(XML, "a.launch.xml"), (YAML, "a.launch.yaml")])
 
 
@@ -95,7 +38,7 @@ def test_everything_at_once(read: Any, prefix: Path, text: str, name: str) -> No
             {"shared": 7},
             {"rate": 2.5},
             {"text": "12"},
-            {"nested": {"list": [1, 2], "on": True}},
+            {"nested": {"list": [1, 2], "flag": True}},
         ),
         remappings=(("tf", "/tf_all"), ("chatter", "/chat")),
         arguments=("--loud", "two words"),
@@ -117,7 +60,7 @@ def test_everything_at_once(read: Any, prefix: Path, text: str, name: str) -> No
             "rate": 2.5,
             "text": "12",
             "nested.list": [1, 2],
-            "nested.on": True,
+            "nested.flag": True,
         },
         remappings={"tf": "/tf_all", "chatter": "/chat"},
         arguments=["--loud", "two words"],

@@ -1,0 +1,156 @@
+"""Launch files evaluated by ROS's own launch, where it is installed; and that the reader which
+needs no ROS means the same by them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.errors import JobError
+from rsltrace.launch import ros_launch
+from rsltrace.launch.model import Launched
+from rsltrace.launch.reader import read_launch_file
+from rsltrace.launch.specs import node_specs
+
+pytest.importorskip("launch_ros", reason="needs ROS's launch and launch_ros")
+
+FILES = Path(__file__).parent / "files"
+XML = (FILES / "everything.launch.xml").read_text(encoding="utf-8")
+YAML = (FILES / "everything.launch.yaml").read_text(encoding="utf-8")
+
+PYTHON = """
+import os
+from launch import LaunchDescription
+from launch.actions import (DeclareLaunchArgument, ExecuteProcess, GroupAction, OpaqueFunction,
+                            IncludeLaunchDescription, RegisterEventHandler, SetEnvironmentVariable,
+                            TimerAction)
+from launch.conditions import IfCondition, UnlessCondition
+from launch.event_handlers import OnProcessExit
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution, ThisLaunchFileDir
+from launch_ros.actions import (ComposableNodeContainer, LifecycleNode, Node, PushRosNamespace,
+                                SetParameter, SetRemap)
+from launch_ros.descriptions import ComposableNode, ParameterFile
+from launch_ros.substitutions import FindPackageShare
+
+def more(context):
+    robot = LaunchConfiguration('robot').perform(context)
+    return [Node(package='demo', executable='listener', name='opaque_' + robot)]
+
+def generate_launch_description():
+    robot = LaunchConfiguration('robot')
+    talker = Node(
+        package='demo', executable='talker', name='talk', output='screen',
+        arguments=['--loud', robot], ros_arguments=['--log-level', 'warn'],
+        parameters=[{'rate': 2.5, 'nested': {'list': [1, 2]}, 'text': robot, 'number': '12'},
+                    PathJoinSubstitution([FindPackageShare('demo'), 'config', 'demo.yaml'])],
+        remappings=[('chatter', '/chat')])
+    return LaunchDescription([
+        DeclareLaunchArgument('robot', default_value='husky', description='which one',
+                              choices=['husky', 'jackal']),
+        DeclareLaunchArgument('camera', default_value='true'),
+        SetEnvironmentVariable('RSLTRACE_T', 'set'),
+        SetParameter('shared', 7),
+        GroupAction([
+            PushRosNamespace(robot), SetRemap('tf', '/tf_all'), talker,
+            Node(package='demo', executable='listener', namespace='/abs',
+                 condition=IfCondition(LaunchConfiguration('camera'))),
+            LifecycleNode(package='demo', executable='talker', name='cycle', namespace='life'),
+        ]),
+        OpaqueFunction(function=more),
+        ComposableNodeContainer(
+            package='rclcpp_components', executable='component_container', name='c', namespace='',
+            composable_node_descriptions=[
+                ComposableNode(package='demo', plugin='demo.nodes.Filter', name='f',
+                               parameters=[{'gain': 3}], remappings=[('in', 'out')]),
+                ComposableNode(package='demo', plugin='demo::Fast'),
+            ]),
+        IncludeLaunchDescription(
+            AnyLaunchDescriptionSource([ThisLaunchFileDir(), '/sub.launch.xml']),
+            launch_arguments={'who': robot}.items()),
+        ExecuteProcess(cmd=['echo', robot], condition=UnlessCondition('false')),
+        TimerAction(period=1.0, actions=[talker]),
+        RegisterEventHandler(OnProcessExit(target_action=talker, on_exit=[talker])),
+    ])
+"""
+
+SUB = "<launch><arg name='who'/><node pkg='demo' exec='talker' name='sub_$(var who)'/></launch>"
+
+
+@pytest.fixture
+def evaluate(write: Callable[..., Path], prefix: Path) -> Callable[..., Launched]:
+    def go(text: str, name: str, **arguments: str) -> Launched:
+        write(SUB, "sub.launch.xml")
+        path = write(text, name)
+        assert ros_launch.can_read(path)
+        return ros_launch.read_launch_file(path, arguments)
+
+    return go
+
+
+def test_a_python_launch_file(evaluate: Any) -> None:
+    launched = evaluate(PYTHON, "a.launch.py", robot="jackal")
+    assert "RSLTRACE_T" not in os.environ
+    specs = node_specs(launched, skip_unsupported=True, why_not=lambda package, name: None)
+    names = [(spec.target, spec.namespace, spec.name) for spec in specs]
+    assert names == [
+        ("demo/talker", "/jackal", "talk"),
+        ("demo/listener", "/abs", None),
+        ("demo/talker", "/jackal/life", "cycle"),
+        ("demo/listener", None, "opaque_jackal"),
+        ("demo.nodes:Filter", None, "f"),
+        ("demo/talker", None, "sub_jackal"),
+    ]
+    talk, component = specs[0], specs[4]
+    # The file gives rate once more, after the values.
+    assert talk.parameters == {
+        "shared": 7,
+        "nested.list": (1, 2),
+        "text": "jackal",
+        "number": "12",
+    }
+    assert [Path(file).name for file in talk.parameter_files] == ["demo.yaml"]
+    assert talk.arguments == ("--loud", "jackal")
+    assert talk.remappings == {"tf": "/tf_all", "chatter": "/chat"}
+    assert (component.parameters, component.remappings) == ({"shared": 7, "gain": 3}, {"in": "out"})
+    assert {item.what for item in launched.unsupported} == {
+        "process 'echo jackal'",
+        "TimerAction",
+        "RegisterEventHandler",
+        "demo/demo::Fast",
+    }
+    assert list(launched.arguments) == ["robot", "camera", "who"]
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [(XML, "a.launch.xml"), (YAML, "a.launch.yaml"), (SUB, "s.launch.xml")]
+)
+@pytest.mark.parametrize("robot", ["husky", "jackal"])
+def test_both_readers_agree(
+    evaluate: Any, write: Any, text: str, name: str, robot: str, tmp_path: Path
+) -> None:
+    write("/**: {ros__parameters: {z: 1}}", "extra.yaml")
+    arguments = {"robot": robot, "who": robot, "use_camera": "true"}
+    ros = evaluate(text, name, **arguments)
+    own = read_launch_file(tmp_path / name, arguments)
+
+    def specs(launched: Launched) -> list[Any]:
+        nodes = [replace(node, where="") for node in launched.nodes]
+        return node_specs(
+            replace(launched, nodes=nodes), skip_unsupported=True, why_not=lambda p, e: None
+        )
+
+    assert specs(ros) == specs(own)
+    assert set(ros.arguments) == set(own.arguments)
+
+
+def test_mistakes_name_the_file(evaluate: Any) -> None:
+    with pytest.raises(JobError, match=r"a\.launch\.py: .*not valid"):
+        evaluate(PYTHON, "a.launch.py", robot="tank")
+    with pytest.raises(JobError, match="ZeroDivisionError"):
+        evaluate("def generate_launch_description():\n    1 / 0\n", "b.launch.py")
