@@ -30,6 +30,7 @@ _COMMANDS = {
     "cat": "Print the events of a trace, one per line.",
     "view": "Look at a trace in the terminal, or at two side by side.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
+    "export": "Write the messages of a trace as a plain rosbag2 bag.",
     "diff": "Find where two runs (or recordings) first part, and why.",
 }
 """Each is the function of its name in the module of its name, beside this one."""

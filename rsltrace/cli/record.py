@@ -32,7 +32,13 @@ if TYPE_CHECKING:
     type=click.Path(path_type=Path),
     help="Trace to write (default: the job file's folder name or name, with .mcap, here).",
 )
-@click.option("--force", is_flag=True, help="Overwrite an existing trace.")
+@click.option(
+    "--bag",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Write the messages as a plain rosbag2 bag, too.",
+)
+@click.option("--force", is_flag=True, help="Overwrite an existing trace, and bag.")
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
@@ -43,6 +49,7 @@ def record(
     launch: Path | None,
     skip: bool,
     output: Path | None,
+    bag: Path | None,
     force: bool,
     seed: int | None,
     until: str | None,
@@ -62,6 +69,7 @@ def record(
     The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
     130 or 143 if interrupted.
     """
+    from rsltrace.bag.export import check_bag_folder, export_bag
     from rsltrace.run import Observer, run
 
     changes = _all_overrides(overrides, seed, until)
@@ -72,6 +80,8 @@ def record(
     if not loaded.guard.enabled:
         unpin()
     path = output or default_output(named)
+    if bag is not None:
+        check_bag_folder(bag, force=force)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(
             loaded,
@@ -81,6 +91,9 @@ def record(
             observer=Observer(progress=on_progress, interrupt=on_interrupt, note=_note),
         )
     _report(result, path, as_json=as_json)
+    if bag is not None:
+        count = export_bag(path, bag, force=force)
+        click.echo(f"wrote {bag}: {count} messages", err=True)
     sys.exit(result.exit_code)
 
 

@@ -20,7 +20,7 @@ BAG_METADATA_VERSION = 9
 FILE_NAME = "trace.mcap"
 KEY = "serialized_metadata"
 
-_PLAIN = re.compile(r"[/A-Za-z_][/A-Za-z0-9_]*")
+_PLAIN = re.compile(r"[/A-Za-z_][/A-Za-z0-9_]*(?:\.mcap)?")
 _NOT_TEXT = frozenset(("null", "true", "false", "yes", "no", "on", "off", "y", "n"))
 
 
@@ -36,9 +36,14 @@ class BagTopic:
 
 
 def bag_metadata_yaml(
-    topics: Sequence[BagTopic], *, start_ns: int, duration_ns: int, ros_distro: str
+    topics: Sequence[BagTopic],
+    *,
+    start_ns: int,
+    duration_ns: int,
+    ros_distro: str,
+    file_name: str = FILE_NAME,
 ) -> str:
-    """Return the YAML of a bag whose only file is this trace. Times are in nanoseconds."""
+    """Return the YAML of a bag whose only file is ``file_name``. Times are in nanoseconds."""
     message_count = sum(topic.message_count for topic in topics)
     lines = [
         f"version: {BAG_METADATA_VERSION}",
@@ -64,9 +69,9 @@ def bag_metadata_yaml(
         'compression_format: ""',
         'compression_mode: ""',
         "relative_file_paths:",
-        f"  - {FILE_NAME}",
+        f"  - {_scalar(file_name)}",
         "files:",
-        f"  - path: {FILE_NAME}",
+        f"  - path: {_scalar(file_name)}",
         "    starting_time:",
         f"      nanoseconds_since_epoch: {start_ns}",
         "    duration:",
