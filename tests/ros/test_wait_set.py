@@ -210,9 +210,10 @@ def test_a_waitable_of_a_users_own(simulate: Callable[..., Any]) -> None:
             super().__init__("owner")
             self.both = Both(self, log)
             self.add_waitable(self.both)
-            self.create_timer(1.7, self.stop)
+            self.once = self.create_timer(1.7, self.stop)
 
         def stop(self) -> None:
+            self.once.cancel()
             self.remove_waitable(self.both)
 
     run = simulate(Counter, Owner, duration=4)
