@@ -64,7 +64,7 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 "overrides",
                 multiple=True,
                 metavar="KEY=VALUE",
-                help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.",
+                help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.0.",
             ),
             click.option(
                 "--ros-args",

@@ -65,7 +65,8 @@ class Identity:
 
 def identify(a: Trace, b: Trace) -> Identity:
     """Match the entities of two runs. Reads all entities of both."""
-    keys_a, keys_b = _keys(a), _keys(b)
+    classes_a, classes_b = _classes(a), _classes(b)
+    keys_a, keys_b = _keys(a, classes_b), _keys(b, classes_a)
     by_key: dict[EntityKey, int] = {}
     for key in (*keys_a.values(), *keys_b.values()):
         by_key.setdefault(key, len(by_key))
@@ -90,12 +91,24 @@ def identify(a: Trace, b: Trace) -> Identity:
     )
 
 
-def _keys(trace: Trace) -> dict[int, EntityKey]:
-    """Return the key of every entity, by id, in creation order."""
+def _classes(trace: Trace) -> dict[str, str]:
+    """Return the class of every node, by name."""
+    nodes = (entity for entity in trace.entities.values() if entity.kind is EntityKind.NODE)
+    return {node.name: node.type for node in nodes}
+
+
+def _keys(trace: Trace, other_classes: Mapping[str, str]) -> dict[int, EntityKey]:
+    """Return the key of every entity, by id, in creation order.
+
+    A node whose constructor raised has no class in its trace: it is the node of its name.
+    """
     seen: dict[tuple[str, str, str, str], int] = {}
     keys: dict[int, EntityKey] = {}
     for entity in trace.entities.values():
-        what = (_node_name(trace, entity), entity.kind.label, entity.name, entity.type)
+        kind = entity.type
+        if entity.kind is EntityKind.NODE and not kind:
+            kind = other_classes.get(entity.name, kind)
+        what = (_node_name(trace, entity), entity.kind.label, entity.name, kind)
         ordinal = seen.get(what, 0)
         seen[what] = ordinal + 1
         keys[entity.id] = EntityKey(*what, ordinal)

@@ -28,7 +28,7 @@ def is_trace(path: str | os.PathLike[str]) -> bool:
         return False
     # The format has it that this metadata is the first record after the header.
     name = METADATA_FORMAT.encode()
-    with suppress(struct.error):
+    with suppress(struct.error, OverflowError):  # a damaged length may be any 64 bits
         _, header_length = _RECORD_HEAD.unpack_from(head, len(MCAP_MAGIC))
         place = len(MCAP_MAGIC) + _RECORD_HEAD.size + header_length
         opcode, _, length = _METADATA_HEAD.unpack_from(head, place)

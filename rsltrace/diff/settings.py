@@ -17,6 +17,7 @@ from rsltrace.trace.reader import Trace
 
 _NOTHING = ("null", "[]", "{}")
 _ENTITIES_MAX = 50
+_EFFECTIVE = "# The effective job "
 _LINES_MAX = 20_000
 """Longer job files are compared as a whole: difflib takes time with the square of the lines."""
 
@@ -75,7 +76,9 @@ def _job_lines(a: Trace, b: Trace) -> Iterator[Setting]:
     if a.job_text == b.job_text:
         return
     name = a.job.get("name") or b.job.get("name") or "job.yaml"
-    lines_a, lines_b = a.job_text.splitlines(), b.job_text.splitlines()
+    if a.job_text.startswith(_EFFECTIVE) or b.job_text.startswith(_EFFECTIVE):
+        name = f"effective {name}"  # put together from several files: no line of one of them
+    (numbers_a, lines_a), (numbers_b, lines_b) = _lines(a), _lines(b)
     if max(len(lines_a), len(lines_b)) > _LINES_MAX:
         yield Setting(name, f"{len(lines_a)} lines", f"{len(lines_b)} lines")
         return
@@ -86,9 +89,15 @@ def _job_lines(a: Trace, b: Trace) -> Iterator[Setting]:
         for nth in range(max(end_a - begin_a, end_b - begin_b)):
             line_a = lines_a[begin_a + nth] if begin_a + nth < end_a else None
             line_b = lines_b[begin_b + nth] if begin_b + nth < end_b else None
-            if (line_a or "").strip() or (line_b or "").strip():
-                number = begin_a + nth if line_a is not None else begin_b + nth
-                yield Setting(f"{name}:{number + 1}", line_a, line_b)
+            number = numbers_b[begin_b + nth] if line_a is None else numbers_a[begin_a + nth]
+            yield Setting(f"{name}:{number}", line_a, line_b)
+
+
+def _lines(trace: Trace) -> tuple[list[int], list[str]]:
+    """Return numbers and text of the lines of a job that are more than space and a comment."""
+    numbered = enumerate(trace.job_text.splitlines(), 1)
+    lines = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
+    return [n for n, _ in lines], [line for _, line in lines]
 
 
 def _resolved(trace: Trace) -> Any:

@@ -1,4 +1,4 @@
-"""``--set nodes.ekf.parameters.rate=20``: every key of a job from the command line.
+"""``--set nodes.ekf.parameters.rate=20.0``: every key of a job from the command line.
 
 An override is YAML with its path written in front, so its mistakes are shown in its own text.
 """
@@ -59,7 +59,7 @@ def _steps(source: YamlSource) -> tuple[list[_Step], int]:
         elif text[at : at + 1] != "[":
             break
     if not steps or text[at : at + 1] != "=" or text[at - 1 : at] == ".":
-        example = "--set stop.duration=10s, --set nodes.0.parameters.rate=20"
+        example = "--set stop.duration=10s, --set nodes.0.parameters.rate=20.0"
         raise source.error(f"expected key=value, as in {example}", Mark(1, at + 1))
     return steps, at + 1
 

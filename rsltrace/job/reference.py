@@ -38,7 +38,7 @@ it, and a mistake is an error with file, line, column and what was expected.
 - **Editors** complete and check: `rsltrace schema > job.schema.json`, and as the first line of the
   job `# yaml-language-server: $schema=job.schema.json`.
 - **The command line** sets any key: `--set stop.duration=10s`,
-  `--set nodes.ekf.parameters.rate=20` (a node by name, or a list entry by number, from 0),
+  `--set nodes.ekf.parameters.rate=20.0` (a node by name, or a list entry by number, from 0),
   `--set bags.+=../bag` (a new entry), `--set stop.events=null` (take a key away). The value is
   YAML; paths in it start in the current folder. Names with a dot go in quotes. Later ones win.
 """

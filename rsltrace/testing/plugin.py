@@ -54,10 +54,26 @@ class Golden:
     ) -> RunResult | None:
         """Assert that it does what the golden trace did; return the result if a job was run."""
         __tracebackhide__ = True
-        from rsltrace.errors import TraceError
-        from rsltrace.testing.golden import assert_matches_golden, run_job
+        from rsltrace.errors import RsltraceError, RunError
 
         self._calls += 1
+        try:
+            return self._check(job_or_result, path, options)
+        except RunError:
+            raise  # the traceback is that of the node
+        except RsltraceError as error:
+            message = str(error)
+        pytest.fail(message, pytrace=False)
+
+    def _check(
+        self,
+        job_or_result: Job | RunResult | str | os.PathLike[str],
+        path: str | os.PathLike[str] | None,
+        options: DiffOptions | None,
+    ) -> RunResult | None:
+        __tracebackhide__ = True
+        from rsltrace.testing.golden import assert_matches_golden, run_job
+
         folder = Path(self._node.path).parent
         golden = folder / (self._default() if path is None else Path(path))
         result: RunResult | None = None
@@ -71,10 +87,7 @@ class Golden:
             is_job = not hasattr(given, "digest")
         if is_job:
             given = result = run_job(given, self._tmp_path, name=f"run{self._number()}.mcap")
-        try:
-            written = assert_matches_golden(given, golden, update=self._update, options=options)
-        except TraceError as error:
-            pytest.fail(str(error), pytrace=False)
+        written = assert_matches_golden(given, golden, update=self._update, options=options)
         if written:
             self._node.user_properties.append((_PROPERTY, str(golden)))
         return result

@@ -76,6 +76,7 @@ class Plan:
     end_ns: int = 1_000 * MS
     seed: int = 0
     version: str = "1"
+    job_heading: str = ""
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ class Simulation:
     def _write_job(self, writer: TraceWriter) -> None:
         # What a node is made of is in the job, as parameters would be.
         nodes = "".join(f"  - {node}\n" for node in self.plan.nodes)
-        text = f"seed: {self.plan.seed}\nnodes:\n{nodes}"
+        text = f"{self.plan.job_heading}seed: {self.plan.seed}\nnodes:\n{nodes}"
         writer.add_metadata(METADATA_JOB, {"name": "job.yaml", "resolved": "{}"})
         writer.add_metadata(METADATA_ENVIRONMENT, {"sim": self.plan.version})
         writer.add_attachment(ATTACHMENT_JOB, "application/yaml", text.encode())

@@ -420,3 +420,13 @@ def test_gaps_by_stamp_never_match_different_stamps(a: list[tuple[int, int]], da
     for gap in gaps:
         if gap.surplus == 0:
             assert a[gap.a_start][0] == b[gap.b_start][0]
+
+
+def test_a_damaged_length_at_the_head_is_no_traceback(tmp_path: Path) -> None:
+    path = one_file(write(tmp_path / "a", [(1, "/n", uint64(1))]))
+    data = bytearray(path.read_bytes())
+    data[9:17] = b"\xff" * 7 + b"\x7f"  # the length of the header
+    path.write_bytes(data)
+    assert not is_trace(path)
+    with pytest.raises(BagError):
+        diff_bags(path, path)

@@ -212,6 +212,21 @@ def test_settings_are_always_listed(tmp_path: Path) -> None:
     assert "job.yaml:1, environment: sim" in diff.divergences[0].root_sentence
 
 
+def test_lines_of_a_job_of_several_files_are_not_those_of_one(tmp_path: Path) -> None:
+    """They are counted in the effective job, and what it was made of is no setting."""
+    heading = "# The effective job of job.yaml\n"
+    other = replace(PLAN, seed=7, job_heading=f"{heading}#   with --set seed=7\n")
+    diff = compare(
+        tmp_path, Fault("bit", step(20, 1)), a=replace(PLAN, job_heading=heading), b=other
+    )
+    (setting,) = diff.settings
+    assert (setting.place, setting.a, setting.b) == (
+        "effective job.yaml:2",
+        "seed: 0",
+        "seed: 7",
+    )
+
+
 def test_a_constructor_that_differs(tmp_path: Path) -> None:
     drawing = replace(PLAN, nodes=(*PLAN.nodes[:2], replace(PLAN.nodes[2], draws_at_start=True)))
     diff = compare(tmp_path, a=drawing, b=replace(drawing, seed=1))
@@ -278,6 +293,14 @@ def test_an_interrupted_run(tmp_path: Path) -> None:
     assert diff.agreeing == diff.b.events > 100
     assert "the recording of b" in diff.notes[0]
     assert "was killed" in diff.divergences[0].root_sentence
+
+
+def test_two_runs_that_were_both_interrupted_are_identical_only_so_far(tmp_path: Path) -> None:
+    for name in ("a.mcap", "b.mcap"):
+        Simulation(PLAN, tmp_path / name, storage=Storage(50, close=False)).run()
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert diff.verdict is Verdict.IDENTICAL
+    assert diff.sentence.startswith("as far as both recordings go, the two runs are identical")
 
 
 def test_an_exception_in_one_run(tmp_path: Path) -> None:

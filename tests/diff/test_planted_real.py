@@ -87,6 +87,8 @@ class Checker(Node):
         self.asked = 0
         self.create_service(Trigger, "check", self.check)
         self.create_subscription(Float64, "smooth", lambda message: None, 10)
+        if MODE == "refuse":
+            raise RuntimeError("no")
         if MODE == "graph":
             self.create_publisher(UInt64, "unexpected", 1)
 
@@ -121,7 +123,8 @@ def diffed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Dif
             monkeypatch.setenv("FAULTY_MODE", its_mode)
             job = tmp_path / "job.yaml"
             job.write_text(JOB.replace("GAIN", its_gain).replace("SEED", str(its_seed)))
-            run(rsltrace.load_job(job), tmp_path / f"{name}.mcap", force=True)
+            result = run(rsltrace.load_job(job), tmp_path / f"{name}.mcap", force=True)
+            assert result.error is None or its_mode in ("raise", "refuse")
         return rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
 
     return go
@@ -173,6 +176,14 @@ def test_a_node_that_misbehaves_once(
         assert [m.presence for m in first.messages] == ["only b"]
     if mode == "raise":
         assert "raised ValueError: the sensor is unplugged in b and not in a" in diff.sentence
+
+
+def test_a_constructor_that_raises(diffed: Callable[..., Diff]) -> None:
+    """It is the same node, though the trace of the failed one does not know its class."""
+    diff = diffed("refuse")
+    assert (diff.verdict, diff.divergences[0].root) == (Verdict.EXCEPTION, Root.EXCEPTION)
+    assert "the constructor of /checker" in diff.sentence
+    assert "raised RuntimeError: no in b and not in a" in diff.sentence
 
 
 KINDS = {

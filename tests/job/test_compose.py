@@ -309,7 +309,7 @@ def test_every_key_can_be_set(folder: Path) -> None:
         (
             "seed",
             5,
-            "expected key=value, as in --set stop.duration=10s, --set nodes.0.parameters.rate=20",
+            "expected key=value, as in --set stop.duration=10s, --set nodes.0.parameters.rate=20.0",
         ),
         ("seed.x=1", 6, "seed is the number 3: there is nothing below it to set"),
         ("stop={duration: 1s", 19, None),

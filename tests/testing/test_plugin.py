@@ -137,6 +137,7 @@ def test_the_fixture_makes_compares_and_updates_golden_traces(team: Run, tmp_pat
     assert missing.returncode == 1
     assert "there is no golden trace" in missing.stdout
     assert "--rsltrace-update" in missing.stdout
+    assert "During handling of the above exception" not in missing.stdout
     assert not golden.exists()
 
     made = team("--rsltrace-update")
@@ -159,6 +160,19 @@ def test_the_fixture_makes_compares_and_updates_golden_traces(team: Run, tmp_pat
     assert team("--rsltrace-update", STEP="2").returncode == 0
     assert team(STEP="2").returncode == 0
     assert team().returncode == 1
+
+
+@pytest.mark.ros
+def test_a_job_that_cannot_be_used_is_one_line(team: Run, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "job.yaml").write_text("nodes: [{nod: counting:Counter}]\n")
+    (tmp_path / "test_robot.py").write_text(
+        "def test_counts(rsltrace_golden):\n    rsltrace_golden('job.yaml')\n"
+    )
+    done = team()
+    assert done.returncode == 1
+    assert "job.yaml:1:10: unknown key 'nod'" in done.stdout
+    assert "Error" not in done.stdout, "a traceback of rsltrace's own code"
 
 
 @pytest.mark.ros
