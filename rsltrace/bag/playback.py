@@ -41,6 +41,14 @@ class Playback:
         return self._first_ns if self.at_ns is None else self.at_ns
 
     @property
+    def end_ns(self) -> int | None:
+        """When the last message plays, as far as the bag's log times tell; None: never."""
+        if self.passes is None:
+            return None
+        length_ns = max(self.bag.end_ns - self.bag.start_ns, 0) * self.passes
+        return self.start_ns + length_ns * self.rate.denominator // self.rate.numerator
+
+    @property
     def _first_ns(self) -> int:
         if self.by == BY_LOG_TIME:
             return self.bag.start_ns

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rsltrace.job.bag import BagSpec, QosSpec
     from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
+    from rsltrace.job.hooks import HooksSpec
     from rsltrace.job.job import Job
     from rsltrace.job.launch_spec import LaunchSpec
     from rsltrace.job.load import job_from_text, load_job, locate, showing_line
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagSpec": "bag",
     "GuardSpec": "guard",
+    "HooksSpec": "hooks",
     "Job": "job",
     "LaunchSpec": "launch_spec",
     "NodeSpec": "node",
@@ -37,6 +39,7 @@ _HOMES = {
 __all__ = [
     "BagSpec",
     "GuardSpec",
+    "HooksSpec",
     "Job",
     "LaunchSpec",
     "NodeSpec",

@@ -15,7 +15,9 @@ from rsltrace.job.clocks import ClockSpec
 from rsltrace.job.delay import DelaysSpec
 from rsltrace.job.distribution import files_of
 from rsltrace.job.guard import GuardSpec, guard_part
+from rsltrace.job.hooks import HooksSpec
 from rsltrace.job.launch_spec import LaunchSpec
+from rsltrace.job.names import check_topic
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, attach, check, items, one_of, parts, text, whole
 from rsltrace.job.problems import Loc, Problem, Problems, describe
@@ -126,6 +128,17 @@ class Job(Part):
         "in the order of the recording.",
         examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
     )
+    progress: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
+        default=None,
+        description="Topic on which the bags' progress is published as `std_msgs/msg/Float32`, "
+        "from 0 to 1 in steps of a hundredth.",
+        examples=["/rslcpp/progress"],
+    )
+    hooks: HooksSpec = Field(
+        default=HooksSpec(),
+        description="Functions that are called around the construction of the nodes.",
+        examples=[{"after": "my_robot.setup:wire"}],
+    )
     record: RecordSpec = Field(
         default=RecordSpec(),
         description="Which payloads the trace keeps.",
@@ -203,6 +216,8 @@ class Job(Part):
             timer_ties: Literal["creation", "heap"] = "creation",
             livelock_limit: int = LIVELOCK_LIMIT,
             bags: Sequence[BagSpec | dict[str, Any] | str] = (),
+            progress: str | None = None,
+            hooks: HooksSpec | dict[str, Any] = ...,
             record: RecordSpec | dict[str, Any] = ...,
             guard: GuardSpec | dict[str, Any] | bool = ...,
             delay: DelaysSpec | dict[str, Any] | None = None,
@@ -264,11 +279,20 @@ class Job(Part):
             *self._distinct_names(),
             *self._bags_end(),
             *self._paths_exist(),
+            *self._bags_progress(),
             *self._ties_are_decided_once(),
         ]
         if problems:
             raise Problems(problems)
         return self
+
+    def _bags_progress(self) -> Iterator[Problem]:
+        if self.progress is None:
+            return
+        if not self.bags:
+            yield Problem("there are no bags (bags:) whose progress could be told", ("progress",))
+        elif any(bag.loop is True for bag in self.bags):
+            yield Problem("a bag that plays for ever makes no progress", ("progress",))
 
     def _bags_end(self) -> Iterator[Problem]:
         if self.stop != StopSpec():

@@ -40,6 +40,7 @@ class StopSpec(Part):
     TIMES: ClassVar[dict[str, str]] = {
         "duration": "duration_ns",
         "time": "time_ns",
+        "timeout": "timeout_ns",
         "quiescence": "quiescence_ns",
     }
 
@@ -51,6 +52,12 @@ class StopSpec(Part):
     )
     time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None, alias="time", description="At this simulated time.", examples=["110s"]
+    )
+    timeout_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None,
+        alias="timeout",
+        description="After so much simulated time, as a failure: with exit status 1.",
+        examples=["120s"],
     )
     events: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None, description="After so many events.", examples=[100000]
@@ -89,6 +96,8 @@ class StopSpec(Part):
             duration_ns: int | None = None,
             time: TimeLike | None = None,
             time_ns: int | None = None,
+            timeout: TimeLike | None = None,
+            timeout_ns: int | None = None,
             events: int | None = None,
             topic: TopicStop | str | None = None,
             function: Target | None = None,

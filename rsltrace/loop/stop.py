@@ -40,21 +40,21 @@ class StopCondition(Protocol):
 class _StopAt:
     """See ``stop_at``. ``quiet_until_ns``: no answer while time is before, and stays up to it."""
 
-    def __init__(self, time_ns: int, reason: str) -> None:
+    def __init__(self, time_ns: int, stop: Stop) -> None:
         self.quiet_until_ns = time_ns
-        self._reason = reason
+        self._stop = stop
 
     def __call__(self, progress: Progress) -> Stop | None:
         time_ns = self.quiet_until_ns
         over = progress.now_ns >= time_ns or (
             progress.next_ns is not None and progress.next_ns > time_ns
         )
-        return Stop(self._reason) if over else None
+        return self._stop if over else None
 
 
-def stop_at(time_ns: int, reason: str) -> StopCondition:
+def stop_at(time_ns: int, reason: str, exit_code: int = 0) -> StopCondition:
     """Run every step up to and including ``time_ns``."""
-    return _StopAt(time_ns, reason)
+    return _StopAt(time_ns, Stop(reason, exit_code))
 
 
 def quiet_until_ns(conditions: tuple[StopCondition, ...]) -> int:

@@ -122,6 +122,13 @@ def make_publisher(
     return BagPublisher(core, node, message_class, topic, recorded_qos(qos))
 
 
+def progress_publisher(core: Core, node: NodeHandle, topic: str) -> BagPublisher:
+    """Create the publisher of the player's progress, a Float32."""
+    return BagPublisher(
+        core, node, get_message_class("std_msgs/msg/Float32"), topic, recorded_qos({})
+    )
+
+
 def recorded_qos(values: dict[str, Any]) -> Qos:
     """Return the QoS to offer for a recorded topic; what was not recorded is rclcpp's default.
 

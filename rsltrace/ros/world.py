@@ -192,6 +192,10 @@ class World:
         self.nodes.append(node)
         self.core.executor.add_node(node)
 
+    def all_nodes(self) -> list[Any]:
+        """Return the nodes there are, in the order of their construction."""
+        return [handle.wrapper for handle in self.core.graph.nodes if handle.wrapper is not None]
+
     def keep(self, node: Any) -> None:
         """Destroy ``node`` with the others at the end, although it is not run."""
         self.nodes.append(node)

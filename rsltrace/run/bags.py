@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -137,10 +138,11 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
     from rclpy.node import Node
 
     from rsltrace.model.event import EventKind
-    from rsltrace.ros.player import Player, make_publisher
+    from rsltrace.ros.player import Player, make_publisher, progress_publisher
 
     core = world.core
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
+    told: list[Any] = []
 
     def build() -> None:
         player = Node("rosbag2_player", start_parameter_services=False, enable_rosout=False)
@@ -160,6 +162,8 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
                     )
                 ends.append(publishers[key])
             streams.append(_messages(entry.playback, ends))
+        if job.progress is not None:
+            told.append(progress_publisher(core, player.handle, job.progress))
         world.keep(player)
 
     core.run_outside(lambda: "the bag player", EventKind.CONSTRUCT, 0, None, build)
@@ -174,12 +178,41 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
     merged = streams[0]
     if len(streams) > 1:
         merged = heapq.merge(*streams, key=lambda message: message[0])
+    if told:
+        merged = _with_progress(merged, told[0], _span_ns(bags))
     Player(core, merged, on_end).start()
 
 
 def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:
     for stamp_ns, topic, data in playback.messages():
         yield stamp_ns, publishers[topic], data
+
+
+def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
+    """Return when the first bag begins to play, and when the last one ends."""
+    ends = [entry.playback.end_ns for entry in bags]
+    assert all(end is not None for end in ends), "a job with a bag for ever has no progress"
+    return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
+
+
+def _with_progress(
+    messages: Iterator[tuple[int, Any, bytes]], publisher: Any, span_ns: tuple[int, int]
+) -> Iterator[tuple[int, Any, bytes]]:
+    """Put progress from 0 to 1 among the messages, each hundredth once, when it is reached."""
+    start_ns, end_ns = span_ns
+    told, stamp_ns = -1, start_ns
+    for message in messages:
+        yield message
+        stamp_ns = message[0]
+        percent = min((stamp_ns - start_ns) * 100 // max(end_ns - start_ns, 1), 99)
+        if percent > told:
+            told = percent
+            yield stamp_ns, publisher, _float32(percent)
+    yield stamp_ns, publisher, _float32(100)
+
+
+def _float32(percent: int) -> bytes:
+    return b"\x00\x01\x00\x00" + struct.pack("<f", percent / 100)
 
 
 def _qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, JobError, RunError
 from rsltrace.job import Job, locate, policy_of, showing_line
+from rsltrace.job.node import Target, target_text
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
@@ -165,7 +166,11 @@ class Session:
                 stop_conditions(job, self.start_ns, world.core.outside_events)
             )
             with world.importing():
-                self._entries = _prepare(job)
+                self._entries = [
+                    *_hook(job, "before", job.hooks.before, lambda: job),
+                    *_prepare(job),
+                    *_hook(job, "after", job.hooks.after, world.all_nodes),
+                ]
         check_bag_types(self._bags)
         if self._output is not None:
             self._writer = writer = stack.enter_context(
@@ -309,6 +314,20 @@ def _prepare(job: Job) -> list[Entry]:
             )
         )
     return entries
+
+
+def _hook(
+    job: Job, name: str, target: Target | None, argument: Callable[[], object]
+) -> list[Entry]:
+    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
+    from rsltrace.ros.world import Entry, load_target
+
+    if target is None:
+        return []
+    where = locate(job, ("hooks", name))
+    function: Any = load_target(target, where=where) if isinstance(target, str) else target
+    title = f"hook {name}: {target_text(target)}"
+    return [Entry(title, lambda: function(argument()) or [], [], key=title)]
 
 
 def _arguments_for_all(job: Job) -> list[str]:

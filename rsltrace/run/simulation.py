@@ -158,8 +158,7 @@ class Simulation:
     def nodes(self) -> list[Any]:
         """The nodes, in the order of their construction."""
         self._check_there()
-        graph = self._session.world.core.graph
-        return [handle.wrapper for handle in graph.nodes if handle.wrapper is not None]
+        return self._session.world.all_nodes()
 
     def node(self, name: str) -> Any:
         """Return a node by its name (``ekf``) or its name with namespace (``/husky/ekf``).

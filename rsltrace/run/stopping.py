@@ -27,6 +27,8 @@ def end_ns_of(job: Job, start_ns: int) -> int | None:
     ends = []
     if job.stop.duration_ns is not None:
         ends.append(start_ns + job.stop.duration_ns)
+    if job.stop.timeout_ns is not None:
+        ends.append(start_ns + job.stop.timeout_ns)
     if job.stop.time_ns is not None:
         ends.append(job.stop.time_ns)
     return min(ends, default=None)
@@ -45,6 +47,9 @@ def stop_conditions(
     if stop.duration_ns is not None:
         reason = f"duration of {format_seconds(stop.duration_ns)} s"
         yield stop_at(start_ns + stop.duration_ns, reason)
+    if stop.timeout_ns is not None:
+        reason = f"timeout of {format_seconds(stop.timeout_ns)} s"
+        yield stop_at(start_ns + stop.timeout_ns, reason, exit_code=1)
     if stop.time_ns is not None:
         yield stop_at(stop.time_ns, f"time {format_seconds(stop.time_ns)} s")
     if stop.events is not None:
