@@ -18,7 +18,8 @@ from pathlib import Path
 from time import perf_counter, process_time, sleep
 from typing import Any
 
-EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+BENCHMARKS = Path(__file__).resolve().parent
+EXAMPLES = BENCHMARKS.parent / "examples"
 
 WARM_UP_S = 0.5
 """How long a native graph runs, after every node has had work, before it is measured."""
@@ -90,6 +91,51 @@ def _groups_job(groups: int) -> Callable[[int], dict[str, Any]]:
     return job
 
 
+EVENTS_PER_GOAL = 14
+"""What an action's goal is: request, answer, status, feedback, result and their callbacks."""
+
+EVENTS_PER_CALL = 3
+"""What a blocking call is: the caller that goes on, the service, the response."""
+
+
+def _action_nodes() -> list[Any]:
+    import whole
+
+    return [whole.Asker(), whole.Worker()]
+
+
+def _action_job(callbacks: int) -> dict[str, Any]:
+    goals = max(1, callbacks // EVENTS_PER_GOAL)
+    return {
+        "nodes": [
+            {"node": "whole:Asker", "parameters": {"goals": goals}},
+            {"node": "whole:Worker"},
+        ],
+        "search_path": [str(BENCHMARKS)],
+        "livelock_limit": 10 * (callbacks + 100),
+        "stop": {"topic": {"name": "/asker/done", "exit_code": "data"}},
+    }
+
+
+def _mains_job(callbacks: int) -> dict[str, Any]:
+    job = _ping_pong_job(callbacks)
+    ping, pong = job["nodes"]
+    ping["main"], pong["main"] = "whole:ping", "whole:pong"
+    del ping["node"], pong["node"]
+    job["search_path"].append(str(BENCHMARKS))
+    return job
+
+
+def _calls_job(callbacks: int) -> dict[str, Any]:
+    calls = max(1, callbacks // EVENTS_PER_CALL)
+    return {
+        "nodes": [{"main": "whole:call", "parameters": {"calls": calls}}, {"main": "whole:serve"}],
+        "search_path": [str(BENCHMARKS)],
+        "livelock_limit": 10 * (callbacks + 100),
+        "stop": {"topic": {"name": "/caller/done", "exit_code": "data"}},
+    }
+
+
 GRAPHS = {
     graph.name: graph
     for graph in (
@@ -102,6 +148,15 @@ GRAPHS = {
         ),
         Graph("graph8", "graph of 8 nodes", (), _eight_nodes, _groups_job(1)),
         Graph("graph200", "graph of 200 nodes", (), None, _groups_job(25)),
+        Graph(
+            "actions",
+            "goals, one after the other",
+            (),
+            _action_nodes,
+            _action_job,
+        ),
+        Graph("mains", "ping-pong of two mains that spin", (), None, _mains_job),
+        Graph("calls", "blocking calls of a main", (), None, _calls_job),
     )
 }
 

@@ -178,10 +178,11 @@ def ratios(cases: list[Case]) -> list[dict[str, Any]]:
                 pair = {"graph": graph, "slow": delayed, "fast": plain, "most": DELAYED_AIM}
                 found.append(pair | compare(*names))
     for mode in RSLTRACE_MODES:
-        few, many = f"graph8/{mode}", f"graph200/{mode}"
-        if few in medians and many in medians:
-            pair = {"graph": "graph200", "slow": mode, "fast": "graph8"}
-            found.append(pair | compare(many, few))
+        for few_graph, many_graph in (("graph8", "graph200"), ("ping_pong", "mains")):
+            few, many = f"{few_graph}/{mode}", f"{many_graph}/{mode}"
+            if few in medians and many in medians:
+                pair = {"graph": many_graph, "slow": mode, "fast": few_graph}
+                found.append(pair | compare(many, few))
     return found
 
 
@@ -224,7 +225,7 @@ def print_table(cases: list[Case]) -> None:
             )
         else:
             print(
-                f"an event among 200 nodes costs {each['x']:.2f} of one among 8 "
+                f"an event of {each['graph']} costs {each['x']:.2f} of one of {each['fast']} "
                 f"({TITLES[each['slow']]}; by CPU time {each['cpu_x']:.2f})"
             )
 
