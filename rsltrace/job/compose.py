@@ -76,8 +76,8 @@ class Composition(Part):
     include: Annotated[tuple[str, ...], check(_paths)] = Field(
         default=(),
         description="Files whose keys belong to this job, too: a path or a list of paths, relative "
-        "to this file. Their `nodes` and `bags` are added in front of this file's; apart from "
-        "that they are merged like a base, later ones over earlier ones.",
+        "to this file. Their `nodes`, `launch` and `bags` are added in front of this file's; apart "
+        "from that they are merged like a base, later ones over earlier ones.",
         examples=[["sensors.yaml", "../common/recording.yaml"]],
     )
     vars: Annotated[dict[str, Any], check(_variables)] = Field(
@@ -223,7 +223,8 @@ def merge(
     """Return ``under`` with ``over`` laid over it.
 
     Mappings are merged by key, and null takes a key away. ``search_path`` is the sum, ``over``'s
-    first. ``nodes`` are merged by name; with ``add_up``, lists of nodes and bags are added up.
+    first. ``nodes`` are merged by name; with ``add_up``, lists of nodes, launch files and bags
+    are added up.
     Everything else is replaced. ``strict`` refuses a change to a node that is not there.
     """
     if _is_mapping(under) and _is_mapping(over):
@@ -246,7 +247,7 @@ def merge(
         if loc == ("nodes",):
             nodes = _merged_nodes(under.value, over.value, add_up=add_up, strict=strict)
             return replace(over, value=nodes)
-        if add_up and loc == ("bags",):
+        if add_up and loc in (("bags",), ("launch",)):
             return replace(over, value=under.value + over.value)
     return over
 

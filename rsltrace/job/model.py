@@ -60,6 +60,11 @@ def shorthand_at(model: type[BaseModel], loc: Loc) -> str | None:
     field = field_at(model, loc)
     if field is None or not loc:
         return None
-    is_entry = isinstance(loc[-1], int)
-    value = attached(field, "entry_shorthand" if is_entry else "shorthand")
+    around = field_at(model, loc[:-1])
+    if isinstance(loc[-1], int):
+        fact = "entry_shorthand"
+    else:
+        # An entry of a mapping has the field of the mapping itself.
+        fact = "value_shorthand" if around is field else "shorthand"
+    value = attached(field, fact)
     return None if value is None else str(value)

@@ -114,7 +114,8 @@ class _Maker:
         if one_of and not self._partial:
             definition["oneOf"] = [{"required": [key]} for key in one_of]
         if model is Job and not self._partial:
-            definition["anyOf"] = [{"required": ["nodes"]}, {"required": ["bags"]}]
+            needed = ("nodes", "launch", "bags")
+            definition["anyOf"] = [{"required": [key]} for key in needed]
         return definition
 
     def field(self, field: FieldInfo, *, bare: bool = False) -> Schema:

@@ -327,3 +327,11 @@ def test_a_mistake_in_an_override_is_shown_in_it(
         assert first == f"--set: {expected}"
     assert line == f"      | {override}"
     assert caret == f"      | {' ' * (column - 1)}^"
+
+
+def test_a_delay_of_one_topic_from_the_command_line() -> None:
+    write("job.yaml", "{nodes: [{node: m:N}], delay: {topics: {/odom: 1ms}}}")
+    overrides = ["delay.topics./scan.constant=5ms", "delay.topics./odom.drop=0.5"]
+    resolved = load_job("job.yaml", overrides=overrides).resolved()["delay"]["topics"]
+    assert resolved["/scan"]["constant_ns"] == 5_000_000
+    assert (resolved["/odom"]["constant_ns"], resolved["/odom"]["drop"]) == (1_000_000, 0.5)

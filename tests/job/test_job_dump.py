@@ -170,6 +170,8 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
                 "guard": None,
             }
         ],
+        "launch": [],
+        "ros_arguments": [],
         "search_path": ["."],
         "start_ns": 1_000_000_000,
         "construct_time_ns": None,

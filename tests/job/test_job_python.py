@@ -80,7 +80,7 @@ def test_paths_are_relative_to_the_current_folder(
         (lambda: StopSpec(duration=1, duration_ns=1), "StopSpec: duration_ns: give either duration or duration_ns, not both"),
         (lambda: StopSpec(duration_ns=1.0), "StopSpec: duration: expected an integer number of nanoseconds, got 1.0"),
         (lambda: StopSpec(quiescence_ns=0), "StopSpec: quiescence: must be more than 0"),
-        (lambda: Job(), "Job: a job needs at least one node (nodes:) or bag (bags:)"),
+        (lambda: Job(), "Job: a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)"),
         (lambda: Job(nodes=NODE), "Job: nodes: expected a list, got an object of NodeSpec"),
         (lambda: Job(nodes=[Talker]), "Job: nodes[0]: expected a mapping, got an object of type"),
         (lambda: Job(nodes=[{"node": "m:N", "nam": "x"}]), "Job: unknown key 'nam' in nodes[0]; did you mean 'name'?"),

@@ -424,7 +424,7 @@ GOLDEN = {
     "nothing to run": (
         "seed: 1\n",
         """
-        job.yaml:1:1: a job needs at least one node (nodes:) or bag (bags:)
+        job.yaml:1:1: a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)
             1 | seed: 1
               | ^
         """,
@@ -432,10 +432,10 @@ GOLDEN = {
     "no nodes in the list": (
         "seed: 1\nnodes: []\n",
         """
-        job.yaml:2:8: nodes: a job needs at least one node (nodes:) or bag (bags:)
+        job.yaml:2:8: nodes: a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)
             2 | nodes: []
               |        ^
-        """,
+        """,  # noqa: E501
     ),
     "nodes without a value": (
         "seed: 1\nnodes:\n\nbags:\n",
