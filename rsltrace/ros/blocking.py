@@ -16,6 +16,7 @@ import threading
 import time
 import traceback
 from _thread import get_ident
+from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -203,7 +204,12 @@ def wait(
     core.on_end = None
     if core.program is not core.host:
         core.host.enter()
+    running = _get_running_loop()
+    if running is not None:  # asyncio keeps one per thread, here each stack has its own
+        _set_running_loop(None)
     core.next_runner().switch()
+    if running is not None:
+        _set_running_loop(running)
     core.blocked.pop(blocked, None)
     blocked.stop_waiting()
     blocked.resumed()

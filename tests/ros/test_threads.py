@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _thread
+import asyncio
 import queue
 import threading
 import time
@@ -440,3 +441,54 @@ def test_threads_give_the_same_digest_every_time(simulate: Any) -> None:
         return str(simulate(main_spec(program), Counter, duration=3).result.digest)
 
     assert len({run() for _ in range(4)}) == 1
+
+
+def test_asyncio_loops_keep_simulated_time_and_wake_each_other(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("mixed")
+        loop = asyncio.new_event_loop()
+        thread = threading.Thread(target=loop.run_forever, daemon=True)
+        thread.start()
+
+        async def ticks(name: str, period: float) -> str:
+            for _ in range(2):
+                await asyncio.sleep(period)
+                log.append((name, seconds(node)))
+            return name
+
+        node.create_timer(0.5, lambda: log.append(("ros", seconds(node))))
+
+        async def main() -> None:
+            assert asyncio.get_running_loop() is not loop
+            other = asyncio.run_coroutine_threadsafe(ticks("thread", 0.4), loop)
+            both = await asyncio.gather(ticks("main", 0.3), asyncio.wrap_future(other))
+            log.append((both, seconds(node)))
+            await asyncio.get_running_loop().run_in_executor(None, time.sleep, 0.1)
+            for _ in range(3):
+                rclpy.spin_once(node, timeout_sec=0)
+                await asyncio.sleep(0.25)
+
+        asyncio.run(main())
+        loop.call_soon_threadsafe(loop.stop)
+        thread.join()
+        loop.close()
+        log.append(seconds(node))
+
+    simulate(main_spec(program), duration=5)
+    assert [(what, round(at, 6)) for what, at in log[:-1]] == [
+        ("main", 0.3), ("thread", 0.4), ("main", 0.6), ("thread", 0.8),
+        (["main", "thread"], 0.8), ("ros", 0.9), ("ros", 1.15),
+    ]  # fmt: skip
+    assert round(log[-1], 6) == 1.65
+
+
+def test_asyncio_is_real_again_after_a_run(simulate: Any) -> None:
+    before = asyncio.BaseEventLoop.time, asyncio.SelectorEventLoop.__init__
+    simulate(Counter, duration=1)
+    assert (asyncio.BaseEventLoop.time, asyncio.SelectorEventLoop.__init__) == before
+    began = time.monotonic()
+    asyncio.run(asyncio.sleep(0.01))
+    assert time.monotonic() - began >= 0.009
