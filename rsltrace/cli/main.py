@@ -24,6 +24,7 @@ _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
     "init": "Write a commented first job, from bags and nodes.",
     "verify": "Record a job many times in unlike surroundings and compare.",
+    "audit": "Look into nodes' sources for what could make runs differ.",
     "check": "Check a job and show its graph, without running it.",
     "schema": "Print the JSON Schema of a job file, for editors.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",

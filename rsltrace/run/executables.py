@@ -87,6 +87,16 @@ def why_not(package: str, name: str) -> str | None:
     return None
 
 
+def source_of(target: str, *, where: str) -> str | Path:
+    """Return where an executable's code is: ``module:function``, or a script.
+
+    :raises JobError: as ``find_executable``.
+    """
+    found = find_executable(target, where=where)
+    package, _, name = target.partition("/")
+    return found if isinstance(found, str) else _installed_files(package)[name]
+
+
 def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     """Return what runs ``package/name``: a function, or its name (``module:function``).
 
@@ -195,4 +205,4 @@ def _run_script(text: str, path: Path) -> None:
     exec(code, {"__name__": "__main__", "__file__": str(path), "__builtins__": __builtins__})
 
 
-__all__ = ["Mains", "find_executable"]
+__all__ = ["Mains", "find_executable", "source_of"]

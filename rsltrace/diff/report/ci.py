@@ -47,15 +47,18 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         level = "error" if diff.parted else "notice"
         title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
         text = plain_text(_report(diff, options)) if diff.parted else _message(diff)
-        file = _property(printable(diff.a.path))
-        lines.append(f"::{level} file={file},title={_property(printable(title))}::{_data(text)}")
+        file = command_property(printable(diff.a.path))
+        place = f"file={file},title={command_property(printable(title))}"
+        lines.append(f"::{level} {place}::{command_data(text)}")
         if isinstance(diff, Diff):
             for setting in diff.settings:
                 name, colon, number = setting.place.rpartition(":")
                 if colon and number.isdigit():
                     change = f"{_side(setting.a)} became {_side(setting.b)}"
-                    place = f"file={_property(printable(name))},line={number}"
-                    lines.append(f"::notice {place},title=rsltrace%3A job differs::{_data(change)}")
+                    place = f"file={command_property(printable(name))},line={number}"
+                    lines.append(
+                        f"::notice {place},title=rsltrace%3A job differs::{command_data(change)}"
+                    )
     return "".join(f"{row}\n" for row in lines)
 
 
@@ -82,9 +85,11 @@ def _attribute(text: str) -> str:
     return quoteattr(_NOT_IN_XML.sub("\ufffd", printable(text)))
 
 
-def _data(text: str) -> str:
+def command_data(text: str) -> str:
+    """Return text as the message of a workflow command."""
     return text.rstrip("\n").replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
 
 
-def _property(text: str) -> str:
-    return _data(text).replace(":", "%3A").replace(",", "%2C")
+def command_property(text: str) -> str:
+    """Return text as a property of a workflow command."""
+    return command_data(text).replace(":", "%3A").replace(",", "%2C")

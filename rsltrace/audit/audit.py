@@ -1,0 +1,122 @@
+"""Auditing a path or a job: from files to findings."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+from rsltrace.audit.files import Collection, SourceFile, collect_modules, collect_path
+from rsltrace.audit.look import Place, look
+from rsltrace.audit.model import Audit, Found, Treatment
+from rsltrace.audit.names import Names
+from rsltrace.audit.rules import allowed
+from rsltrace.errors import JobError
+from rsltrace.job import Job, locate, policy_of
+from rsltrace.model.finding import Policy
+
+Executables = Callable[[str, str], "str | Path"]
+"""Given ``package/executable`` and where it is written: ``module:function``, or a script's path."""
+
+
+def audit_path(path: Path) -> Audit:
+    """Look at a Python file, or at all below a folder; the guard's defaults are taken.
+
+    :raises JobError: if there is nothing to look at.
+    """
+    if not path.exists():
+        raise JobError(f"{path}: there is no such file or folder")
+    found = collect_path(path)
+    if not found.files and not found.troubles:
+        raise JobError(f"{path}: there is no Python file in this folder")
+    return _audit(found, Policy())
+
+
+def audit_job(job: Job, executable: Executables) -> Audit:
+    """Look at the modules of a job's nodes, and at what those import below its search path.
+
+    :raises JobError: if a node's module is not found.
+    """
+    names: dict[str, str] = {}
+    scripts = []
+    for index, spec in enumerate(job.nodes):
+        where = locate(job, ("nodes", index, spec.kind))
+        target = spec.target
+        if spec.executable is not None:
+            found = executable(spec.executable, where)
+            if isinstance(found, Path):
+                scripts.append(found)
+                continue
+            target = found
+        names.setdefault(re.split("[:]", target)[0], where)
+    folders = [job.resolve(folder).resolve() for folder in job.search_path]
+    collection, missing = collect_modules(list(names), scripts, folders)
+    for name in missing:
+        parent = name.rpartition(".")[0]
+        if parent and parent in collection.files:
+            continue
+        raise JobError(
+            f"there is no module {name!r}: search_path has {', '.join(map(str, job.search_path))}",
+            where=names[name],
+        )
+    policy = policy_of(job.guard) if job.guard.enabled else None
+    return _audit(collection, policy)
+
+
+def _audit(collection: Collection, policy: Policy | None) -> Audit:
+    sources = list(collection.files.values())
+    names = Names({source.module.name: source.module for source in sources})
+    called: set[ast.AST] = set()
+    places: list[tuple[SourceFile, Place]] = []
+    for source in sources:
+        for place in look(source.module, names, as_script=source.as_script):
+            if place.alias is None:
+                called |= names.passed
+            places.append((source, place))
+    found = set()
+    silenced = 0
+    for source, place in places:
+        if place.alias is not None and place.alias in called:
+            continue  # where it is called is found, too
+        if _is_silenced(source, place):
+            silenced += 1
+            continue
+        found.add(_found(source, place, policy))
+    return Audit(
+        tuple(sorted(found)),
+        len(sources),
+        tuple(collection.troubles),
+        tuple(collection.notes),
+        silenced,
+    )
+
+
+def _is_silenced(source: SourceFile, place: Place) -> bool:
+    first = place.node.lineno
+    last = first if isinstance(place.node, ast.stmt) else place.node.end_lineno or first
+    for line in range(first, last + 1):
+        kinds = source.allowed.get(line)
+        if kinds is not None and (not kinds or place.rule.kind in kinds):
+            return True
+    return False
+
+
+def _found(source: SourceFile, place: Place, policy: Policy | None) -> Found:
+    rule = place.rule
+    treatment, does = rule.treated(policy)
+    if policy is not None and rule.source is not None:
+        globs = policy.allowed.get(rule.source, ())
+        if allowed(source.module.name, globs):
+            treatment, does = Treatment.NOTHING, "the job allows it to this module"
+    node = place.node
+    return Found(
+        source.path,
+        node.lineno,
+        node.col_offset + 1,
+        rule.kind,
+        place.call,
+        treatment,
+        does,
+        rule.instead,
+    )

@@ -1,0 +1,178 @@
+"""Which expressions are sets, and where the order of one matters.
+
+A set of plain integers has the same order in every process, and what only counts, sorts or tests
+the members does not see the order; neither is worth a line.
+"""
+
+from __future__ import annotations
+
+import ast
+
+from rsltrace.audit.names import Names
+from rsltrace.audit.scopes import Annotated, Binding, Scope
+
+_MAKERS = {"builtins.set", "builtins.frozenset", "weakref.WeakSet"}
+_TYPES = _MAKERS | {
+    f"{module}.{name}"
+    for module in ("typing", "collections.abc")
+    for name in ("Set", "FrozenSet", "AbstractSet", "MutableSet")
+}
+_METHODS = {"union", "intersection", "difference", "symmetric_difference", "copy"}
+_OPERATORS = (ast.BitOr, ast.BitAnd, ast.BitXor, ast.Sub)
+_DEPTH_MAX = 8
+
+_UNORDERED = {
+    *(f"builtins.{name}" for name in "sorted min max len any all set frozenset bool".split()),
+    "math.fsum",
+}
+"""They give the same in whatever order the members come."""
+_ORDERED = {
+    "builtins.list",
+    "builtins.tuple",
+    "builtins.enumerate",
+    "builtins.zip",
+    "builtins.map",
+    "builtins.filter",
+    "builtins.iter",
+    "builtins.sum",
+    "builtins.dict",
+    "builtins.str",
+    "builtins.repr",
+    "builtins.print",
+    "itertools.chain",
+    "itertools.product",
+    "itertools.combinations",
+    "itertools.permutations",
+    "itertools.islice",
+    "itertools.cycle",
+    "functools.reduce",
+    "collections.deque",
+    "collections.OrderedDict",
+    "numpy.array",
+    "numpy.fromiter",
+}
+_KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
+_INSENSITIVE_CALLS = {"add", "discard", "remove"}
+
+
+def is_set(node: ast.expr, scope: Scope, names: Names, depth: int = 0) -> bool:
+    """Return whether an expression is a set whose order is not known."""
+    if depth > _DEPTH_MAX:
+        return False
+    if isinstance(node, ast.Set):
+        return not all(isinstance(x, ast.Constant) and type(x.value) is int for x in node.elts)
+    if isinstance(node, ast.SetComp):
+        return True
+    if isinstance(node, ast.BinOp) and isinstance(node.op, _OPERATORS):
+        return is_set(node.left, scope, names, depth + 1) or (
+            not isinstance(node.op, ast.Sub) and is_set(node.right, scope, names, depth + 1)
+        )
+    if isinstance(node, ast.IfExp):
+        return is_set(node.body, scope, names, depth + 1) or is_set(
+            node.orelse, scope, names, depth + 1
+        )
+    if isinstance(node, ast.Call):
+        function = node.func
+        if isinstance(function, ast.Attribute) and function.attr in _METHODS:
+            return is_set(function.value, scope, names, depth + 1)
+        made = names.of(function, scope) in _MAKERS
+        return made and not (node.args and _is_range(node.args[0], scope, names))
+    bindings: list[tuple[Binding, Scope]] = []
+    if isinstance(node, ast.Name):
+        bindings = list(names.bindings(node, scope))
+    elif isinstance(node, ast.Attribute):
+        owner = scope.own_class
+        if owner is not None and isinstance(node.value, ast.Name) and node.value.id == "self":
+            bindings = [(one, scope) for one in owner.attributes.get(node.attr, [])]
+            bindings = bindings or [(one, owner) for one in owner.names.get(node.attr, [])]
+    return bool(bindings) and all(
+        _binds_set(binding, place, names, depth) for binding, place in bindings
+    )
+
+
+def _binds_set(binding: Binding, scope: Scope, names: Names, depth: int) -> bool:
+    if isinstance(binding, Annotated):
+        return _annotates_set(binding.type, scope, names)
+    if isinstance(binding, ast.expr):
+        place = scope.module.scope_of(binding)
+        return is_set(binding, place, names, depth + 1)
+    return False
+
+
+def _annotates_set(node: ast.expr, scope: Scope, names: Names) -> bool:
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        try:
+            node = ast.parse(node.value, mode="eval").body
+        except SyntaxError:
+            return False
+    if isinstance(node, ast.Subscript):
+        member = node.slice
+        if isinstance(member, ast.Name) and member.id in ("int", "bool"):
+            return False
+        node = node.value
+    return names.of(node, scope) in _TYPES
+
+
+def _is_range(node: ast.expr, scope: Scope, names: Names) -> bool:
+    return isinstance(node, ast.Call) and names.of(node.func, scope) == "builtins.range"
+
+
+def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
+    """Return whether the place in which a set stands sees the order of its members."""
+    parent = scope.module.parents.get(node)
+    if isinstance(parent, (ast.For, ast.AsyncFor)):
+        return parent.iter is node and not _only_collects(parent)
+    if isinstance(parent, ast.comprehension):
+        return parent.iter is node and _comprehension_matters(parent, scope, names)
+    if isinstance(parent, ast.Call):
+        return node in parent.args and _call_matters(parent, scope, names)
+    if isinstance(parent, ast.Attribute):
+        used = scope.module.parents.get(parent)
+        called = isinstance(used, ast.Call) and used.func is parent
+        return called and parent.attr == "pop" and not getattr(used, "args", None)
+    if isinstance(parent, ast.FormattedValue):
+        return parent.value is node
+    if isinstance(parent, ast.Starred):
+        user = scope.module.parents.get(parent)
+        return not isinstance(user, ast.Set) and not _ends_unordered(parent, scope, names)
+    return isinstance(parent, ast.YieldFrom)
+
+
+def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
+    name = names.of(call.func, scope)
+    if name in _UNORDERED:
+        return False
+    if name in _ORDERED:
+        return not _ends_unordered(call, scope, names)
+    return isinstance(call.func, ast.Attribute) and call.func.attr in _KEEPING
+
+
+def _comprehension_matters(part: ast.comprehension, scope: Scope, names: Names) -> bool:
+    whole = scope.module.parents[part]
+    if isinstance(whole, ast.SetComp):
+        return False
+    return not _ends_unordered(whole, scope, names)
+
+
+def _ends_unordered(node: ast.AST, scope: Scope, names: Names) -> bool:
+    """Whether what is made of a set goes right into something that does not see its order."""
+    user = scope.module.parents.get(node)
+    return (
+        isinstance(user, ast.Call)
+        and node in user.args
+        and names.of(user.func, scope) in _UNORDERED
+    )
+
+
+def _only_collects(loop: ast.For | ast.AsyncFor) -> bool:
+    """Whether a loop does nothing but put members into other sets, or delete what they name."""
+    return all(
+        isinstance(line, ast.Delete)
+        or (
+            isinstance(line, ast.Expr)
+            and isinstance(line.value, ast.Call)
+            and isinstance(line.value.func, ast.Attribute)
+            and line.value.func.attr in _INSENSITIVE_CALLS
+        )
+        for line in loop.body
+    )

@@ -1,0 +1,151 @@
+"""``rsltrace audit``: what in the nodes' sources could make runs differ."""
+
+from __future__ import annotations
+
+import json
+import traceback
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
+from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.model.printable import printable
+
+if TYPE_CHECKING:
+    from rsltrace.audit.model import Audit, Found
+
+_FORMATS = ("text", "json", "github")
+
+
+@click.command(cls=RosArgsCommand)
+@job_options
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(_FORMATS),
+    default="text",
+    show_default=True,
+    help="What to print: lines for people, JSON, or GitHub's annotations.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Short for --format json.")
+@click.option(
+    "--unguarded",
+    is_flag=True,
+    help="Only what the guard does not make deterministic.",
+)
+def audit(
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
+    overrides: tuple[str, ...],
+    form: str,
+    as_json: bool,
+    unguarded: bool,
+) -> int:
+    """Look into the sources of JOB's nodes, or of a .py file or folder, for what makes runs differ.
+
+    \b
+      rsltrace audit job.yaml      the nodes' modules, and what they import below search_path
+      rsltrace audit src/my_robot  every Python file below a folder
+
+    Nothing is executed. Each line names the place, the call, what the guard does about it (virtual,
+    pinned, recorded, detected, refused, nothing) and what to write instead. A comment on the line,
+    "# rsltrace: allow" or "# rsltrace: allow clock", silences it.
+
+    The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
+    """
+    try:
+        result = _look(words, launch, skip, overrides)
+    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
+        raise
+    except Exception:
+        traceback.print_exc()  # Python's own exit status for a bug would say: findings
+        return EXIT_USAGE
+    from rsltrace.audit.model import IS_SAFE
+
+    found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
+    for trouble in result.troubles:
+        click.echo(f"rsltrace: error: {printable(trouble)}", err=True)
+    for note in result.notes:
+        click.echo(f"rsltrace: note: {printable(note)}", err=True)
+    if as_json or form == "json":
+        click.echo(_as_json(result, found))
+    elif form == "github":
+        click.echo("".join(map(_annotation, found)), nl=False)
+    else:
+        click.echo("\n".join([*map(_line, found), _summary(result, found)]))
+    return EXIT_USAGE if result.troubles else 1 if found else 0
+
+
+def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequence[str]) -> Audit:
+    from rsltrace.audit.audit import audit_job, audit_path
+
+    only = Path(words[0]) if len(words) == 1 and launch is None else None
+    if only is not None and (only.is_dir() or only.suffix == ".py"):
+        if overrides:
+            raise click.UsageError(f"--set changes a job, and {only} is none")
+        return audit_path(only)
+    from rsltrace.launch import expand
+    from rsltrace.run.executables import source_of, why_not
+
+    job, _ = job_of(words, launch, skip, overrides)
+    expanded = expand(job, why_not=why_not)
+    return audit_job(expanded.job, lambda target, where: source_of(target, where=where))
+
+
+def _line(one: Found) -> str:
+    text = (
+        f"{_shown(one.path)}:{one.line}:{one.column}: {one.kind}: {one.call}; "
+        f"guard: {one.treatment.value}, {one.does}; instead: {one.instead}"
+    )
+    return printable(text)
+
+
+def _summary(result: Audit, found: Sequence[Found]) -> str:
+    files = f"{result.files} file{'s' * (result.files != 1)}"
+    silenced = f"; {result.allowed} allowed by a comment" if result.allowed else ""
+    if not found:
+        return f"nothing found in {files}{silenced}"
+    counts = Counter(one.treatment.value for one in found)
+    treated = ", ".join(f"{counts[name]} {name}" for name in counts)
+    many = f"{len(found)} finding{'s' * (len(found) != 1)}"
+    return f"{many} in {files} (guard: {treated}){silenced}"
+
+
+def _as_json(result: Audit, found: Sequence[Found]) -> str:
+    findings = [
+        {**asdict(one), "path": _shown(one.path), "treatment": one.treatment.value} for one in found
+    ]
+    return json.dumps(
+        {
+            "files": result.files,
+            "findings": findings,
+            "allowed": result.allowed,
+            "troubles": list(result.troubles),
+        },
+        indent=2,
+    )
+
+
+def _annotation(one: Found) -> str:
+    from rsltrace.audit.model import IS_SAFE
+    from rsltrace.diff.report.ci import command_data, command_property
+
+    level = "notice" if one.treatment in IS_SAFE else "warning"
+    place = f"file={command_property(printable(_shown(one.path)))},line={one.line},col={one.column}"
+    title = command_property(printable(f"rsltrace {one.kind}: {one.call}"))
+    text = f"guard: {one.treatment.value}, {one.does}; instead: {one.instead}"
+    return f"::{level} {place},title={title}::{command_data(printable(text))}\n"
+
+
+def _shown(path: Path) -> str:
+    """Return a path as seen from here, if it is below."""
+    try:
+        return str(path.absolute().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
