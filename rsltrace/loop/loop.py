@@ -84,6 +84,7 @@ class EventLoop:
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
         self._pause_events = 0
+        self._quiet_ns = -1
         self._scheduled: list[tuple[int, int, int, Callable[[], None]]] = []
         self._schedule_count = 0
 
@@ -117,7 +118,7 @@ class EventLoop:
 
     def run(self) -> Stop:
         """Run until something stops the run, and say what."""
-        quiet_ns = quiet_until_ns(self.stop_conditions)
+        quiet_ns = self._quiet_ns = quiet_until_ns(self.stop_conditions)
         scheduled, first = self._scheduled, self.first_timer
         while True:
             self.run_step()
@@ -160,29 +161,47 @@ class EventLoop:
         return timer.deadline_ns
 
     def run_step(self) -> None:
-        """Run everything that is due at the present time."""
+        """Run everything that is due at the present time.
+
+        Where nobody has to be asked before time moves on, later time steps are run, too: with
+        delays on every link nearly every event is a time step of its own.
+        """
         now_ns = self.now_ns
         scheduled = self._scheduled
-        while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
-            heappop(scheduled)[3]()
         tasks = self.tasks
         ready = self.ready
-        timers = self.timers
-        limit = self.events + self._livelock_limit
-        while not self._interrupt:
-            if tasks:
-                tasks.popleft().dispatch()
-            elif ready:
-                ready.popleft().dispatch()
+        first = self.first_timer
+        quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
+        while True:
+            while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
+                heappop(scheduled)[3]()
+            limit = self.events + self._livelock_limit
+            timer = None
+            while not self._interrupt:
+                if tasks:
+                    tasks.popleft().dispatch()
+                elif ready:
+                    ready.popleft().dispatch()
+                else:
+                    timer = first()
+                    if timer is not None and timer.deadline_ns <= now_ns:
+                        owner: TimerOwner = timer.owner  # type: ignore[assignment]
+                        owner.dispatch()
+                    elif not self.idle or not self._run_idle():
+                        break
+                if self.events >= limit:
+                    self._livelock(now_ns)
+            if self.stopped is not None or self.events >= self._pause_events:
+                return
+            if scheduled and (timer is None or scheduled[0][0] < timer.deadline_ns):
+                next_ns = scheduled[0][0]
+            elif timer is not None:
+                next_ns = timer.deadline_ns
             else:
-                timer = timers.first()
-                if timer is not None and timer.deadline_ns <= now_ns:
-                    owner: TimerOwner = timer.owner  # type: ignore[assignment]
-                    owner.dispatch()
-                elif not self.idle or not self._run_idle():
-                    break
-            if self.events >= limit:
-                self._livelock(now_ns)
+                return
+            if next_ns >= quiet_ns or next_ns <= now_ns or self._interrupt:
+                return
+            self.now_ns = now_ns = next_ns
 
     def _run_idle(self) -> bool:
         """Let those who poll have a look, now that nothing else is ready. True: go on."""

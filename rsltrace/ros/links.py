@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.model.draw import Draw, encode_draw
-from rsltrace.model.event import OutputKind
 from rsltrace.ros.qos import INFINITE_NS, Reliability
 from rsltrace.ros.qos_status import MESSAGE_LOST
 from rsltrace.ros.qos_time import RequestedLease, finite
@@ -23,7 +22,6 @@ if TYPE_CHECKING:
     from rsltrace.ros.pubsub import Delivery, PublisherHandle, SubscriptionHandle
     from rsltrace.ros.services import ClientHandle, Exchange, ServiceHandle
 
-_DRAW = int(OutputKind.DRAW)
 _DELAY = encode_draw(Draw.DELAY)
 _LOST = {
     LOST_DROP: encode_draw(Draw.DROP),
@@ -91,7 +89,7 @@ class Network:
 def note(core: Core, entity: int, draw: int) -> None:
     """Write down what chance has decided, as an output of the event under way."""
     if core.recorder is not None:
-        core.recorder.output(_DRAW, entity, draw)
+        core.recorder.draw(entity, draw)
 
 
 class Exchanges:
@@ -101,12 +99,29 @@ class Exchanges:
         self._core = core
         self._receiver = receiver
         self._channel = channel
+        self._plain = channel.plain if channel is not None and channel.keep_order else None
+        self._last_ns = 0
+        self._under_way: deque[Exchange] = deque()
+        self._arrive_next = self._next_arrives
 
     def send(self, exchange: Exchange) -> None:
         """Send a request or response on its way."""
         core = self._core
         now_ns = core.loop.now_ns
         arrival_ns = now_ns + core.busy_ns
+        plain = self._plain
+        if plain is not None:
+            delay_ns = plain(arrival_ns)
+            if arrival_ns + delay_ns < self._last_ns:
+                delay_ns = self._last_ns - arrival_ns
+            self._last_ns = arrival_ns = arrival_ns + delay_ns
+            note(core, self._receiver.entity_id, _DELAY | delay_ns)
+            self._under_way.append(exchange)
+            if arrival_ns == now_ns:
+                self._next_arrives()
+            else:
+                core.loop.schedule(arrival_ns, self._arrive_next)
+            return
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
@@ -119,6 +134,9 @@ class Exchanges:
             self._arrive(exchange)
         else:
             core.loop.schedule(arrival_ns, partial(self._arrive, exchange))
+
+    def _next_arrives(self) -> None:
+        self._arrive(self._under_way.popleft())
 
     def _arrive(self, exchange: Exchange) -> None:
         if not self._receiver._destroyed:
@@ -185,12 +203,13 @@ class Link:
             if arrival_ns + delay_ns < self._last_ns:
                 delay_ns = self._last_ns - arrival_ns
             self._last_ns = arrival_ns = arrival_ns + delay_ns
-            if core.recorder is not None:
-                core.recorder.output(_DRAW, self._receiver, _DELAY | delay_ns)
+            recorder = core.recorder
+            if recorder is not None:
+                recorder.draw(self._receiver, _DELAY | delay_ns)
+            self._under_way.append(delivery)
             if arrival_ns == now_ns:
-                self._arrive(delivery)
+                self._next_arrives()
             else:
-                self._under_way.append(delivery)
                 loop.schedule(arrival_ns, self._arrive_next)
             return
         channel = self._channel
@@ -200,9 +219,7 @@ class Link:
                 note(core, self.subscription.entity_id, _LOST[delay_ns])
                 self._lost += 1
                 return
-            recorder = core.recorder
-            if recorder is not None:
-                recorder.output(_DRAW, self.subscription.entity_id, _DELAY | delay_ns)
+            note(core, self._receiver, _DELAY | delay_ns)
             if channel.duplicate_ns >= 0:
                 self._duplicate(delivery, arrival_ns + channel.duplicate_ns)
             if channel.held_until_ns >= 0:

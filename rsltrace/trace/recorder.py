@@ -17,6 +17,7 @@ from rsltrace.trace.writer import TraceWriter
 
 _pack_event = EVENT_REST.pack
 _pack_output = OUTPUT.pack
+_DRAW = int(OutputKind.DRAW)
 
 
 class Recorder:
@@ -49,6 +50,13 @@ class Recorder:
         position = self.outputs
         self.outputs = position + 1
         return position
+
+    def draw(self, entity: int, draw: int) -> None:
+        """Add what chance has decided to the event under way: ``output`` in a hurry."""
+        packed = _pack_output(self.index, draw, entity, _DRAW, NO_SEQUENCE)
+        self.output_hash = hash64(packed[8:24], self.output_hash)
+        self._add_output(packed)
+        self.outputs += 1
 
     def message(
         self, kind: int, entity: int, channel: int, stamp_ns: int, data: bytes, content_hash: int

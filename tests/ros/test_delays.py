@@ -257,3 +257,24 @@ def test_messages_under_way_survive_their_publisher_but_not_their_subscription(r
 
     run(Talker, Deaf, delay={"default": "30ms"})
     assert run.heard == []
+
+
+def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
+    run: Run, simulate: Callable[..., Any], tmp_path: Any
+) -> None:
+    """A bag's message comes before everything else that is due, so it could overtake."""
+    run(Talker, delay=None, duration=0.25).path.rename(tmp_path / "bag.mcap")
+    series = {"points": [["0s", "100ms"], ["0.1s", "0s"]], "steps": True}
+    ears: list[Any] = []
+
+    def listener() -> Node:
+        ears.append(Listener())
+        return ears[-1]
+
+    delay = {"topics": {"/numbers": {"series": series}}}
+    simulate(
+        listener,
+        duration=0.3,
+        job={"bags": [{"path": "bag.mcap", "topics": ["/numbers"]}], "delay": delay},
+    )
+    assert ears[0].heard == [(1, 200), (2, 200)]
