@@ -7,8 +7,7 @@ time of the run. Each module is a job of its own, in a process of its own; a tes
 crashes ends the process, is reported, and the rest of the module runs in a new one. What cannot
 run in a simulation is listed in ``excluded.py`` with the reason.
 
-The exit status is 0 if every test that passes natively (``--baseline``, or all of them) passes here
-or is excluded.
+The exit status is 0 if every test passes or is excluded.
 """
 
 from __future__ import annotations
@@ -22,8 +21,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from excluded import EXCLUDED, reason_for
+from document import Counts, document
+from excluded import EXCLUDED
 from suite import Outcome, copy_tests, module_names, run_module
+
+DOCUMENT = Path(__file__).parents[2] / "docs" / "rclpy-tests.md"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -60,24 +62,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _report(outcomes: list[Outcome], options: argparse.Namespace) -> int:
     passed = {outcome.test for outcome in outcomes if outcome.passed}
-    excluded = {o.test for o in outcomes if reason_for(o.test) and not o.passed}
+    excluded = {outcome.test for outcome in outcomes if outcome.verdict == "excluded"}
     failed = [o.test for o in outcomes if not o.passed and o.test not in excluded]
     where = "natively" if options.native else "in the simulation"
     print(
         f"{len(outcomes)} tests: {len(passed)} pass {where}, {len(excluded)} excluded with a "
         f"reason, {len(failed)} fail"
     )
+    baseline: set[str] = set()
     if options.baseline is not None:
-        baseline = set(options.baseline.read_text().split())
-        seen = {outcome.test for outcome in outcomes}
-        missing = sorted((baseline & seen) - passed - excluded)
+        baseline = set(options.baseline.read_text().split()) & {o.test for o in outcomes}
         print(
-            f"of {len(baseline & seen)} that pass natively: {len(baseline & passed)} pass here, "
-            f"{len(baseline & excluded)} excluded, {len(missing)} fail"
+            f"of {len(baseline)} that pass natively: {len(baseline & passed)} pass here, "
+            f"{len(baseline & excluded)} excluded, {len(baseline - passed - excluded)} fail"
         )
-        failed = missing
     if options.list is not None:
         options.list.write_text("".join(f"{test}\n" for test in sorted(passed)))
+    if options.document:
+        counts = Counts(
+            version=options.document,
+            suite=len(outcomes),
+            native=len(baseline),
+            passed=len(passed),
+            both=len(baseline & passed),
+            excluded=len(excluded),
+            failed=len(failed),
+        )
+        DOCUMENT.write_text(document(counts, EXCLUDED))
     return 1 if failed else 0
 
 
@@ -90,6 +101,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--all", action="store_true", help="try what is excluded, too")
     parser.add_argument("--baseline", type=Path, help="ids of the tests that pass natively")
     parser.add_argument("--list", type=Path, help="write the ids of the tests that passed")
+    parser.add_argument(
+        "--document", metavar="VERSION", default="", help="write docs/rclpy-tests.md"
+    )
     parser.add_argument("--timeout", type=float, default=120, help="wall seconds for a process")
     parser.add_argument("-j", "--jobs", type=int, default=1, help="modules at a time")
     parser.add_argument("module", nargs="*", help="test modules (test_node.py); default: all")
