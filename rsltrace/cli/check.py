@@ -60,6 +60,8 @@ def check(
     """
     from rsltrace.run.checking import check_job
 
+    if graph is not None and graph.suffix != ".svg":
+        raise click.BadParameter(f"{graph} should end in .svg", param_hint="--graph")
     loaded, _ = job_of(words, launch, skip, overrides)
     try:
         checked = check_job(loaded, everything=everything)

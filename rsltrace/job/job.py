@@ -125,7 +125,9 @@ class Job(Part):
         default=(),
         description="rosbag2 recordings (MCAP or sqlite3) to play in; a path stands for "
         "`{path: ...}`. Messages of equal time play in the order of this list, those of one bag "
-        "in the order of the recording.",
+        "in the order of the recording. Of a bag that was cut off, or has no index or no "
+        "metadata.yaml, what is there plays, and a note says what is not; recorded services and "
+        "actions never play, a note names them.",
         examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
     )
     progress: Annotated[str | None, check(text(check_topic), optional=True)] = Field(

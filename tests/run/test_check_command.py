@@ -141,6 +141,24 @@ def test_a_job_that_cannot_run(
     assert done.stdout == ""
 
 
+def test_only_svg_is_drawn(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+    job_file(FINE)
+    done = rsltrace("check", "job.yaml", "--graph", "graph.png")
+    assert done.returncode == 2
+    assert "graph.png should end in .svg" in done.stderr
+
+
+def test_a_graph_without_connections_is_drawn_too(job_file: Callable[..., Path]) -> None:
+    from rsltrace.cli.graph_svg import graph_svg
+
+    code = "class Alone(Node):\n    def __init__(self):\n        super().__init__('alone')\n"
+    overview = check_job(
+        load_job(job_file("nodes: [{node: nodes_under_test:Alone}]", code))
+    ).overview
+    texts = [e.text for e in ET.fromstring(graph_svg(overview)).iter() if e.tag.endswith("}text")]
+    assert texts == ["/alone"]
+
+
 def test_everything_includes_what_each_node_has(job_file: Callable[..., Path]) -> None:
     job = load_job(job_file(FINE))
     few = {link.name for link in check_job(job).overview.links}
