@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+from collections.abc import Sequence
 from typing import IO, Any, NoReturn
 
 import click
@@ -97,13 +98,14 @@ def cli() -> None:
     """
 
 
-def main() -> NoReturn:
-    """Run the command line and exit."""
-    if sys.argv[1:2] == ["record"]:
+def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> NoReturn:
+    """Run the command line (``words``: what follows the program's name) and exit."""
+    words = sys.argv[1:] if words is None else words
+    if list(words[:1]) == ["record"]:
         from rsltrace.guard.pin import pin
 
         pin()
-    cli.main(prog_name="rsltrace")
+    cli.main(args=list(words), prog_name=prog_name)
     raise AssertionError("click exits")
 
 

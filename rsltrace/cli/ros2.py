@@ -1,0 +1,31 @@
+"""``ros2 rsltrace …``: the whole command as an extension of ROS's own command line.
+
+ros2cli finds it by the entry point group ``ros2cli.command``; nothing else imports this module, so
+rsltrace does without ros2cli.
+"""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from ros2cli.command import CommandExtension
+
+from rsltrace.cli.main import main
+
+
+class RsltraceCommand(CommandExtension):  # type: ignore[misc]
+    """Record, compare and step through what rclpy nodes do, deterministically."""
+
+    def add_arguments(self, parser: Any, cli_name: str, *, argv: Any = None) -> None:
+        """Leave all words to rsltrace: ``ros2 rsltrace record --help`` is its own help."""
+        parser.add_argument(
+            "words",
+            nargs=argparse.REMAINDER,
+            metavar="COMMAND ...",
+            help=f"what would follow 'rsltrace'; see '{cli_name} record --help' and so on",
+        )
+
+    def main(self, *, parser: Any, args: Any) -> int:
+        """Run rsltrace and exit with its status."""
+        main(args.words, prog_name="ros2 rsltrace")
