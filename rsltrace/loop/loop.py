@@ -142,10 +142,10 @@ class EventLoop:
                 self._pause_events = self._between_steps()
             if next_ns > self.now_ns:
                 if self.min_step_ns:
-                    next_ns = self._stepped(next_ns, quiet_ns)
+                    next_ns = self.stepped(next_ns, quiet_ns)
                 self.now_ns = next_ns
 
-    def _stepped(self, next_ns: int, end_ns: int) -> int:
+    def stepped(self, next_ns: int, end_ns: int) -> int:
         """Return the next time if time moves on by no less than ``min_step_ns``."""
         at_least_ns = self.now_ns + self.min_step_ns
         return max(next_ns, min(at_least_ns, end_ns) if end_ns > next_ns else at_least_ns)

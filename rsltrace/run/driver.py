@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent
 
 from rsltrace.errors import RunError
+from rsltrace.loop.stop import quiet_until_ns
 from rsltrace.run.session import Session
 
 if TYPE_CHECKING:
@@ -48,7 +49,8 @@ class Driver:
         self._steps: int | None = 0
         self._until_ns: int | None = None
         self._to_the_end = False
-        self._held: tuple[int, int] | None = None
+        self._held: tuple[int, tuple[int, int, int]] | None = None
+        self._counted = 0
         self._news: list[tuple[Callable[[Any], object], Any]] = []
         self._raised = False
 
@@ -88,8 +90,7 @@ class Driver:
         if self.ended:
             return
         self.leave()
-        if steps is not None and self._something_is_ready():
-            steps -= 1  # that step is run before the gate is asked
+        self._counted = self.loop.events
         self._steps, self._until_ns, self._to_the_end = steps, until_ns, to_the_end
         while True:
             self._who = _Who.RUN
@@ -111,16 +112,15 @@ class Driver:
         """
         self.outside.leave()
         if self._held is not None:
-            last_ns, events = self._held
-            loop = self.loop
-            if events == loop.events and not loop.ready and not loop.tasks:
-                loop.now_ns = last_ns
+            last_ns, before = self._held
+            if self._activity() == before:
+                self.loop.now_ns = last_ns
             self._held = None
 
-    def _something_is_ready(self) -> bool:
+    def _activity(self) -> tuple[int, int, int]:
+        """Return what changes when somebody outside does something."""
         loop = self.loop
-        next_ns = loop.next_ns()
-        return bool(loop.ready or loop.tasks or (next_ns is not None and next_ns <= loop.now_ns))
+        return loop.events, len(loop.ready), len(loop.tasks)
 
     # -- the gate, on the loop's stack ---------------------------------------------------------
 
@@ -128,9 +128,10 @@ class Driver:
         if not self._news:
             if self._to_the_end:
                 return False
+            if self._steps and self.loop.events != self._counted:
+                self._steps -= 1  # what was ready when the driver let go
+            self._counted = self.loop.events
             if self._steps != 0 and self._may_advance(next_ns):
-                if self._steps is not None:
-                    self._steps -= 1
                 return False
         core = self.session.world.core
         core.runners.append(getcurrent())
@@ -140,13 +141,15 @@ class Driver:
 
     def _may_advance(self, next_ns: int | None) -> bool:
         until_ns, end_ns = self._until_ns, self.session.end_ns
+        if next_ns is not None and self.loop.min_step_ns and next_ns > self.loop.now_ns:
+            next_ns = self.loop.stepped(next_ns, quiet_until_ns(self.loop.stop_conditions))
         if next_ns is not None and (until_ns is None or next_ns <= until_ns):
             return True
         if until_ns is None:
             return False  # nothing is left to happen, unless the driver does something
         if end_ns is not None and until_ns >= end_ns:
             return True  # the job ends before that: its stop condition will say so
-        self._held = (self.loop.now_ns, self.loop.events)
+        self._held = (self.loop.now_ns, self._activity())
         self.loop.now_ns = until_ns
         return False
 
