@@ -82,15 +82,21 @@ def record(
     path = output or default_output(named)
     if bag is not None:
         check_bag_folder(bag, force=force)
+    told: list[str] = []
+
+    def tell(note: str) -> None:
+        told.append(note)
+        _note(note)
+
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(
             loaded,
             path,
             force=force,
             echo=not quiet,
-            observer=Observer(progress=on_progress, interrupt=on_interrupt, note=_note),
+            observer=Observer(progress=on_progress, interrupt=on_interrupt, note=tell),
         )
-    _report(result, path, as_json=as_json)
+    _report(result, path, told, as_json=as_json)
     if bag is not None:
         count = export_bag(path, bag, force=force)
         click.echo(f"wrote {bag}: {count} messages", err=True)
@@ -132,9 +138,9 @@ def _note(text: str) -> None:
     click.echo(f"rsltrace: note: {text}", err=True)
 
 
-def _report(result: RunResult, path: Path, *, as_json: bool) -> None:
+def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) -> None:
     error = result.error
-    for note in result.notes:
+    for note in result.notes[len(told) :]:  # the others were told when the run began
         click.echo(f"note: {note}", err=True)
     if error is not None:
         if isinstance(error, NodeError) and error.traceback_text:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.stop import Stop
+from rsltrace.model.stamp import format_seconds
 from rsltrace.run.stopping import has_stop
 
 if TYPE_CHECKING:
@@ -100,10 +101,17 @@ def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
     )
 
 
-def notes_of(bags: list[BagInput]) -> Iterator[str]:
+def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
     """Yield what somebody should know about the bags: what is missing, what does not play."""
     for entry in bags:
         yield from entry.bag.notes
+        begin_ns = entry.playback.start_ns
+        if job.start_ns is not None and begin_ns < job.start_ns:
+            yield (
+                f"{entry.spec.path}: begins at {format_seconds(begin_ns)} s, before the run does "
+                f"({format_seconds(job.start_ns)} s): what comes earlier plays all at once, at the "
+                "start; leave it out with start_offset, or move the bag with at"
+            )
         services = [name for name in entry.bag.skipped if name.endswith(_SERVICE_EVENT)]
         actions = sorted({n.partition(_ACTION)[0] for n in entry.bag.skipped if _ACTION in n})
         services = [n.removesuffix(_SERVICE_EVENT) for n in services if _ACTION not in n]

@@ -65,7 +65,8 @@ class RunResult:
     exit_code: int
     error: RunError | None = field(default=None, compare=False)
     notes: tuple[str, ...] = ()
-    """What is worth saying of a run that went well: how mains ended."""
+    """What is worth saying of a run that went well: what of a launch file or a bag it was without,
+    how mains ended."""
     guarded: tuple[GuardCount, ...] = ()
     """How often the guard met each call, and what was done about it."""
 
@@ -135,8 +136,9 @@ class Session:
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
+        self._notes = (*expanded.notes, *notes_of(job, self._bags))
         if observer.note is not None:
-            for note in (*expanded.notes, *notes_of(self._bags)):
+            for note in self._notes:
                 observer.note(note)
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
@@ -268,7 +270,7 @@ class Session:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
-            notes=tuple(core.notes),
+            notes=(*self._notes, *core.notes),
             guarded=self._guarded.counts,
         )
 

@@ -123,6 +123,16 @@ def test_a_bag_that_plays_for_ever_needs_an_end(play: Any, tmp_path: Path) -> No
         play("bags: [{path: a.mcap, loop: true}]")
 
 
+def test_a_bag_that_begins_before_the_run_is_noted(play: Any, tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", numbers(4))
+    result = play("{bags: [a.mcap], start: 12s}")
+    assert [stamp for stamp, _ in played(result)] == [12 * S, 12 * S, 12 * S, 13 * S]
+    (note,) = play.notes
+    assert result.notes == (note,)
+    assert note.startswith("a.mcap: begins at 10.000000000 s, before the run does (12.0")
+    assert play("{bags: [{path: a.mcap, start_offset: 2s}], start: 12s}").notes == ()
+
+
 def test_a_single_instant_cannot_loop(play: Any, tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(2, step_ns=0))
     result = play("{bags: [{path: a.mcap, loop: true}], stop: {duration: 1s}}")
