@@ -202,3 +202,74 @@ def test_a_blocking_client_in_a_callback(simulate: Any) -> None:
 
     simulate(Blocking, Server, duration=10)
     assert log == [(3.25, [0, 1, 1, 2])]
+
+
+def test_goals_whose_execution_is_deferred(simulate: Any) -> None:
+    """A queue of goals, worked off one after the other, of which a waiting one is cancelled."""
+    log: list[Any] = []
+
+    class Queueing(Server):
+        def __init__(self) -> None:
+            super().__init__(handle_accepted_callback=self.accepted)
+            self.waiting: list[Any] = []
+            self.create_timer(2.0, self.next)
+
+        def accepted(self, goal: Any) -> None:
+            self.waiting.append(goal)
+
+        def next(self) -> None:
+            if self.waiting:
+                goal = self.waiting.pop(0)
+                log.append((seconds(self), "execute", goal.request.order, goal.status))
+                goal.execute()
+
+    class Three(Client):
+        def ask(self) -> None:
+            for order, cancel_after in ((1, None), (2, 1.5), (3, None)):
+                self.order, self.cancel_after = order, None
+                self.once.cancel()
+                future = self.client.send_goal_async(Fibonacci.Goal(order=order))
+                future.add_done_callback(
+                    lambda done, after=cancel_after: self.sent(done.result(), after)
+                )
+
+        def sent(self, goal: Any, cancel_after: float | None) -> None:
+            goal.get_result_async().add_done_callback(self.done)
+            if cancel_after is not None:
+                self.once = self.create_timer(
+                    cancel_after, lambda: (self.once.cancel(), goal.cancel_goal_async())
+                )
+
+    simulate(Queueing, lambda: Three(0, log), duration=12)
+    assert log == [
+        (2.0, "execute", 1, 1),
+        (3.0, 4, [0, 1, 1]),
+        (4.0, "execute", 2, 3),  # is being cancelled
+        (5.0, 5, [0, 1]),
+        (6.0, "execute", 3, 1),
+        (9.0, 4, [0, 1, 1, 2, 3]),
+    ]
+
+
+def test_goal_ids_come_from_the_seed(simulate: Any) -> None:
+    def goal_ids(seed: int) -> list[str]:
+        seen: list[str] = []
+
+        class Noting(Server):
+            def work(self, goal: Any) -> Any:
+                seen.append(bytes(goal.goal_id.uuid).hex())
+                return super().work(goal)
+
+        class Two(Client):
+            def ask(self) -> None:
+                super().ask()
+                super().ask()
+
+        simulate(Noting, lambda: Two(1, []), duration=4, job={"seed": seed})
+        return seen
+
+    first = goal_ids(1)
+    assert len(set(first)) == 2
+    assert all(text[12] == "4" for text in first)  # UUIDs of version 4
+    assert goal_ids(1) == first
+    assert not set(goal_ids(2)) & set(first)
