@@ -366,3 +366,17 @@ def test_a_bad_name_is_told_at_its_node(read: Any, prefix: Path) -> None:
     launched = read("<launch><node pkg='demo' exec='talker' name='a b'/></launch>")
     with pytest.raises(JobError, match=r"a\.launch\.xml:1:9: name: 'a b' is not a node name"):
         node_specs(launched, skip_unsupported=False)
+
+
+def test_the_document_names_all_that_is_read() -> None:
+    from rsltrace.launch.reader import Reader
+    from rsltrace.launch.scope import Values
+    from rsltrace.launch.substitution import Substitutions
+
+    text = (Path(__file__).parents[2] / "docs" / "launch.md").read_text(encoding="utf-8")
+    silent = {"push-ros-namespace", "reset_env", "set_use_sim_time", "set_ros_log_dir", "log",
+              "log_info", "executable", "timer", "ros_timer", "shutdown"}  # fmt: skip
+    for action in set(Reader({})._actions) - silent:
+        assert f"`{action}`" in text, action
+    for name in set(Substitutions(Values(), Path())._known) - {"optenv"}:
+        assert f"`$({name})`" in text or f"`$({name} …)`" in text, name
