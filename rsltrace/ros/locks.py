@@ -8,6 +8,8 @@ of a run, and in real threads, real locks are made.
 from __future__ import annotations
 
 import _thread
+import sys
+import threading
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -57,7 +59,8 @@ class SimLock:
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
             )
         for_ns = None if timeout == -1 else int(timeout * _NS_PER_S)
-        what: Any = _Holder(core, self._owner)
+        in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
+        what: Any = _Holder(core, self._owner, for_work=in_condition)
         if wait(core, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
             self._owner = getcurrent()  # whoever released it has left it taken, for us
             return True
@@ -154,11 +157,11 @@ class SimRLock:
 class _Holder:
     """Says who has a lock, when somebody asks: for the report of a deadlock."""
 
-    def __init__(self, core: Core, owner: greenlet | None) -> None:
+    def __init__(self, core: Core, owner: greenlet | None, *, for_work: bool) -> None:
         self._core = core
         self._owner = owner
         self._me = getcurrent()
-        self._own = owner is self._me
+        self._for_work = for_work
 
     def is_idle(self) -> bool:
         """Say whether a thread waits for work (a queue, an event) that may never come.
@@ -166,8 +169,8 @@ class _Holder:
         So does a main that leaves the work to threads which spin.
         """
         core = self._core
-        if not self._own or core.is_thread(self._me):
-            return self._own
+        if not self._for_work or core.is_thread(self._me):
+            return self._for_work
         program = core.program_of(self._me)
         return program is not None and any(
             blocked.quiet and blocked.program is program and blocked.stack is not self._me
@@ -175,8 +178,10 @@ class _Holder:
         )
 
     def __str__(self) -> str:
-        if self._own:
+        if self._for_work:
             return "somebody to wake it (an event, a condition, a queue, a future)"
+        if self._owner is self._me:
+            return "a lock that it holds itself"
         for blocked in self._core.blocked:
             if blocked.stack is self._owner:
                 return f"a lock that is held by {blocked.describe()}"

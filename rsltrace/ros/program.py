@@ -8,7 +8,7 @@ finds its own. The nodes that the job itself constructs share one program, the h
 from __future__ import annotations
 
 import sys
-from types import ModuleType
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from greenlet import getcurrent, greenlet
@@ -67,12 +67,12 @@ class Program:
         core = self.core
         before, core.program = core.program, self
         places = _places()
-        before._kept = [getattr(module, name) for module, name, _ in places]
+        before._kept = [names[name] for names, name, _ in places]
         if self._kept is None:
             self._kept = [first for _, _, first in places]
             self._kept[0] = self._argv
-        for (module, name, _), value in zip(places, self._kept, strict=True):
-            setattr(module, name, value)
+        for (names, name, _), value in zip(places, self._kept, strict=True):
+            names[name] = value
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -144,15 +144,16 @@ def failure_of(program: Program, error: BaseException) -> NodeError | None:
     return None
 
 
-def _places() -> list[tuple[ModuleType, str, object]]:
+@lru_cache(maxsize=1)
+def _places() -> list[tuple[dict[str, object], str, object]]:
     """Return where process-wide values are kept, and their first values."""
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
     return [
-        (sys, "argv", []),
-        (rclpy, "__executor", None),
-        (rclpy.utilities, "g_default_context", None),
-        (rclpy.context, "g_logging_ref_count", 0),
+        (vars(sys), "argv", []),
+        (vars(rclpy), "__executor", None),
+        (vars(rclpy.utilities), "g_default_context", None),
+        (vars(rclpy.context), "g_logging_ref_count", 0),
     ]

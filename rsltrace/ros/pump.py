@@ -30,8 +30,11 @@ class Pump:
     """The simulated part of one executor."""
 
     def __init__(self, core: Core, executor: Any) -> None:
+        from rclpy import executors
+
         self.core = core
         self.executor = executor
+        self._rclpy: Any = executors
         self.nodes: dict[Any, Mailbox] = {}
         self.tasks = Mailbox(core)
         self.tasks.pump = self
@@ -151,9 +154,7 @@ class Pump:
         return True
 
     def _handler(self, node: Any, mailbox: Mailbox, item: Any) -> tuple[Any, Any, Any]:
-        from rclpy.task import Task
-
-        task = Task(self._run, (mailbox, item), executor=self.executor)
+        task = self._rclpy.Task(self._run, (mailbox, item), executor=self.executor)
         return task, getattr(item, "wrapper", None), node
 
     def _run(self, mailbox: Mailbox, item: Dispatchable) -> None:

@@ -290,6 +290,17 @@ def test_a_deadlock_of_two_locks_names_both_sides(simulate: Any) -> None:
     assert text.count("in take") == 2
 
 
+def test_a_lock_taken_twice_is_a_deadlock_that_names_who_holds_it(simulate: Any) -> None:
+    def program() -> None:
+        rclpy.init()
+        lock = threading.Lock()
+        with lock, lock:
+            pass
+
+    with pytest.raises(DeadlockError, match="program waits for a lock that it holds itself"):
+        simulate(main_spec(program))
+
+
 def test_what_a_thread_raises_ends_the_run(simulate: Any) -> None:
     class Fails(Node):
         def __init__(self) -> None:
