@@ -16,6 +16,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded, Wait
+from rsltrace.ros.exit_handlers import run_exit_handlers
 from rsltrace.ros.failure import exit_status, text_of
 from rsltrace.ros.threads import SimThread
 
@@ -32,8 +33,6 @@ def end_program(program: Program, error: BaseException | None) -> None:
     An exception that nobody caught is raised again: it fails the run, except while that ends.
     """
     core = program.core
-    if error is None or isinstance(error, SystemExit):
-        _wait_for_threads(program)
     program.ended = True
     _stop_threads(program)
     failed = _judge(program, error)
@@ -52,6 +51,16 @@ def end_program(program: Program, error: BaseException | None) -> None:
     alone = not core.fed and all(node.program is not core.host for node in core.graph.nodes)
     if alone and core.loop.stopped is None and all(other.ended for other in core.programs):
         core.loop.stop(Stop(_EVERY_MAIN_ENDED))
+
+
+def finish_process(program: Program, error: BaseException | None) -> None:
+    """Do what Python does when main is over: wait for its threads, run its exit handlers.
+
+    A main that fails ends the run at once instead.
+    """
+    if error is None or isinstance(error, (SystemExit, KeyboardInterrupt)):
+        _wait_for_threads(program)
+        run_exit_handlers(program)
 
 
 def _wait_for_threads(program: Program) -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.blocking import Wait
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.core import Core
+    from rsltrace.ros.exit_handlers import Handler
     from rsltrace.ros.world import Entry
 
 # What a callback raised, which event that was, its stamp (ns), its traceback and its node.
@@ -50,6 +51,7 @@ class Program:
         self.announced = True
         self.contexts: list[ContextHandle] = []
         self.failures: list[Failure] = []
+        self.exit_handlers: list[Handler] = []
         self.stack: greenlet | None = None
         self.begun = False
         self.spun = False
@@ -99,12 +101,16 @@ class Program:
         self.stack.switch()
 
     def _run(self) -> None:
-        from rsltrace.ros.ending import end_program
+        from rsltrace.ros.ending import end_program, finish_process
 
         assert self._main is not None
         error: BaseException | None = None
         try:
             self._main()
+        except BaseException as raised:
+            error = raised
+        try:
+            finish_process(self, error)
         except BaseException as raised:
             error = raised
         end_program(self, error)

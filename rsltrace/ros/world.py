@@ -27,6 +27,7 @@ from rsltrace.ros.boundary import Boundary, installed
 from rsltrace.ros.core import Core
 from rsltrace.ros.ending import end_programs
 from rsltrace.ros.event_loops import simulated_event_loops
+from rsltrace.ros.exit_handlers import own_exit_handlers
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
@@ -90,6 +91,7 @@ class World:
             stack.enter_context(own_executors(self.core))
             stack.enter_context(cooperative_threads(self.core))
             stack.enter_context(simulated_event_loops(self.core))
+            stack.enter_context(own_exit_handlers(self.core))
             rclpy.init(args=[])
             self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())

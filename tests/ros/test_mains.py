@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import sys
 import time
 from typing import Any
@@ -401,3 +402,25 @@ def test_a_main_that_has_cleaned_up_has_spun_all_the_same(simulate: Any) -> None
     recorded = simulate(main_spec(program), duration=2)
     (note,) = recorded.result.notes
     assert note.endswith("program ended at 0.500000000 s")
+
+
+def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program(name: str, exit_ns: int) -> Any:
+        def main() -> None:
+            rclpy.init()
+            node = Node(name)
+            atexit.register(lambda: log.append((name, "first", seconds(node))))
+            atexit.register(log.append, (name, "second"))
+            atexit.register(log.append, "never")
+            atexit.unregister(log.append)
+            atexit.register(log.append, (name, "last"))
+            time.sleep(exit_ns)
+
+        return main_spec(main)
+
+    simulate(program("one", 1), program("two", 9), duration=3)
+    assert log == [
+        ("one", "last"), ("one", "first", 1.0), ("two", "last"), ("two", "first", 1.0),
+    ]  # fmt: skip
