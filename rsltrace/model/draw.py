@@ -37,6 +37,11 @@ def encode_draw(kind: int, value_ns: int = 0) -> int:
     return (kind << _SHIFT) | min(value_ns, _VALUE_MAX)
 
 
+def is_second_copy(number: int) -> bool:
+    """Whether a decision sends a message twice."""
+    return number >> _SHIFT == Draw.DUPLICATE
+
+
 def draw_text(number: int) -> str:
     """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
     kind, value_ns = number >> _SHIFT, number & _VALUE_MAX

@@ -110,7 +110,9 @@ class Scheduling:
             kind = item.kind.label.replace(" ", "_")
             candidate = _candidate(item, node, item.entity_id, kind, item.trace_name(), names)
         else:
-            candidate = _candidate(item, node, 0, "other", item.describe(), ())
+            # A thread that user code has started is on no executor.
+            candidate = _candidate(item, node, 0, "thread", item.describe(), ())
+            return Place(candidate, None, None)
         return Place(candidate, self._workers_of(node), exclusive)
 
     def _workers_of(self, node: NodeHandle | None) -> Workers | None:
@@ -145,7 +147,9 @@ class Scheduling:
     ) -> None:
         """Stand in for ``Core.execute``: draw how long the callback takes, then run it."""
         core, charge = self._core, self._loop.charge
-        duration = self._duration_of(handle, entity, node) if kind in _TAKES_TIME else None
+        duration = None
+        if kind in _TAKES_TIME and isinstance(handle, (EntityHandle, TaskRun)):
+            duration = self._duration_of(handle, entity, node)
         duration_ns = 0 if duration is None else duration(core.loop.now_ns)
         if duration is not None:
             note(core, entity, encode_draw(Draw.EXECUTION, duration_ns))

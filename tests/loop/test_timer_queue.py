@@ -131,3 +131,30 @@ def test_first_is_always_a_timer_with_the_smallest_deadline(
             assert first is not None
             assert first.order in inside
             assert first.deadline_ns == min(timers[i].deadline_ns for i in inside)
+
+
+@given(
+    st.lists(st.tuples(st.integers(0, 20), st.integers(0, 3)), max_size=30),
+    st.integers(0, 20),
+    st.sampled_from(["creation", "heap"]),
+)
+def test_due_gives_all_that_are_due_in_order_and_the_next(
+    entries: list[tuple[int, int]], now_ns: int, ties: str
+) -> None:
+    queue = timer_queue(ties)
+    timers = []
+    for order, (deadline_ns, change) in enumerate(entries):
+        timer = TimerState(deadline_ns, 0, order=order, owner=None)
+        queue.add(timer)
+        if change == 1:
+            queue.remove(timer)
+            continue
+        if change == 2:  # leaves a stale entry behind
+            timer.reset(5)
+            queue.add(timer)
+        timers.append(timer)
+    due, after = queue.due(now_ns)
+    timers.sort(key=lambda timer: (timer.deadline_ns, timer.order))
+    assert due == [timer for timer in timers if timer.deadline_ns <= now_ns]
+    later = [timer for timer in timers if timer.deadline_ns > now_ns]
+    assert after is (later[0] if later else None)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -278,3 +279,20 @@ def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
         job={"bags": [{"path": "bag.mcap", "topics": ["/numbers"]}], "delay": delay},
     )
     assert ears[0].heard == [(1, 200), (2, 200)]
+
+
+def test_viewer_and_cat_say_what_chance_decided(run: Run) -> None:
+    pytest.importorskip("rsltrace_viewer")
+    from rsltrace_viewer.model.run import Run as Opened
+    from rsltrace_viewer.model.text import output_text
+
+    from rsltrace.cli.event_text import EventText
+
+    recorded = run(Talker, Listener, delay={"default": "5ms"}, duration=0.1)
+    with recorded.trace() as trace:
+        event = next(e for e in recorded.events() if e.kind is EventKind.TIMER)
+        outputs = trace.outputs_of(event.index)
+        assert [o.kind for o in outputs] == [OutputKind.MESSAGE, OutputKind.DRAW]
+        assert EventText(trace).line(event, outputs).endswith("/numbers, delay 5 ms (/listener)")
+    with closing(Opened.open(recorded.path)) as opened:
+        assert output_text(opened, outputs[1]) == "delay 5 ms (/listener)"

@@ -208,3 +208,21 @@ def test_a_least_time_step_gathers_what_is_due(simulate: Any) -> None:
     stamps = [e.stamp_ns // 1_000_000 for e in recorded.events() if e.kind.label == "timer"]
     assert stamps == [20, 20, 40, 40, 50, 50]
     assert recorded.result.end_ns == 50_000_000
+
+
+def test_the_ordered_loop_keeps_the_order_of_the_plain_one(tmp_path: Any) -> None:
+    """RSLCPP's network through the other loop, with more workers than it could ever use."""
+    from pathlib import Path
+
+    from rsltrace import load_job, record
+
+    folder = Path(__file__).parents[2] / "examples" / "rslcpp_determinism"
+    text = (folder / "job.yaml").read_text()
+    digests = []
+    for extra in ("", "executors: [{workers: 1000}]\n"):
+        path = tmp_path / "job.yaml"
+        path.write_text(f"search_path: ['{folder}']\n{text}\n{extra}")
+        job = load_job(path)
+        job = job.replace(stop=job.stop.replace(duration="15s", function=None, time=None))
+        digests.append(record(job, tmp_path / "run.mcap", force=True).digest)
+    assert digests[0] == digests[1]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rsltrace.errors import TraceError
+from rsltrace.model.draw import is_second_copy
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import OutputKind
 from rsltrace_viewer.model.inspector import Effects
@@ -88,6 +89,8 @@ def _most(run: Run, index: int) -> int | None:
             total += _receivers(run, entity.name)
         elif output.kind in (OutputKind.REQUEST, OutputKind.RESPONSE):
             total += 1
+        elif output.kind is OutputKind.DRAW:
+            total += is_second_copy(output.hash)
         elif output.kind in (OutputKind.TASK, OutputKind.TIMER, OutputKind.ENTITY):
             return None
     return total if run.row(index)["outputs"] else None

@@ -10,6 +10,7 @@ import struct
 from dataclasses import dataclass
 
 from rsltrace.errors import TraceError
+from rsltrace.model.draw import draw_text
 from rsltrace.model.event import Output, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace_viewer.model.run import Run
@@ -81,6 +82,10 @@ def output_text(run: Run, output: Output) -> str:
     if kind is OutputKind.LOG:
         record = log_of(run, output)
         return printable(f"log {record.level_name} {record.text}") if record else "log"
+    if kind is OutputKind.DRAW:
+        entity = run.entities.get(output.entity)
+        node = run.entities.get(entity.node) if entity is not None else None
+        return draw_text(output.hash) + (f" ({printable(node.name)})" if node is not None else "")
     if kind is OutputKind.ENTITY:
         entity = run.entities.get(output.entity)
         return f"new {entity.kind.label} {name}" if entity else f"new {name}"
