@@ -107,7 +107,12 @@ def _truncated_ms(text: str) -> Any:
 def _lines(path: Path, *, comments: bool = True) -> Iterator[tuple[int, str]]:
     try:
         text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise JobError(
+            f"not UTF-8: byte 0x{error.object[error.start]:02x}; a file of delays is text",
+            where=path.name,
+        ) from None
+    except OSError as error:
         raise JobError(f"cannot be read: {error}", where=path.name) from None
     for number, line in enumerate(text.splitlines(), start=1):
         bare = (line.partition("#")[0] if comments else line).strip()

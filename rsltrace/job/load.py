@@ -104,6 +104,11 @@ def _read(path: Path) -> str:
         raise JobError(f"this is a folder; {advice}", where=name) from None
     except OSError as error:
         raise JobError(f"cannot read the job file: {error.strerror}", where=name) from None
+    if data.startswith(b"\x89MCAP"):
+        raise JobError(
+            "this is a recording, not a job file (rsltrace info, view and diff read traces)",
+            where=name,
+        )
     if len(data) > SIZE_MAX:
         raise JobError(f"larger than {SIZE_MAX >> 20} MiB: this is not a job file", where=name)
     try:

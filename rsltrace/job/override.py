@@ -35,6 +35,10 @@ def apply_override(root: Item, label: str, override: str, *, folder: str) -> Ite
     """
     shown = YamlSource(label, override, folder, is_option=True)
     steps, at = _steps(shown)
+    if steps[0].text in ("base", "include"):
+        raise steps[0].place.error(
+            f"{steps[0].text}: is read before the command line is: write it in the job file"
+        )
     source = parse_yaml(override[at:], label, folder=folder, option=override)
     value = source.root or Item(None, steps[-1].place)
     if value.value is None:

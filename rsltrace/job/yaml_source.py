@@ -24,6 +24,7 @@ VALUES_MAX = 100_000
 SHOWN_COLUMNS = 100
 
 _TAG = "tag:yaml.org,2002:"
+_SHOWN_MAX = 40
 _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 
 
@@ -214,7 +215,8 @@ class _Builder:
         try:
             return _value(kind, text)
         except ValueError:
-            raise self.source.error(f"{text!r} is not a number", _mark(node)) from None
+            shown = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
+            raise self.source.error(f"{shown!r} is not a number", _mark(node)) from None
 
     def _unknown_tag(self, node: Node) -> JobError:
         tag = _tag(node).replace(_TAG, "!!")

@@ -435,6 +435,7 @@ class Core:
         elif isinstance(error, RsltraceError):
             # Raised by the middleware itself: the message says what to do, this says where.
             failure = type(error).__new__(type(error))
+            failure.__dict__.update(error.__dict__)
             Exception.__init__(failure, f"{said}\n  in {where}")
             self.error = failure if isinstance(failure, RunError) else RunError(str(failure))
         else:

@@ -40,3 +40,39 @@ def test_a_bad_until_is_named_as_it_was_typed(
     done = rsltrace("record", "job.yaml", "--until", until)
     assert done.returncode == 2
     assert done.stderr.startswith("rsltrace: error: --until: ")
+
+
+def test_two_nodes_of_one_name_are_explained(job_file: Callable[..., Path], rsltrace: Any) -> None:
+    job_file("nodes: [{node: nodes_under_test:Listener}, {node: nodes_under_test:Listener}]\n")
+    done = rsltrace("record", "job.yaml")
+    assert done.returncode == 3
+    assert "there is already a node named /listener; give one of them another name" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def test_a_number_without_end_is_not_printed_in_full(
+    job_file: Callable[..., Path], rsltrace: Any
+) -> None:
+    job_file(f"nodes: [{{node: nodes_under_test:Listener}}]\nseed: {'9' * 5000}\n")
+    done = rsltrace("record", "job.yaml")
+    assert done.returncode == 2
+    assert "...' is not a number" in done.stderr
+    assert len(done.stderr) < 500
+
+
+def test_a_recording_is_no_job(job_file: Callable[..., Path], rsltrace: Any) -> None:
+    job_file(JOB)
+    assert rsltrace("record", "job.yaml", "--until", "0.1", "-o", "run.mcap").returncode == 0
+    done = rsltrace("record", "run.mcap")
+    assert done.returncode == 2
+    assert "run.mcap: this is a recording, not a job file" in done.stderr
+
+
+@pytest.mark.parametrize("key", ["base", "include"])
+def test_other_files_are_not_named_on_the_command_line(
+    job_file: Callable[..., Path], rsltrace: Any, key: str
+) -> None:
+    job_file(JOB)
+    done = rsltrace("check", "job.yaml", "--set", f"{key}=other.yaml")
+    assert done.returncode == 2, "it would be left out in silence"
+    assert f"--set: {key}: is read before the command line is" in done.stderr
