@@ -26,7 +26,8 @@ def call_differences(
         return (*differing, *(call for call in inside if call.a == call.b))[:CALLS_MAX]
     some = a or b
     node = some.entity.node if some is not None else ""
-    before = _paired(_before(run_a, a, node), _before(run_b, b, node)) if node else []
+    # Where one run has no such event: up to there the two agree, indexes and all.
+    before = _paired(_before(run_a, a or b, node), _before(run_b, b or a, node)) if node else []
     earlier = [call for call in before if call.a != call.b][:EARLIER_MAX]
     return (*earlier, *inside)[:CALLS_MAX]
 

@@ -25,7 +25,6 @@ from rsltrace.model.finding import Mode, Source
 _NS = 1_000_000_000
 
 REAL_TIME_MODULES = {
-    "asyncio.base_events",
     "multiprocessing.connection",
     "multiprocessing.popen_fork",
     "multiprocessing.synchronize",
@@ -162,6 +161,21 @@ def _utcnow(real: Any) -> Any:
         )
 
     return utcnow
+
+
+def numpy_now(function: Any, text: str, *more: Any) -> Any:
+    """Do ``np.datetime64("now")``, which asks the C library: user modules come here instead."""
+    real = function(text, *more)
+    guard = engaged()
+    if guard is None:
+        return real
+    return clock_call(
+        guard,
+        sys._getframe(1),
+        f"datetime64({text!r})",
+        lambda now_ns: function(now_ns, "ns").astype(real.dtype),
+        lambda: real,
+    )
 
 
 @contextmanager

@@ -11,6 +11,7 @@ import _thread
 import hashlib
 import os
 import re
+import resource
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -163,6 +164,7 @@ def _one(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _W
 _HANDLERS: dict[str, Callable[[tuple[Any, ...], FrameType], _Wanted]] = {
     "open": _opened,
     "ctypes.dlsym": _foreign_function,
+    "ctypes.addressof": lambda arguments, frame: (Source.ADDRESS, "ctypes.addressof()", ""),
     "builtins.id": lambda arguments, frame: (Source.ADDRESS, "id()", hex(arguments[0])),
     **{event: _one(Source.PROCESS, name) for event, name in _PROCESSES.items()},
     **{event: _one(Source.SOCKET, event) for event in _SOCKETS},
@@ -242,13 +244,11 @@ def _watched_functions() -> Iterator[tuple[Source, str, Any]]:
         yield Source.ENVIRONMENT, name, function
     for name, function in builtin(signal, "alarm", "setitimer"):
         yield Source.THREAD, name, function
-    for module, source, names in (
-        ("resource", Source.CLOCK, ("getrusage",)),
-        ("_ssl", Source.RANDOM, ("RAND_bytes",)),
-    ):
-        if module in sys.modules:
-            for name, function in builtin(sys.modules[module], *names):
-                yield source, name, function
+    for name, function in builtin(resource, "getrusage"):
+        yield Source.CLOCK, name, function
+    if "_ssl" in sys.modules:
+        for name, function in builtin(sys.modules["_ssl"], "RAND_bytes"):
+            yield Source.RANDOM, name, function
 
 
 @contextmanager
@@ -285,8 +285,8 @@ _SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
 def _reading(method: str, real: Callable[..., Any]) -> Any:
     def read(self: Any, *arguments: Any) -> Any:
         guard = engaged()
-        if guard is None or self is not os.environ:
-            return real(self, *arguments)
+        if guard is None or self is not os.environ or str(*arguments).startswith("PYTHON"):
+            return real(self, *arguments)  # PYTHON…: what Python looks at for itself
         frame = sys._getframe(1)
         if method == "__iter__":
             guard.watched(Source.ENVIRONMENT, "os.environ", f"{len(self)} variables", frame)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
+from rsltrace.guard.ordering import ordered_sets
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.randomness import begin_shared
 from rsltrace.job import Job, NodeSpec, policy_of
@@ -85,6 +86,8 @@ def guarding(stack: ExitStack, job: Job) -> Guarding:
     if job.guard.enabled:
         stack.enter_context(pinned_place())
         stack.enter_context(installed())
+        folders = [str(job.resolve(folder)) for folder in job.search_path]
+        stack.enter_context(ordered_sets(folders, _packages(job.nodes)))
     return Guarding(job)
 
 

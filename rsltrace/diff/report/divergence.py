@@ -147,7 +147,7 @@ def _calls(found: Divergence, width: int) -> Section:
                 text = "not called" if value is None else printable(value)
                 rows.append(cut(line("      ", (f"{name} ", style), text), width))
         rows.append(cut(line((f"      at {printable(call.where)}", FAINT)), width))
-    title = "calls in it whose answers come from outside"
+    title = "calls whose answers come from outside"
     return Section(line((title, TITLE)), rows, 8, "lines", least=3)
 
 
