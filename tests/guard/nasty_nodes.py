@@ -350,14 +350,14 @@ def threads_with_queue(node: Any) -> object:
     return [words.get(timeout=1) for _ in range(3)]
 
 
-@case(DETERMINISTIC, "asyncio")
+@case(DETERMINISTIC, "asyncio, with sleeps of random length")
 def asyncio_sleep(node: Any) -> object:
     async def sleep(seconds: float) -> float:
         await asyncio.sleep(seconds)
         return asyncio.get_running_loop().time()
 
     async def both() -> object:
-        return await asyncio.gather(sleep(0.003), sleep(0.001))
+        return await asyncio.gather(sleep(0.003), sleep(random.random() / 100))
 
     return asyncio.run(both())
 
