@@ -212,3 +212,74 @@ def test_wrong_ros_arguments(rsltrace: Callable[..., subprocess.CompletedProcess
         assert done.returncode == 2
         assert message in done.stderr
         assert "Traceback" not in done.stderr
+
+
+# -- installed executables -------------------------------------------------------------------------
+
+TALKER = """#!/usr/bin/env python3
+import sys
+
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+
+
+def main():
+    rclpy.init(args=sys.argv)
+    node = Node('talker')
+    node.declare_parameter('rate', 1.0)
+    node.declare_parameter('word', 'none')
+    publisher = node.create_publisher(String, 'chatter', 10)
+    text = node.get_parameter('word').value + ' ' + ' '.join(sys.argv[1:2])
+    timer = node.create_timer(1.0 / node.get_parameter('rate').value,
+                              lambda: publisher.publish(String(data=text)))
+    try:
+        rclpy.spin(node)
+    finally:
+        node.get_logger().info('goodbye')
+        node.destroy_node()
+
+
+if __name__ == '__main__':
+    main()
+"""
+
+EXECUTABLES = """<launch>
+  <arg name="robots" default="true"/>
+  <group if="$(var robots)">
+    <push_ros_namespace namespace="one"/>
+    <node pkg="demo" exec="talker" name="talk" args="--loud">
+      <param from="$(find-pkg-share demo)/config/demo.yaml"/>
+      <param name="rate" value="4.0"/>
+      <remap from="chatter" to="/chat"/>
+    </node>
+  </group>
+  <node pkg="demo" exec="talker" namespace="two"><param name="word" value="second"/></node>
+</launch>
+"""
+
+
+def test_installed_executables_run_with_what_the_launch_file_gives_them(
+    rsltrace: Callable[..., subprocess.CompletedProcess[str]], prefix: Path, folder: Path
+) -> None:
+    (prefix / "lib" / "demo" / "talker").write_text(TALKER)
+    (folder / "robots.launch.xml").write_text(EXECUTABLES)
+    done = rsltrace("record", "--launch", "robots.launch.xml", "--until", "2")
+    assert done.returncode == 0, done.stderr
+    assert "[one.talk]: goodbye" in done.stderr
+    assert "[two.talker]: goodbye" in done.stderr
+    with Trace.open("robots.mcap") as trace:
+        said = {
+            topic: [(stamp, trace.decode(topic, data).data) for stamp, _, data in
+                    trace.messages(topic)]  # type: ignore[attr-defined]
+            for topic in ("/chat", "/two/chatter")
+        }  # fmt: skip
+    quarter = 250_000_000
+    assert said["/chat"] == [(n * quarter, "from file --loud") for n in range(1, 9)]
+    assert said["/two/chatter"] == [(n * 4 * quarter, "second ") for n in (1, 2)]
+
+    one = rsltrace("record", "--launch", "robots.launch.xml", "robots:=false", "--until", "2",
+                   "-o", "one.mcap", "--ros-args", "-p", "rate:=2.0")  # fmt: skip
+    assert one.returncode == 0, one.stderr
+    with Trace.open("one.mcap") as trace:
+        assert len(list(trace.messages("/two/chatter"))) == 4

@@ -489,3 +489,17 @@ def test_simulations_one_after_the_other_do_not_disturb_each_other(simulate: Any
             sim.run_for(3)
             digests.append((sim.events, sim.node("listener").total))
     assert digests[0] == digests[1]
+
+
+def test_nodes_of_mains_and_their_end(job_file: Any, tmp_path: Path) -> None:
+    job = job_file(MAINS, MORE + MAIN)
+    with Simulation(job, tmp_path / "t.mcap") as sim:
+        sim.run_for("2.5s")
+        assert [value for _, value in sim.node("echo").heard] == [1, 2]
+        sim.publish("numbers", _number(100))
+        sim.run_for("0.1s")
+        assert [value for _, value in sim.node("echo").heard] == [1, 2, 100]
+        assert sim.call(sim.node("echo").say, 5) == "said"
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        logs = [trace.decode("/rosout", data) for _, _, data in trace.messages("/rosout")]
+    assert "goodbye" in [log.msg for log in logs]  # type: ignore[attr-defined]
