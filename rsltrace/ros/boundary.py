@@ -407,6 +407,18 @@ def boundary() -> Boundary:
     return _installed
 
 
+def check_free() -> None:
+    """Raise UnsupportedError if a simulation is under way in this process: rclpy can be only one's.
+
+    :raises SetupError: if rclpy is not installed or cannot be loaded.
+    """
+    if boundary()._core is not None:
+        raise UnsupportedError(
+            "another simulation is running in this process: end it first (leave the block of the "
+            "other Simulation), or use a process of its own"
+        )
+
+
 @contextmanager
 def installed() -> Iterator[Boundary]:
     """Have rclpy use the simulated middleware within the ``with`` block."""

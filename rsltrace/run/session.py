@@ -128,8 +128,10 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
+        from rsltrace.ros.boundary import check_free
         from rsltrace.ros.world import World
 
+        check_free()
         expanded = expand(self.job, why_not=why_not)
         self.job = expanded.job
         job, observer = self.job, self._observer

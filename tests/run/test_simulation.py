@@ -482,6 +482,18 @@ def test_a_node_cannot_drive_its_own_simulation(job_file: Any) -> None:
         sim.run_for(2)
 
 
+def test_one_simulation_at_a_time(simulate: Any, tmp_path: Path) -> None:
+    with simulate(GRAPH) as sim:
+        sim.step()
+        with pytest.raises(UnsupportedError, match="another simulation is running"):
+            simulate(GRAPH, tmp_path / "t.mcap").__enter__()
+        with pytest.raises(UnsupportedError, match="another simulation is running"):
+            rsltrace.record(sim._session.job, None)
+        assert sim.run_for(2)
+        assert sim.node("talker").count == 3
+    assert not (tmp_path / "t.mcap").exists()
+
+
 def test_simulations_one_after_the_other_do_not_disturb_each_other(simulate: Any) -> None:
     digests = []
     for _ in range(2):
