@@ -17,12 +17,21 @@ def substituted_parameters(
     path: str, replaced: Callable[[str], str], full_name: str | None
 ) -> dict[str, Any]:
     """Return the parameters for a node in a file that has substitutions in it."""
-    return matching(replaced(Path(path).read_text(encoding="utf-8")), path, full_name)
+    return matching(replaced(_read(path)), path, full_name)
 
 
 def parameters_for(path: str, full_name: str | None) -> dict[str, Any]:
     """Return the parameters a file gives a node, flat; without a name, those for all nodes."""
-    return matching(Path(path).read_text(encoding="utf-8"), path, full_name)
+    return matching(_read(path), path, full_name)
+
+
+def _read(path: str) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except OSError as error:
+        raise JobError(f"cannot read the parameter file: {error.strerror}", where=path) from None
+    except UnicodeDecodeError:
+        raise JobError("the parameter file is not UTF-8 text", where=path) from None
 
 
 def matching(text: str, path: str, full_name: str | None) -> dict[str, Any]:

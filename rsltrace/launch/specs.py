@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -147,7 +148,10 @@ class _RosWords:
         if option in ("--log-level", "--log-file-name", "--log-config-file", "-e", "--enclave"):
             return
         if option == "--params-file":
-            self.parameters.append(ParameterFile(value))
+            path = os.path.abspath(value)
+            if not os.path.isfile(path):
+                raise JobError(f"there is no parameter file {value}", where=self._where)
+            self.parameters.append(ParameterFile(path))
             return
         name, assigned, to = value.partition(":=")
         if option not in ("-r", "--remap", "-p", "--param") or not assigned:

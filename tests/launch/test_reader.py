@@ -79,7 +79,7 @@ def test_arguments_and_conditions(
     last = node_specs(launched, skip_unsupported=False)[-1]
     assert (last.namespace, last.parameters) == ("/given", {"shared": 7, "a.b": 3})
     assert last.remappings == {"tf": "/tf_all", "x": "y"}
-    assert last.parameter_files == ("extra.yaml",)
+    assert [Path(file).name for file in last.parameter_files] == ["extra.yaml"]
 
 
 def test_groups_keep_their_values_to_themselves(read: Any) -> None:
@@ -354,6 +354,7 @@ def test_a_python_launch_file_needs_ros(read: Any) -> None:
         ("-q x", "unknown ROS argument -q x"),
         ("-p", "the ROS argument -p has no value"),
         ("-r nothing", "unknown ROS argument -r nothing"),
+        ("--params-file none.yaml", "there is no parameter file none.yaml"),
     ],
 )
 def test_mistakes_in_ros_arguments(read: Any, prefix: Path, words: str, message: str) -> None:
