@@ -40,7 +40,7 @@ def job_schema() -> Schema:
             "description": "Text with $(env NAME default), $(var NAME), $(find-pkg-share PACKAGE) "
             "or $(dirname) in it",
             "type": "string",
-            "pattern": r"\$\(",
+            "pattern": r"\$\(.+\)",
         },
         "Parameter": _parameter(),
     }
