@@ -101,12 +101,28 @@ def cli() -> None:
 def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> NoReturn:
     """Run the command line (``words``: what follows the program's name) and exit."""
     words = sys.argv[1:] if words is None else words
+    _open_standard_streams()
     if list(words[:1]) == ["record"]:
         from rsltrace.guard.pin import pin
 
         pin()
     cli.main(args=list(words), prog_name=prog_name)
     raise AssertionError("click exits")
+
+
+def _open_standard_streams() -> None:
+    """Put nothing in the place of output streams that whoever started us has closed.
+
+    Python has None for them then, and the next file that is opened (the trace) would get their
+    number, for all that writes to it below Python.
+    """
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        if getattr(sys, name) is None:
+            devnull = os.open(os.devnull, os.O_WRONLY)
+            if devnull != number:
+                os.dup2(devnull, number)
+                os.close(devnull)
+            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
 
 
 def _fail(message: str, status: int) -> NoReturn:
