@@ -178,6 +178,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "stop": {
             "duration_ns": None,
             "time_ns": None,
+            "timeout_ns": None,
             "events": None,
             "topic": None,
             "function": None,
@@ -195,6 +196,8 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "executors": None,
         "execution": None,
         "clocks": [],
+        "hooks": {"before": None, "after": None},
+        "progress": None,
         "guard": {
             "enabled": True,
             "state": "false",
