@@ -23,7 +23,17 @@ if TYPE_CHECKING:
     from rsltrace.diff.model import Diff, Verdict
     from rsltrace.diff.options import DiffOptions
     from rsltrace.errors import RsltraceError
-    from rsltrace.job import BagSpec, Job, NodeSpec, RecordSpec, StopSpec, TopicStop, load_job
+    from rsltrace.job import (
+        BagSpec,
+        HooksSpec,
+        Job,
+        LaunchSpec,
+        NodeSpec,
+        RecordSpec,
+        StopSpec,
+        TopicStop,
+        load_job,
+    )
     from rsltrace.run import RunResult, Simulation, record
     from rsltrace.trace.reader import Trace
 
@@ -32,7 +42,9 @@ _HOMES = {
     "BagSpec": "rsltrace.job",
     "Diff": "rsltrace.diff.model",
     "DiffOptions": "rsltrace.diff.options",
+    "HooksSpec": "rsltrace.job",
     "Job": "rsltrace.job",
+    "LaunchSpec": "rsltrace.job",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
     "RsltraceError": "rsltrace.errors",
@@ -52,7 +64,9 @@ __all__ = [
     "BagSpec",
     "Diff",
     "DiffOptions",
+    "HooksSpec",
     "Job",
+    "LaunchSpec",
     "NodeSpec",
     "RecordSpec",
     "RsltraceError",

@@ -79,6 +79,8 @@ def record(
         return
     if not loaded.guard.enabled:
         unpin()
+    if loaded.launch and not (loaded.stop.model_fields_set or loaded.bags):
+        _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
     path = output or default_output(named)
     if bag is not None:
         check_bag_folder(bag, force=force)

@@ -6,6 +6,11 @@ from dataclasses import dataclass, field
 
 from rsltrace.launch.scope import Parameters
 
+ENVIRONMENT = (
+    "{where}: environment variable {name}: it counts for the launch file only; nodes see the "
+    "environment that rsltrace was started with"
+)
+
 
 @dataclass(frozen=True, slots=True)
 class LaunchedNode:

@@ -15,7 +15,7 @@ from typing import Any
 from rsltrace.errors import JobError
 from rsltrace.job.yaml_source import Place
 from rsltrace.launch.element import Attribute, Element
-from rsltrace.launch.model import Argument, Launched, Unsupported
+from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, Unsupported
 from rsltrace.launch.nodes import Nodes
 from rsltrace.launch.scope import ParameterFile, Values, joined_namespace
 from rsltrace.launch.substitution import Substitutions, truth
@@ -257,6 +257,11 @@ class Reader:
         element.check(["name", "value"])
         name = self.needed(element, "name")
         self.values.environment[name] = self.needed(element, "value")
+        self._note_environment(element, name)
+
+    def _note_environment(self, element: Element, name: str) -> None:
+        where = element.place.source.where(element.place.mark)
+        self.launched.ignored.append(ENVIRONMENT.format(where=where, name=name))
 
     def _append_env(self, element: Element) -> None:
         element.check(["name", "value", "prepend", "separator"])
@@ -267,10 +272,13 @@ class Reader:
         if self.flag(element.get("prepend"), False):
             parts.reverse()
         self.values.environment[name] = separator.join(parts)
+        self._note_environment(element, name)
 
     def _unset_env(self, element: Element) -> None:
         element.check(["name"])
-        self.values.environment.pop(self.needed(element, "name"), None)
+        name = self.needed(element, "name")
+        self.values.environment.pop(name, None)
+        self._note_environment(element, name)
 
     def _reset_env(self, element: Element) -> None:
         self.values.environment.clear()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.launch.model import Argument, Launched, LaunchedNode, Unsupported
+from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.launch.scope import ParameterFile, Parameters
 from rsltrace.launch.values import yaml_value
@@ -80,7 +80,12 @@ class _Visitor:
     def visit(self, entity: Any) -> None:
         """Do what an entity does, and its sub-entities, except for starting processes."""
         from launch import Action
-        from launch.actions import DeclareLaunchArgument
+        from launch.actions import (
+            AppendEnvironmentVariable,
+            DeclareLaunchArgument,
+            SetEnvironmentVariable,
+            UnsetEnvironmentVariable,
+        )
 
         if isinstance(entity, Action):
             if entity.condition is not None and not entity.condition.evaluate(self._context):
@@ -89,6 +94,12 @@ class _Visitor:
                 return
             if isinstance(entity, DeclareLaunchArgument):
                 self._declare(entity)
+            elif isinstance(
+                entity,
+                (SetEnvironmentVariable, AppendEnvironmentVariable, UnsetEnvironmentVariable),
+            ):
+                name = self._text(entity.name)
+                self.launched.ignored.append(ENVIRONMENT.format(where=self.where(), name=name))
         for inner in entity.visit(self._context) or ():
             self.visit(inner)
 

@@ -105,6 +105,9 @@ def test_groups_keep_their_values_to_themselves(read: Any) -> None:
         ("z3", "/rel"),
         ("w3none", None),
     ]
+    assert [note.split(":", 3)[3][:33] for note in launched.ignored] == [
+        " environment variable RSLTRACE_T:"
+    ] * 2
 
 
 def test_includes(read: Any, write: Any) -> None:

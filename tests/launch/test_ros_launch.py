@@ -96,6 +96,7 @@ def evaluate(write: Callable[..., Path], prefix: Path) -> Callable[..., Launched
 def test_a_python_launch_file(evaluate: Any) -> None:
     launched = evaluate(PYTHON, "a.launch.py", robot="jackal")
     assert "RSLTRACE_T" not in os.environ
+    assert "environment variable RSLTRACE_T" in launched.ignored[0]
     specs = node_specs(launched, skip_unsupported=True, why_not=lambda package, name: None)
     names = [(spec.target, spec.namespace, spec.name) for spec in specs]
     assert names == [
