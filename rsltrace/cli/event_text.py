@@ -9,12 +9,13 @@ from rsltrace.model.draw import draw_text
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, EventFlag, Output, OutputKind
 from rsltrace.model.finding import Finding
-from rsltrace.model.printable import printable
+from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.reader import Trace
 
 _LOG_LEVELS = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
+_VALUE_MAX = 200
 _COLUMN_MAX = 40
 """A column is as wide as its longest name, up to here; longer names push the rest to the right."""
 
@@ -56,7 +57,8 @@ class EventText:
         where = printable(finding.stack.partition("\n")[0])
         return (
             f"{'':>{self._index_width}}  ! {finding.source.value} {finding.mode.value}: "
-            f"{printable(finding.call)} -> {printable(finding.value)}  at {where}"
+            f"{printable(finding.call)} -> "
+            f"{shortened(printable(finding.value), _VALUE_MAX)}  at {where}"
         )
 
     def _output(self, output: Output) -> str:

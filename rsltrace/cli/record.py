@@ -41,6 +41,12 @@ if TYPE_CHECKING:
 @click.option("--force", is_flag=True, help="Overwrite an existing trace, and bag.")
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option(
+    "--replay",
+    type=click.Path(path_type=Path),
+    metavar="TRACE",
+    help="Give the nodes what TRACE recorded from outside (guard: mode record).",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.option("--print-job", is_flag=True, help="Print the job as YAML instead of running it.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
@@ -53,6 +59,7 @@ def record(
     force: bool,
     seed: int | None,
     until: str | None,
+    replay: Path | None,
     as_json: bool,
     overrides: tuple[str, ...],
     print_job: bool,
@@ -97,6 +104,7 @@ def record(
             force=force,
             echo=not quiet,
             observer=Observer(progress=on_progress, interrupt=on_interrupt, note=tell),
+            replay=replay,
         )
     _report(result, path, told, as_json=as_json)
     if bag is not None:

@@ -37,6 +37,13 @@ REAL_TIME_MODULES = {
 they read must go on. Their users get simulated time."""
 
 
+_wall_ns = copy_of(time.time_ns)  # type: ignore[arg-type]
+_REAL_NS = {
+    name: copy_of(getattr(time, f"{name}_ns"))
+    for name in ("monotonic", "perf_counter", "process_time", "thread_time")
+}
+
+
 def clock_call(
     guard: Guard,
     frame: FrameType,
@@ -54,7 +61,10 @@ def clock_call(
         return virtual(guard.context.now_ns())
     if mode is Mode.ALLOW:
         return real()
-    value = guard.outside(Source.CLOCK, call, real) if mode is Mode.RECORD else real()
+    if mode is Mode.RECORD:
+        real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
+        return virtual(guard.recorded(Source.CLOCK, call, real_ns, frame))
+    value = real()
     guard.found(Source.CLOCK, mode, call, value, frame)
     return value
 

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import module_of, stack_of, user_frame
-from rsltrace.guard.outside import Outside
+from rsltrace.guard.outside import Outside, decoded
 from rsltrace.guard.redirect import copy_of
 from rsltrace.guard.streams import Streams
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
@@ -124,7 +124,7 @@ class Guard:
         if event != self._event:
             self._event, self._in_event = event, 0
         self._in_event += 1
-        if self._in_event <= FINDINGS_PER_EVENT or mode is Mode.ERROR:
+        if self._in_event <= FINDINGS_PER_EVENT or mode in (Mode.ERROR, Mode.RECORD):
             user = user_frame(frame, self.packages)
             stack = stack_of(user or frame, self.packages)
             text = value if isinstance(value, str) else repr(value)
@@ -136,6 +136,16 @@ class Guard:
                     f"{ADVICE[source]}"
                 )
 
+    def recorded(self, source: Source, call: str, real: Callable[[], Any], frame: FrameType) -> Any:
+        """Return the answer to a call from outside; the trace keeps it for a re-run.
+
+        :raises OSError: if that is what was answered.
+        """
+        with engage(None):
+            text = self.outside.answer(self.context.node(), call, real)
+        self.found(source, Mode.RECORD, call, text, frame)
+        return decoded(text)
+
     def watched(self, source: Source, call: str, value: object, frame: FrameType) -> None:
         """Report a call that cannot be virtual, if user code made it and the job wants to know."""
         user = user_frame(frame, self.packages)
@@ -144,7 +154,9 @@ class Guard:
         mode = self.mode(source, frame)
         if mode is Mode.ALLOW:
             return
-        self.found(source, Mode.WARN if mode is Mode.VIRTUAL else mode, call, value, frame)
+        # What cannot be made virtual or be recorded is told all the same.
+        told = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
+        self.found(source, told, call, value, frame)
 
     def clock_read(self) -> None:
         """Keep whoever reads a clock until time has passed from waiting for ever."""

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from rsltrace.guard.clocks import clocks
 from rsltrace.guard.folders import folders
 from rsltrace.guard.randomness import randomness
+from rsltrace.guard.recorded_files import recorded_files
 from rsltrace.guard.watch import watching
 
 _users = 0
@@ -20,7 +21,7 @@ def installed() -> Iterator[None]:
     global _users, _stack
     if _users == 0:
         with ExitStack() as stack:
-            for replacement in (clocks, randomness, folders, watching):
+            for replacement in (clocks, randomness, folders, watching, recorded_files):
                 stack.enter_context(replacement())
             _stack = stack.pop_all()
     _users += 1

@@ -25,6 +25,9 @@ _NODE_ID = 0x02_00_00_00_00_01
 """A locally administered MAC address, for ``uuid1`` and ``getnode``."""
 
 
+_real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
+
+
 def _drawn(
     call: str,
     real: Callable[..., Any],
@@ -42,15 +45,20 @@ def _drawn(
             return real(*arguments, **options)
         frame = sys._getframe(1)
         mode = guard.mode(Source.RANDOM, frame)
+        if mode is Mode.RECORD:
+            guard.streams.begin(
+                guard.stream(frame),
+                lambda: guard.recorded(
+                    Source.RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame
+                ),
+            )
+            return virtual(guard, frame)(*arguments, **options)
         if mode is Mode.VIRTUAL:
             guard.count(Source.RANDOM, mode, call, frame)
             return virtual(guard, frame)(*arguments, **options)
         if mode is Mode.ALLOW:
             return real(*arguments, **options)
-        if mode is Mode.RECORD:
-            value = guard.outside(Source.RANDOM, call, lambda: real(*arguments, **options))
-        else:
-            value = real(*arguments, **options)
+        value = real(*arguments, **options)
         guard.found(Source.RANDOM, mode, call, _shown(value), frame)
         return value
 

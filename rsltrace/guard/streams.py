@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from random import Random
 from typing import Any
 
@@ -15,14 +16,25 @@ class Streams:
         self._entropy: dict[str, Random] = {}
         self._numpy: dict[str, Any] = {}
         self.last_uuid: dict[str, int | None] = {}
+        self._begun: dict[str, str] = {}
+
+    def begin(self, name: str, entropy: Callable[[], str]) -> None:
+        """Let a node's streams begin with entropy from outside, the first time it draws."""
+        if name not in self._begun:
+            self._begun[name] = ""  # in case asking for it draws
+            self._begun[name] = entropy()
+
+    def _seed_of(self, name: str) -> str:
+        entropy = self._begun.get(name)
+        return f"{self._seed} {entropy}" if entropy else str(self._seed)
 
     def random(self, name: str) -> Random:
         """Return the stand-in for the generator behind ``random``'s functions."""
-        return _made(self._random, f"random {self._seed}", name)
+        return _made(self._random, f"random {self._seed_of(name)}", name)
 
     def entropy(self, name: str, size: int) -> bytes:
         """Return the next bytes in place of the operating system's."""
-        return _made(self._entropy, f"entropy {self._seed}", name).randbytes(size)
+        return _made(self._entropy, f"entropy {self._seed_of(name)}", name).randbytes(size)
 
     def numpy(self, name: str) -> Any:
         """Return the stand-in for the generator behind ``numpy.random``'s functions."""
@@ -30,7 +42,7 @@ class Streams:
         if found is None:
             import numpy as np
 
-            seed = Random(f"numpy {self._seed} {name}").getrandbits(32)
+            seed = Random(f"numpy {self._seed_of(name)} {name}").getrandbits(32)
             found = self._numpy[name] = np.random.RandomState(seed)
         return found
 

@@ -19,9 +19,10 @@ from contextlib import ExitStack, contextmanager
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
+from rsltrace.guard.callers import user_frame
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.model.finding import Source
+from rsltrace.model.finding import Mode, Source
 
 _HASHED_BYTES_MAX = 64 << 20
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
@@ -292,6 +293,17 @@ def _reading(method: str, real: Callable[..., Any]) -> Any:
             guard.watched(Source.ENVIRONMENT, "os.environ", f"{len(self)} variables", frame)
             return real(self)
         call = f"os.environ[{arguments[0]!r}]"
+        if (
+            guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD
+            and user_frame(frame, guard.packages) is not None
+        ):
+            held: Any = self
+            kept = guard.recorded(
+                Source.ENVIRONMENT, call, lambda: held._data.get(held.encodekey(*arguments)), frame
+            )
+            if kept is None:
+                raise KeyError(*arguments)
+            return self.decodevalue(kept)
         try:
             value = real(self, *arguments)
         except KeyError:

@@ -6,8 +6,10 @@ import json
 import re
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsltrace.errors import JobError
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.ordering import ordered_sets
@@ -17,6 +19,7 @@ from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
+from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
@@ -31,7 +34,7 @@ class Guarding:
         self.guard: Guard | None = None
         self._core: Core | None = None
 
-    def begin(self, core: Core) -> None:
+    def begin(self, core: Core, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
         from rsltrace.ros.guarded import GuardContext
 
@@ -46,6 +49,8 @@ class Guarding:
         early: list[Finding] = []
 
         self._core = core
+        if replay is not None and not self._job.guard.enabled:
+            raise JobError("'guard: false' in the job: nothing from outside can be given again")
         job = self._job
         if job.guard.enabled:
             self.guard = Guard(
@@ -56,6 +61,10 @@ class Guarding:
                 on_finding=on_finding,
             )
             begin_shared(job.seed)
+            if replay is not None:
+                with Trace.open(replay) as trace:
+                    kept = [one for found in trace.findings.values() for one in found]
+                self.guard.outside.replay(kept, str(replay))
         core.default_policy = policy_of(job.guard)
 
     @property

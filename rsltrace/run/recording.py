@@ -10,16 +10,22 @@ from rsltrace.run.session import RunResult, Session
 
 
 def record(
-    job: Job, output: str | Path | None, *, force: bool = False, echo: bool = False
+    job: Job,
+    output: str | Path | None,
+    *,
+    force: bool = False,
+    echo: bool = False,
+    replay: str | Path | None = None,
 ) -> RunResult:
     """Run a job and record it to ``output`` (None: run without recording).
 
-    ``echo`` prints the nodes' log records on stderr.
+    ``echo`` prints the nodes' log records on stderr. ``replay`` is a trace of the same job: what
+    its nodes got from outside (``guard:``, mode ``record``) is given to them again.
 
     :raises RunError: what went wrong in the run; the trace is complete up to there.
     :raises JobError, SetupError, BagError, OutputError: the run could not start or be written.
     """
-    result = run(job, output, force=force, echo=echo)
+    result = run(job, output, force=force, echo=echo, replay=replay)
     if result.error is not None:
         raise result.error
     return result
@@ -32,10 +38,12 @@ def run(
     force: bool = False,
     echo: bool = False,
     observer: Observer | None = None,
+    replay: str | Path | None = None,
 ) -> RunResult:
     """Do ``record``, but return a failed run's error in the result instead of raising it."""
     path = None if output is None else Path(output)
-    with Session(job, path, force=force, echo=echo, observer=observer) as session:
+    earlier = None if replay is None else Path(replay)
+    with Session(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session:
         session.begin()
         if not session.ended:
             session.go_on()

@@ -97,8 +97,10 @@ class Session:
         force: bool = False,
         echo: bool = False,
         observer: Observer | None = None,
+        replay: Path | None = None,
     ) -> None:
         self.job = job
+        self._replay = replay
         self.stop: Stop | None = None
         self._output = output
         self._force = force
@@ -164,7 +166,7 @@ class Session:
             with self._guarded.engaged():
                 world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
         world.use_clocks(clocks_of(job), self.start_ns)
-        self._guarded.begin(world.core)
+        self._guarded.begin(world.core, self._replay)
         with self._guarded.engaged():
             loop.stop_conditions = tuple(
                 stop_conditions(job, self.start_ns, world.core.outside_events)

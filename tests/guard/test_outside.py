@@ -1,0 +1,169 @@
+"""Mode ``record``: what came from outside is in the trace, and a re-run gets it again."""
+
+from __future__ import annotations
+
+import http.server
+import os
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.errors import GuardError, JobError, TraceError
+from rsltrace.job import load_job
+from rsltrace.model.finding import Mode
+from rsltrace.run import run
+from rsltrace.trace.reader import Trace
+from tests.guard.conftest import node_code
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def go(tmp_path: Path) -> Callable[..., Any]:
+    """Write and record a job of node ``m:N``; its result."""
+
+    def record(code: str, guard: str, name: str, replay: Path | None = None) -> Any:
+        (tmp_path / "m.py").write_text(code)
+        (tmp_path / "job.yaml").write_text(
+            f"nodes: [{{node: 'm:N'}}]\nstop: {{duration: 1.2s}}\nguard: {guard}\n"
+        )
+        job = load_job(tmp_path / "job.yaml")
+        return run(job, tmp_path / f"{name}.mcap", force=True, replay=replay)
+
+    return record
+
+
+def test_real_clocks_and_real_chance_are_given_again(go: Callable[..., Any]) -> None:
+    code = node_code(
+        "self.say(time.time(), time.monotonic_ns(), str(datetime.now()), time.strftime('%c'),\n"
+        "    random.random(), os.urandom(4).hex(), str(uuid.uuid4()), np.random.rand(),\n"
+        "    np.random.default_rng().random(), random.Random().random(), AT_IMPORT)",
+        imports="import os, random, time, uuid\nimport numpy as np\nfrom datetime import datetime",
+        module="AT_IMPORT = time.time()",
+    )
+    guard = "{clock: record, random: record}"
+    first, second = go(code, guard, "first"), go(code, guard, "second")
+    assert first.error is None
+    assert first.digest != second.digest
+    again = go(code, guard, "again", replay=first.path)
+    assert again.digest == first.digest
+    assert again.path.read_bytes() == first.path.read_bytes()
+    assert go(code, guard, "again", replay=again.path).digest == first.digest
+
+
+def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
+    code = node_code(
+        "start = time.perf_counter()\nsum(range(1000))\nself.say(time.perf_counter() - start)",
+        imports="import time",
+    )
+    first = go(code, "{clock: record}", "first")
+    assert go(code, "{clock: record}", "again", replay=first.path).digest == first.digest
+    with Trace.open(first.path) as trace:
+        assert {f.mode for found in trace.findings.values() for f in found} == {Mode.RECORD}
+
+
+def test_files_and_environment_are_given_again(
+    go: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = tmp_path / "config.txt"
+    code = node_code(
+        f"path = {str(config)!r}\n"
+        "def lines():\n    with open(path, encoding='latin-1') as f: return f.readlines()\n"
+        "self.say(lines(), list(open(path, 'rb').read()),\n"
+        "    pathlib.Path(path).read_text('latin-1'),\n"
+        "    os.path.getsize(path), os.path.exists(path + '.not'), os.environ.get('SHIFT'))\n"
+        "try: open(path + '.not')\n"
+        "except FileNotFoundError as error: self.say(error.errno)",
+        imports="import os, pathlib",
+    )
+    guard = "{file: record, environment: record}"
+    config.write_bytes("grün\r\n2".encode("latin-1"))
+    monkeypatch.setenv("SHIFT", "7")
+    first = go(code, guard, "first")
+    assert first.error is None
+    config.write_bytes(b"other")
+    (tmp_path / "config.txt.not").touch()
+    monkeypatch.delenv("SHIFT")
+    assert go(code, guard, "other").digest != first.digest
+    again = go(code, guard, "again", replay=first.path)
+    assert again.digest == first.digest
+    config.unlink()
+    assert go(code, guard, "again", replay=first.path).digest == first.digest
+    assert not os.path.exists(config)
+
+
+class Counting(http.server.BaseHTTPRequestHandler):
+    count = 0
+
+    def do_GET(self) -> None:
+        Counting.count += 1
+        body = f"answer {Counting.count}".encode()
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *arguments: object) -> None:
+        pass
+
+
+@pytest.fixture
+def server() -> Iterator[http.server.HTTPServer]:
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Counting) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
+
+
+def test_an_http_answer_is_given_again_without_the_server(
+    go: Callable[..., Any], server: http.server.HTTPServer
+) -> None:
+    url = f"http://127.0.0.1:{server.server_address[1]}/x"
+    code = node_code(
+        f"self.say(urllib.request.urlopen({url!r}, timeout=20).read().decode())",
+        imports="import urllib.request",
+    )
+    first = go(code, "{socket: record}", "first")
+    assert first.error is None
+    asked = Counting.count
+    assert asked == 2
+    again = go(code, "{socket: record}", "again", replay=first.path)
+    assert again.error is None
+    assert again.digest == first.digest
+    assert Counting.count == asked, "nobody was asked"
+    assert go(code, "{socket: record}", "other").digest != first.digest
+
+
+def test_a_refused_connection_is_given_again(go: Callable[..., Any]) -> None:
+    code = node_code(
+        "try: socket.create_connection(('127.0.0.1', 1), timeout=5)\n"
+        "except OSError as error: self.say(type(error).__name__, error.errno)",
+        imports="import socket",
+    )
+    first = go(code, "{socket: record}", "first")
+    again = go(code, "{socket: record}", "again", replay=first.path)
+    assert first.error is None
+    assert again.digest == first.digest
+
+
+def test_a_run_that_asks_for_more_is_told_so(go: Callable[..., Any]) -> None:
+    code = node_code("self.say(time.time())", imports="import time")
+    first = go(code, "{clock: record}", "first")
+    more = node_code("self.say(time.time() + time.time())", imports="import time")
+    again = go(more, "{clock: record}", "again", replay=first.path)
+    assert isinstance(again.error, GuardError)
+    assert "has no answer to time.time() of /n any more" in str(again.error)
+
+
+def test_a_replay_needs_a_trace_and_a_guard(go: Callable[..., Any], tmp_path: Path) -> None:
+    code = node_code("pass")
+    (tmp_path / "no.mcap").write_text("no")
+    with pytest.raises(TraceError, match="not a trace"):
+        go(code, "{}", "again", replay=tmp_path / "no.mcap")
+    with pytest.raises(JobError, match="guard: false"):
+        go(code, "false", "again", replay=tmp_path / "no.mcap")
