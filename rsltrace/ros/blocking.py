@@ -39,6 +39,7 @@ getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the gu
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
 _PATIENCE = 100
+_PYTHON = os.path.dirname(threading.__file__) + os.sep
 
 # Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
 # be collected: that would raise in them once more.
@@ -148,7 +149,7 @@ class Wait:
     def waits_for(self) -> str:
         """Say who waits for what, with the lines of user code that led there."""
         frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
-        own = [f for f in frames if "/rsltrace/" not in f.filename and "/rclpy/" not in f.filename]
+        own = [frame for frame in frames if _is_telling(frame.filename)]
         where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
         hint = ""
         if self._group is not None and self.core.waiting_for_group(self._group):
@@ -159,6 +160,13 @@ class Wait:
             )
         what = self.core.called_service(self.stack.gr_frame) or self.what
         return f"{self.describe()} waits for {what}{hint}{where}"
+
+
+def _is_telling(file: str) -> bool:
+    """Say whether a source file tells the user anything: it is not ours, Python's or rclpy's."""
+    if "/rsltrace/" in file or "/rclpy/" in file:
+        return False
+    return not file.startswith(_PYTHON) or "/site-packages/" in file
 
 
 def wait(
@@ -249,7 +257,13 @@ def set_aside(core: Core) -> Iterator[None]:
 
 
 def _refuse(core: Core) -> NoReturn:
-    """Do not wait any more, the run is over. Who will not hear of it is left where it is."""
+    """Do not wait any more, the run is over."""
+    lose_patience(core)
+    raise RunEnded
+
+
+def lose_patience(core: Core) -> None:
+    """Count that somebody goes on although the run is over; in the end, leave it where it is."""
     core.refused += 1
     if core.refused > _PATIENCE and getcurrent() is not core.main:
         core.refused = 0
@@ -258,7 +272,6 @@ def _refuse(core: Core) -> NoReturn:
         core.host.enter()
         assert core.main is not None
         core.main.switch()
-    raise RunEnded
 
 
 def _hold_group(core: Core) -> object:

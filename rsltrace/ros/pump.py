@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.ros.blocking import Wait, set_aside, wait
+from rsltrace.ros import groups
+from rsltrace.ros.blocking import Wait, lose_patience, set_aside, wait
 from rsltrace.ros.groups import is_busy
 from rsltrace.ros.mailbox import Mailbox
 
@@ -94,6 +95,8 @@ class Pump:
             if condition():
                 raise executors.ConditionReachedException
             if not self.executor.context.ok():
+                if self.core.closing:
+                    lose_patience(self.core)
                 raise executors.ExternalShutdownException
             taken = self._take(nodes)
             if taken is not None:
@@ -163,11 +166,24 @@ class Pump:
         core.took_ns = 0
         with set_aside(core):
             mailbox.run(item)
-        if core.took_ns:
-            wait(core, "its callback to take its time", for_ns=core.took_ns, quiet=True)
         failure, core.raised = core.raised, None
+        if core.took_ns:
+            self._be_busy(item, core.took_ns)
         if failure is not None:
             raise failure
+
+    def _be_busy(self, item: Any, for_ns: int) -> None:
+        """Let the execution time of a callback pass, on the stack and in the group that ran it."""
+        wrapper = getattr(item, "wrapper", None)
+        group = getattr(wrapper, "callback_group", None)
+        held = group is not None and not is_busy(group, wrapper)
+        if held:
+            groups.begin(group, wrapper)
+        try:
+            wait(self.core, "a callback to be over", for_ns=for_ns, quiet=True)
+        finally:
+            if held:
+                groups.end(self.core, group, wrapper)
 
 
 class _Awaited:

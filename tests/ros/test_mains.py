@@ -14,6 +14,7 @@ from rclpy.context import Context
 from rclpy.executors import (
     Executor,
     ExternalShutdownException,
+    MultiThreadedExecutor,
     ShutdownException,
     SingleThreadedExecutor,
     TimeoutException,
@@ -424,3 +425,105 @@ def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
     assert log == [
         ("one", "last"), ("one", "first", 1.0), ("two", "last"), ("two", "first", 1.0),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("spins", [True, False])
+def test_a_main_that_will_not_hear_of_the_end_is_left_behind(simulate: Any, spins: bool) -> None:
+    def deaf() -> None:
+        rclpy.init()
+        node = Node("deaf")
+        while True:
+            try:
+                if spins:
+                    rclpy.spin_once(node, timeout_sec=0.5)
+                else:
+                    time.sleep(0.5)
+            except BaseException:
+                continue
+
+    log: list[str] = []
+
+    def polite() -> None:
+        rclpy.init()
+        try:
+            rclpy.spin(Counter())
+        finally:
+            log.append("ended")
+
+    recorded = simulate(main_spec(deaf), main_spec(polite), duration=2)
+    assert log == ["ended"]
+    assert recorded.result.stop_reason == "duration of 2.000000000 s"
+
+
+def test_a_simulation_steps_through_mains(tmp_path: Any) -> None:
+    import rsltrace
+
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = listener(log)
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt:
+            log.append("ended")
+
+    job = rsltrace.Job(
+        nodes=[main_spec(program)], stop=rsltrace.StopSpec(duration=9), base_dir=tmp_path
+    )
+    with rsltrace.Simulation(job) as sim:
+        sim.run_for(1.0)
+        sim.publish("/numbers", UInt64(data=5))
+        sim.run_for(0.5)
+        assert [value for value, _ in log] == [5]
+        sim.publish("/numbers", UInt64(data=6))
+        sim.run_for(0.5)
+    assert [entry if isinstance(entry, str) else entry[0] for entry in log] == [5, 6, "ended"]
+
+
+def test_a_callback_with_an_execution_time_keeps_its_executor_busy(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("slow")
+        node.create_timer(1.0, lambda: log.append(("a", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("b", seconds(node))))
+        rclpy.spin(node)
+
+    simulate(
+        main_spec(program),
+        duration=3.5,
+        job={"execution": {"nodes": {"/slow": {"constant": "0.5s"}}}},
+    )
+    assert log == [
+        ("a", 1.0),
+        ("b", 1.5),
+        ("a", 2.0),
+        ("b", 2.5),
+        ("a", 3.0),
+    ]
+
+
+def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
+    simulate: Any,
+) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("slow")
+        reentrant = ReentrantCallbackGroup()
+        node.create_timer(1.0, lambda: log.append(("a", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("b", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("r", seconds(node))), callback_group=reentrant)
+        executor = MultiThreadedExecutor(3)
+        executor.add_node(node)
+        executor.spin()
+
+    simulate(
+        main_spec(program),
+        duration=2,
+        job={"execution": {"nodes": {"/slow": {"constant": "0.5s"}}}},
+    )
+    assert log == [("a", 1.0), ("r", 1.25), ("b", 1.5), ("a", 2.0)]
