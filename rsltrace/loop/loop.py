@@ -183,6 +183,7 @@ class EventLoop:
                 elif ready:
                     ready.popleft().dispatch()
                 else:
+                    now_ns = self.now_ns  # a callback may have blocked, and time have passed
                     timer = first()
                     if timer is not None and timer.deadline_ns <= now_ns:
                         owner: TimerOwner = timer.owner  # type: ignore[assignment]
