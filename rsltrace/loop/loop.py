@@ -194,6 +194,8 @@ class EventLoop:
                     self._livelock(now_ns)
             if self.stopped is not None or self.events >= self._pause_events:
                 return
+            if self.now_ns != now_ns:  # a callback has waited, and others have gone on meanwhile
+                return
             if scheduled and (timer is None or scheduled[0][0] < timer.deadline_ns):
                 next_ns = scheduled[0][0]
             elif timer is not None:
