@@ -360,7 +360,7 @@ GOLDEN = {
         stop: {foo: 1}
         """,
         """
-        job.yaml:2:8: unknown key 'foo' in stop; valid keys are duration, time, events, topic, function, quiescence, size
+        job.yaml:2:8: unknown key 'foo' in stop; valid keys are duration, time, timeout, events, topic, function, quiescence, size
             2 | stop: {foo: 1}
               |        ^
         """,  # noqa: E501
@@ -475,7 +475,7 @@ GOLDEN = {
         job.yaml:4:13: timer_ties: expected creation or heap, got text 'stack'
             4 | timer_ties: stack
               |             ^
-        job.yaml:5:7: stop: expected a mapping, got text '10s'; its keys are duration, time, events, topic, function, quiescence, size
+        job.yaml:5:7: stop: expected a mapping, got text '10s'; its keys are duration, time, timeout, events, topic, function, quiescence, size
             5 | stop: 10s
               |       ^
         job.yaml:6:20: record.payloads: expected true or false, got text 'yes'
