@@ -104,7 +104,7 @@ class Core:
         self.closing = False
         self.grace_ns = 0
         self.importing = False
-        self.threads: list[SimThread] = []
+        self.threads: dict[SimThread, None] = {}
         self.thread_stacks: dict[greenlet, SimThread] = {}
         self.thread_count = 0
         self.fed = False

@@ -75,7 +75,7 @@ class SimThread:
         self._joining: list[Wait] = []
         self._cause = (core.loop.events, core.note(OutputKind.TASK, self.entity_id, 3))
         self._input_hash = core.input_hash
-        core.threads.append(self)
+        core.threads[self] = None
         core.loop.tasks.append(self)
 
     # -- the loop's view -------------------------------------------------------------------------
@@ -129,6 +129,7 @@ class SimThread:
     def _end(self) -> None:
         self.ended = True
         self._body = None
+        self.core.threads.pop(self, None)
         if self.stack is not None:
             self.core.thread_stacks.pop(self.stack, None)
         for blocked in self._joining:

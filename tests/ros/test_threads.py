@@ -503,3 +503,20 @@ def test_asyncio_is_real_again_after_a_run(simulate: Any) -> None:
     began = time.monotonic()
     asyncio.run(asyncio.sleep(0.01))
     assert time.monotonic() - began >= 0.009
+
+
+def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
+    alive: list[int] = []
+
+    class Short(Node):
+        def __init__(self) -> None:
+            super().__init__("short")
+            self.create_timer(0.01, self.tick)
+
+        def tick(self) -> None:
+            threading.Timer(0.015, lambda: None).start()
+            alive.append(len(self.handle.core.threads))
+
+    simulate(Short, duration=1)
+    assert len(alive) == 100
+    assert max(alive) <= 3
