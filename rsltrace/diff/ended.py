@@ -42,7 +42,7 @@ def judge_ended(a: Trace, b: Trace, over: Trace, view_a: EventView | None) -> Ju
     name, other_name, other = ("b", "a", a) if over is b else ("a", "b", b)
     where = f" {at(over.end_ns)}" if over.event_count else ""
     sentence = (
-        f"{name} ended{where} ({stop_reason(over)}), {other_name} did the same until then and "
+        f"run {name} ended{where} ({stop_reason(over)}), {other_name} did the same until then and "
         f"went on {'to' if other.end_ns != over.end_ns else 'until'} {at(other.end_ns)[3:]} "
         f"({stop_reason(other)})"
     )

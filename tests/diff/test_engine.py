@@ -276,7 +276,7 @@ def test_a_run_that_was_told_to_stop_earlier(tmp_path: Path) -> None:
     assert first.a is not None
     assert first.a.index == diff.agreeing
     assert first.b is None
-    assert "b ended at 0.5 s (time 500000000)" in first.sentence
+    assert "run b ended at 0.5 s (time 500000000)" in first.sentence, "not: A ended, in a report"
     assert first.next_step == f"rsltrace info {tmp_path / 'b.mcap'}"
     assert compare(tmp_path, a=short, b=PLAN).verdict is Verdict.RAN_LONGER
 
