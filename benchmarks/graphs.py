@@ -235,11 +235,18 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
 
 
 def run_rsltrace(
-    graph: Graph, callbacks: int, folder: Path, *, record: bool, delayed: bool = False
+    graph: Graph,
+    callbacks: int,
+    folder: Path,
+    *,
+    record: bool,
+    delayed: bool = False,
+    guarded: bool = True,
 ) -> dict[str, Any]:
     """Run ``graph`` for about ``callbacks`` events under rsltrace, in ``folder``.
 
-    ``delayed`` gives every link a random delay, shorter than any period.
+    ``delayed`` gives every link a random delay, shorter than any period; without ``guarded`` the
+    job says ``guard: false``.
     Returns ``{"callbacks": n, "wall_s": s, "cpu_s": s, "digest": d, "bytes": size}``; the times
     are those of the whole run, with construction. Raises ImportError if rsltrace cannot record.
     """
@@ -251,6 +258,8 @@ def run_rsltrace(
     job = graph.job(callbacks)
     if delayed:
         job["delay"] = {"default": {"uniform": {"min": "10us", "max": "90us"}}}
+    if not guarded:
+        job["guard"] = False
     job_path.write_text(json.dumps(job))  # JSON is YAML
     output = folder / "run.mcap" if record else None
     start, cpu_start = perf_counter(), process_time()
