@@ -19,7 +19,7 @@ from rsltrace.model.event import (
     Output,
     OutputKind,
 )
-from rsltrace.model.printable import printable
+from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.model.lines import Line, Openness, Role
 from rsltrace_viewer.model.parameters import parameters_at
@@ -31,6 +31,7 @@ from rsltrace_viewer.model.tree import bytes_lines, message_lines, preview
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
 _OUTPUTS_OPEN = 3
 """More outputs than this are listed closed: a constructor has dozens."""
+_ANSWER_MAX = 200
 _EFFECTS_SHOWN = 12
 """Longer lists are in the choice that ``e`` offers."""
 
@@ -53,7 +54,7 @@ def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = 
     except TraceError as error:
         return [Line(0, "", printable(str(error)), Role.ERROR, "error")]
     lines = [*_title_lines(run, event, outputs), *_cause_lines(run, event, effects)]
-    for make in (_input_lines, _output_lines):
+    for make in (_input_lines, _output_lines, _finding_lines):
         try:
             lines += make(run, event, outputs, openness)
         except TraceError as error:
@@ -119,6 +120,26 @@ def _output_lines(
         yield Line(1, str(place), _output_title(run, output), role, path, opened)
         if opened:
             yield from content_lines(run, output, path, 2, openness)
+
+
+def _finding_lines(
+    run: Run, event: Event, outputs: list[Output], openness: Openness
+) -> Iterator[Line]:
+    """What the guard found in the event; nothing for nearly all events."""
+    found = run.trace.findings.get(event.index, [])
+    if not found:
+        return
+    is_open = openness.is_open("guard", True)
+    yield Line(0, "calls from outside", str(len(found)), Role.SECTION, "guard", is_open)
+    if not is_open:
+        return
+    for place, finding in enumerate(found):
+        value = shortened(printable(finding.value), _ANSWER_MAX)
+        text = f"{printable(finding.call)} -> {value}"
+        yield Line(1, finding.source.value, text, Role.WARNING, f"guard.{place}")
+        for number, frame in enumerate(finding.stack.splitlines()):
+            path = f"guard.{place}.{number}"
+            yield Line(2, "at", printable(frame), Role.NOTE, path)
 
 
 def _output_title(run: Run, output: Output) -> str:
