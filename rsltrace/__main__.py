@@ -1,6 +1,6 @@
 """``python -m rsltrace``."""
 
-from rsltrace.cli.main import main
+from rsltrace.cli.start import main
 
 if __name__ == "__main__":
     main()

@@ -79,6 +79,11 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return function
 
 
+def ros_arguments_given() -> tuple[str, ...]:
+    """Return what the present command line has between ``--ros-args`` and ``--``, as it stands."""
+    return tuple(click.get_current_context().meta.get(_META, ()))
+
+
 def job_of(
     words: Sequence[str],
     launch: Path | None,

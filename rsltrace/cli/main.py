@@ -16,6 +16,7 @@ import click
 
 from rsltrace._version import __version__
 from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.guard.pin import pin_recording
 
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
@@ -102,10 +103,7 @@ def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> 
     """Run the command line (``words``: what follows the program's name) and exit."""
     words = sys.argv[1:] if words is None else words
     _open_standard_streams()
-    if list(words[:1]) == ["record"]:
-        from rsltrace.guard.pin import pin
-
-        pin()
+    pin_recording(words)
     cli.main(args=list(words), prog_name=prog_name)
     raise AssertionError("click exits")
 

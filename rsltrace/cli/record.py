@@ -14,7 +14,8 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import NodeError
-from rsltrace.guard.pin import unpin
+from rsltrace.guard.pin import has_fixed_addresses, unpin
+from rsltrace.model.finding import Source
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -49,6 +50,11 @@ if TYPE_CHECKING:
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.option("--print-job", is_flag=True, help="Print the job as YAML instead of running it.")
+@click.option(
+    "--no-pin",
+    is_flag=True,
+    help="Keep hash seed, addresses, time zone, locale and numerical threads as they are here.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
 def record(
     words: tuple[str, ...],
@@ -63,6 +69,7 @@ def record(
     as_json: bool,
     overrides: tuple[str, ...],
     print_job: bool,
+    no_pin: bool,
     quiet: bool,
 ) -> None:
     """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
@@ -81,11 +88,14 @@ def record(
 
     changes = _all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
+    if no_pin:
+        guard = loaded.guard.model_copy(update={"pin": False})
+        loaded = loaded.model_copy(update={"guard": guard})
+    if not loaded.guard.pins:
+        unpin()
     if print_job:
         _print_job(loaded)
         return
-    if not loaded.guard.enabled:
-        unpin()
     if loaded.launch and not (loaded.stop.model_fields_set or loaded.bags):
         _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
     path = output or default_output(named)
@@ -192,6 +202,8 @@ def _warn(result: RunResult) -> None:
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
         times = f", {count} times" if count > 1 else ""
         click.echo(f"  {source}: {printable(call)}{times}", err=True)
+    if any(met.source is Source.ADDRESS for met in found) and not has_fixed_addresses():
+        click.echo("  addresses of objects are others in every process here", err=True)
     if len(calls) > _SHOWN_MAX:
         click.echo(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}", err=True)
 

@@ -2,22 +2,78 @@
 
 from __future__ import annotations
 
-import json
+import shlex
 import shutil
+import signal
 import sys
 import tempfile
+import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from rsltrace.run.perturb import Recorded
-from rsltrace.run.verify import Verified
-from rsltrace.run.verify import verify as verify_job
+from rsltrace.campaign.perturb import KINDS
+from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
+from rsltrace.errors import EXIT_USAGE, RsltraceError
+
+if TYPE_CHECKING:
+    from rsltrace.campaign.perturb import Recorded, Surroundings
+    from rsltrace.campaign.verify import Verified
 
 
-@click.command()
-@click.argument("job", type=click.Path(path_type=Path))
-@click.option("--runs", type=click.IntRange(min=2), default=10, show_default=True, metavar="N")
+@dataclass(frozen=True, slots=True)
+class Given:
+    """What the command line says of the job, to be said again to ``record`` and ``verify``."""
+
+    words: tuple[str, ...]
+    launch: Path | None
+    skip: bool
+    overrides: tuple[str, ...]
+    seed: int | None
+    until: str | None
+    no_pin: bool
+    ros: tuple[str, ...]
+
+    def arguments(self, *, absolute: bool) -> list[str]:
+        """Return the words; ``absolute``: with paths that mean the same in every folder."""
+
+        def path(text: str) -> str:
+            return str(Path(text).absolute()) if absolute else text
+
+        found = [word if ":=" in word else path(word) for word in self.words]
+        if self.launch is not None:
+            found += ["--launch", path(str(self.launch))]
+        found += ["--skip-unsupported"] * self.skip
+        for override in self.overrides:
+            found += ["--set", override]
+        if self.seed is not None:
+            found += ["--seed", str(self.seed)]
+        if self.until is not None:
+            found += ["--until", self.until]
+        found += ["--no-pin"] * self.no_pin
+        if self.ros:
+            ros = list(self.ros)
+            for index, word in enumerate(ros[:-1]):
+                if word == "--params-file":
+                    ros[index + 1] = path(ros[index + 1])
+            found += ["--ros-args", *ros, "--"]
+        return found
+
+
+@click.command(cls=RosArgsCommand)
+@job_options
+@click.option(
+    "--runs",
+    type=click.IntRange(min=2),
+    default=10,
+    show_default=True,
+    metavar="N",
+    help="How many runs; the first is not perturbed.",
+)
 @click.option(
     "--jobs",
     type=click.IntRange(min=1),
@@ -26,107 +82,178 @@ from rsltrace.run.verify import verify as verify_job
     metavar="W",
     help="How many runs at a time.",
 )
-@click.option("--seed", type=int, default=0, help="Choose other perturbations.")
+@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
+@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option("--no-pin", is_flag=True, help="Show what pinning the process hides.")
+@click.option(
+    "--perturbations",
+    type=click.IntRange(min=0),
+    default=0,
+    metavar="SEED",
+    help="Choose other perturbations.",
+)
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Kill a run after so many seconds (default: 30 times what the first took, at least 120).",
+)
 @click.option(
     "--keep",
     type=click.Path(path_type=Path, file_okay=False),
     metavar="FOLDER",
-    help="Keep the traces of two runs that differ there.",
+    help="Keep the traces of all runs there.",
 )
-@click.option("--set", "overrides", multiple=True, metavar="KEY=VALUE", help="As for record.")
+@click.option(
+    "--run", "number", type=click.IntRange(min=0), help="Make only this run, to repeat it."
+)
+@click.option(
+    "--only", type=click.Choice(KINDS), help="With --run: only this one of its perturbations."
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="With --run: the trace to write (default: run-N.mcap, here).",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def verify(
-    job: Path,
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
+    overrides: tuple[str, ...],
     runs: int,
     jobs: int,
-    seed: int,
+    seed: int | None,
+    until: str | None,
+    no_pin: bool,
+    perturbations: int,
+    timeout: float | None,
     keep: Path | None,
-    overrides: tuple[str, ...],
+    number: int | None,
+    only: str | None,
+    output: Path | None,
     as_json: bool,
-) -> None:
+) -> int:
     """Record JOB several times in separate processes and compare the digests.
 
-    Each run has another hash seed, working directory, locale, time zone, heap, address space, CPU
-    load, thread counts and BLAS core type. The first two runs that differ are shown as a diff, with
-    the perturbation that provoked it. The exit status is 0 if all runs are the same, 1 if not, 2 if
-    the job cannot be run.
+    Each run but the first has another hash seed, working directory, locale, time zone, heap,
+    address space, CPU load, thread counts and BLAS core type, as far as these can be chosen here.
+    At the first disagreement, the two runs are compared as by "rsltrace diff"; a line for each of
+    them repeats it, and each perturbation is tried alone.
+
+    The exit status is 0 if all runs are the same, 1 if not, 2 for trouble: the job is wrong, or a
+    run fails, crashes or takes too long.
     """
-    job = job.resolve()
-    arguments = [part for override in overrides for part in ("--set", override)]
-    show = sys.stderr.isatty() and not as_json
+    if (only or output) and number is None:
+        raise click.UsageError("--only and --output go with --run N")
+    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    job_of(words, launch, skip, overrides)  # what is wrong with it is said once, and here
+    try:
+        with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
+            folder = Path(name)
+            if number is not None:
+                return _one_run(given, folder, number, perturbations, only, output)
+            return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
+    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
+        raise
+    except Exception:
+        traceback.print_exc()  # Python's own exit status for a bug would say: the runs differ
+        return EXIT_USAGE
+
+
+def _verify(
+    given: Given,
+    folder: Path,
+    runs: int,
+    jobs: int,
+    perturbations: int,
+    timeout_s: float | None,
+    keep: Path | None,
+    *,
+    as_json: bool,
+) -> int:
+    from rsltrace.campaign.verify import Verification
 
     def on_run(recorded: Recorded) -> None:
-        if show:
-            number = recorded.surroundings.number
-            click.echo(f"run {number}: digest {recorded.digest}", err=True)
+        if sys.stderr.isatty():
+            around = recorded.surroundings
+            click.echo(f"run {around.number}: digest {recorded.digest or '-'}", err=True)
 
-    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as folder:
-        result = verify_job(
-            job,
-            Path(folder),
-            runs=runs,
-            workers=jobs,
-            seed=seed,
-            arguments=arguments,
-            on_run=on_run,
-        )
-        kept = _keep(result, keep) if keep is not None else ()
-        click.echo(json.dumps(_as_json(result)) if as_json else _as_text(result, kept))
-    sys.exit(0 if result.agrees else 1)
+    series = Verification(
+        given.arguments(absolute=True),
+        folder,
+        workers=jobs,
+        seed=perturbations,
+        timeout_s=timeout_s,
+        keep=keep is not None,
+    )
+    result = series.verify(runs, on_run)
+    place = folder
+    if keep is not None:
+        place = keep
+        keep.mkdir(parents=True, exist_ok=True)
+        for trace in sorted(folder.glob("*.mcap")):
+            shutil.move(trace, keep / trace.name)
+    from rsltrace.cli.verify_text import as_text, as_values
 
-
-def _as_text(result: Verified, kept: tuple[Path, ...]) -> str:
-    first, other = result.first, result.other
-    tried = f"{result.runs} runs, {len(result.kinds)} perturbations"
-    kinds = f"perturbed: {', '.join(result.kinds) or 'nothing'}"
-    if other is None:
-        ended = f" (each ended with exit status {first.exit_code})" if first.exit_code else ""
-        return f"{tried}, one digest: {first.digest}{ended}\n{kinds}"
-    from rsltrace.diff import diff_files
-    from rsltrace.diff.report import render
-
-    lines = [
-        f"not deterministic: {tried}, run {other.surroundings.number} differs from run 0",
-        f"  run 0: digest {first.digest}, exit status {first.exit_code}, nothing perturbed",
-        f"  run {other.surroundings.number}: digest {other.digest or '(none)'}, "
-        f"exit status {other.exit_code}, with {other.surroundings}",
-    ]
-    if result.by_itself:
-        lines.append("provoked by nothing: a second run without perturbations differs, too")
-    elif result.provoked_by:
-        lines.append(f"provoked by: {', '.join(result.provoked_by)} (each alone is enough)")
+    again = [_again(given, perturbations, one.surroundings) for one in _two(result)]
+    if as_json:
+        click.echo(as_values(result, place, again, kept=keep is not None))
     else:
-        lines.append("provoked by: several of them together, or chance")
-    if other.digest:
-        paths = kept or (first.path, other.path)
-        lines += ["", render(diff_files(str(paths[0]), str(paths[1]))).rstrip()]
-    else:
-        lines += ["", other.errors.strip()]
-    if not kept:
-        lines += ["", "the traces are gone; --keep FOLDER keeps them"]
-    return "\n".join(lines)
+        click.echo(as_text(result, place, again, kept=keep is not None), err=bool(result.trouble))
+    if result.trouble is not None:
+        return EXIT_USAGE
+    return 0 if result.agrees else 1
 
 
-def _as_json(result: Verified) -> dict[str, object]:
-    other = result.other
-    return {
-        "agrees": result.agrees,
-        "runs": result.runs,
-        "perturbations": list(result.kinds),
-        "digests": sorted(result.digests),
-        "provoked_by": list(result.provoked_by),
-        "by_itself": result.by_itself,
-        "surroundings": dict(other.surroundings.values) if other is not None else None,
-    }
+def _two(result: Verified) -> list[Recorded]:
+    second = result.trouble or result.other
+    return [result.first] if second is None or second is result.first else [result.first, second]
 
 
-def _keep(result: Verified, folder: Path) -> tuple[Path, ...]:
-    if result.other is None:
-        return ()
-    folder.mkdir(parents=True, exist_ok=True)
-    kept = []
-    for name, recorded in (("a.mcap", result.first), ("b.mcap", result.other)):
-        if recorded.path.exists():
-            shutil.copyfile(recorded.path, folder / name)
-            kept.append(folder / name)
-    return tuple(kept) if len(kept) == 2 else ()
+def _again(given: Given, perturbations: int, around: Surroundings) -> str:
+    """Return the command that repeats one run."""
+    words = ["rsltrace", "verify", *given.arguments(absolute=False)]
+    if perturbations:
+        words += ["--perturbations", str(perturbations)]
+    return shlex.join([*words, "--run", str(around.number)])
+
+
+def _one_run(
+    given: Given,
+    folder: Path,
+    number: int,
+    perturbations: int,
+    only: str | None,
+    output: Path | None,
+) -> int:
+    from rsltrace.campaign.perturb import record_in, surroundings
+
+    around = surroundings(number, perturbations)
+    if only is not None:
+        if only not in around.values:
+            raise click.UsageError(f"run {number} does not perturb the {only}")
+        around = around.only(only)
+    path = (output or Path(f"run-{number}.mcap")).absolute()
+    click.echo(f"run {number}: {around}", err=True)
+    done = record_in(around, given.arguments(absolute=True), folder, path=path)
+    click.echo(done.errors, nl=False, err=True)
+    if not done.digest:
+        raise RsltraceError(f"run {number}: {done.failure}")
+    click.echo(f"digest {done.digest}  events {done.events}")
+    return done.exit_code
+
+
+@contextmanager
+def _terminated() -> Iterator[None]:
+    """Let SIGTERM end the runs, too, instead of leaving them behind."""
+
+    def end(number: int, frame: object) -> None:
+        sys.exit(128 + number)
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -12,11 +12,11 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
-MARK = "RSLTRACE_PINNED"
-"""Environment variable that says that it is done; it holds what was there before."""
+_MARK = "RSLTRACE_PINNED"
+"""Environment variable through which the second start learns what was there before the first."""
 
 HASH_SEED = "PYTHONHASHSEED"
 PLACE = {"TZ": "UTC", "LC_ALL": "C.UTF-8"}
@@ -32,26 +32,38 @@ PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 
 _ADDR_NO_RANDOMIZE = 0x0040000
 _ASK = 0xFFFFFFFF
+_UNPINNED = "off"
+_NOTHING_TO_PIN = frozenset(("--no-pin", "--help", "-h"))
+
+_before = ""
+"""What this process was told by the one that pinned it."""
+
+
+def pin_recording(words: Sequence[str]) -> None:
+    """Pin the process if a command line (without the program's name) is one that runs nodes."""
+    if list(words[:1]) == ["record"] and not _NOTHING_TO_PIN.intersection(words):
+        pin()
 
 
 def pin() -> None:
     """Start the present command again, pinned; return if it is, or if that is not possible."""
-    if MARK in os.environ or not sys.orig_argv[1:]:
+    global _before
+    _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
+    if _before or not sys.orig_argv[1:]:
         return
     before = {name: os.environ.get(name) for name in PINNED}
     fixed = fix_addresses(True)
-    _start_again({**PINNED, MARK: json.dumps({**before, "addresses": fixed})})
+    _start_again({**PINNED, _MARK: json.dumps({**before, "addresses": fixed})})
 
 
 def unpin() -> None:
     """Start the present command again as it was before ``pin``; return if it was not pinned."""
-    text = os.environ.get(MARK, "")
-    if not text.startswith("{"):
+    if _before in ("", _UNPINNED):
         return
-    before = json.loads(text)
+    before = json.loads(_before)
     if before.pop("addresses", False):
         fix_addresses(False)
-    _start_again({**before, MARK: "off"})
+    _start_again({**before, _MARK: _UNPINNED})
 
 
 def _start_again(changes: Mapping[str, str | None]) -> None:
@@ -68,57 +80,37 @@ def _start_again(changes: Mapping[str, str | None]) -> None:
 
 def fix_addresses(fixed: bool) -> bool:
     """Let programs started from here have fixed addresses, or random ones; whether that changed."""
-    try:
-        personality = ctypes.CDLL(None, use_errno=True).personality
-    except (OSError, AttributeError):
-        return False
-    now = personality(_ASK)
+    now = _personality(_ASK)
     if now < 0 or bool(now & _ADDR_NO_RANDOMIZE) is fixed:
         return False
     wanted = now | _ADDR_NO_RANDOMIZE if fixed else now & ~_ADDR_NO_RANDOMIZE
-    return bool(personality(wanted) >= 0 and personality(_ASK) == wanted)
+    return _personality(wanted) >= 0 and _personality(_ASK) == wanted
 
 
-def pinned_values() -> dict[str, str]:
-    """Return what is pinned in this process, for the trace's environment."""
-    seed = os.environ.get(HASH_SEED, "random")
+def has_fixed_addresses() -> bool:
+    """Return whether this process has the addresses that every other such process has."""
+    now = _personality(_ASK)
+    return now >= 0 and bool(now & _ADDR_NO_RANDOMIZE)
+
+
+def _personality(value: int) -> int:
+    """Do the system call of that name; -1 where there is none, or where it is forbidden."""
     try:
-        now = ctypes.CDLL(None).personality(_ASK)
+        return int(ctypes.CDLL(None).personality(ctypes.c_ulong(value)))
     except (OSError, AttributeError):
-        now = 0
-    return {
-        "hash_seed": seed,
-        "addresses": "fixed" if now >= 0 and now & _ADDR_NO_RANDOMIZE else "random",
-    }
-
-
-def numerics() -> str:
-    """Return which numerical libraries are loaded, with the kernel they chose for this machine."""
-    import numpy  # noqa: F401 - loads its library
-    from threadpoolctl import threadpool_info
-
-    found = {
-        " ".join(
-            str(pool.get(key))
-            for key in ("internal_api", "version", "architecture")
-            if pool.get(key)
-        )
-        for pool in threadpool_info()
-    }
-    return ", ".join(sorted(found)) or "unknown"
+        return -1
 
 
 @contextmanager
 def pinned_place() -> Iterator[None]:
     """Pin what can be pinned from within: time zone, locale and numerical threads."""
-    from threadpoolctl import threadpool_limits
-
     before = {name: os.environ.get(name) for name in PLACE}
     if before == PLACE and all(os.environ.get(name) == "1" for name in THREADS):
         yield
         return
-    with ExitStack() as stack:
-        stack.enter_context(threadpool_limits(limits=1))
+    from threadpoolctl import threadpool_limits
+
+    with threadpool_limits(limits=1):
         os.environ.update(PLACE)
         time.tzset()
         try:

@@ -101,6 +101,13 @@ class GuardSpec(Part):
         description="`false` leaves every source as it is; `guard: false` is short for it.",
         examples=[False],
     )
+    pin: Annotated[bool | None, check(flag, optional=True)] = Field(
+        default=None,
+        description="Whether `rsltrace record` starts its process once more with a fixed hash "
+        "seed, fixed addresses, in UTC, in C.UTF-8, with one thread per numerical library. For "
+        "the job as a whole only. Unless said otherwise: `true`.",
+        examples=[False],
+    )
     state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
         default=None,
         description="Whether a node's state is hashed after each of its callbacks; `record` keeps "
@@ -142,6 +149,7 @@ class GuardSpec(Part):
             self,
             *,
             enabled: bool = True,
+            pin: bool | None = None,
             state: bool | Literal["record"] | None = None,
             clock: SourceSpec | dict[str, Any] | ModeName | None = None,
             random: SourceSpec | dict[str, Any] | ModeName | None = None,
@@ -154,6 +162,11 @@ class GuardSpec(Part):
             address: SourceSpec | dict[str, Any] | ModeName | None = None,
             order: SourceSpec | dict[str, Any] | ModeName | None = None,
         ) -> None: ...
+
+    @property
+    def pins(self) -> bool:
+        """Whether the process that records the job is pinned."""
+        return self.enabled and self.pin is not False
 
 
 def guard_part() -> BeforeValidator:
@@ -175,7 +188,12 @@ def resolved_guard(*guards: GuardSpec) -> dict[str, Any]:
         source.value: {"mode": mode.value, "allow": list(policy.allowed.get(source, ()))}
         for source, mode in policy.modes.items()
     }
-    return {"enabled": guards[0].enabled, "state": policy.state or "false", **values}
+    return {
+        "enabled": guards[0].enabled,
+        "pin": guards[0].pins,
+        "state": policy.state or "false",
+        **values,
+    }
 
 
 def policy_of(*guards: GuardSpec) -> Policy:

@@ -269,6 +269,11 @@ class NodeSpec(Part):
                 (kinds[1],),
                 at_key=True,
             )
+        if self.guard is not None and self.guard.pin is not None:
+            raise Problem(
+                "'pin' is for the process that all nodes share: write it in the job's own 'guard:'",
+                ("guard", "pin"),
+            )
         if self.node is not None and isinstance(self.arguments, tuple):
             raise Problem(
                 "a node takes arguments by name (a mapping); a list of command-line words is for "

@@ -93,7 +93,8 @@ class Guarding:
 def guarding(stack: ExitStack, job: Job) -> Guarding:
     """Put the replacements in place until ``stack`` ends."""
     if job.guard.enabled:
-        stack.enter_context(pinned_place())
+        if job.guard.pins:
+            stack.enter_context(pinned_place())
         stack.enter_context(installed())
         folders = [str(job.resolve(folder)) for folder in job.search_path]
         stack.enter_context(ordered_sets(folders, _packages(job.nodes)))

@@ -5,14 +5,16 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import json
+import os
 import platform
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from rsltrace._version import __version__
-from rsltrace.guard.pin import numerics, pinned_values
+from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
+from rsltrace.run.numerics import numerics
 from rsltrace.run.process import user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.writer import TraceWriter
@@ -56,18 +58,26 @@ def sources(job: Job) -> dict[str, str]:
     }
 
 
-def environment() -> dict[str, str]:
-    """Return what a run's result may depend on: versions, never dates, names or paths."""
+def environment(job: Job | None = None) -> dict[str, str]:
+    """Return what a run's result may depend on: versions, never dates, names or paths.
+
+    For a job whose modules (imported already) use numerical libraries, also which kernels these
+    chose for the processor.
+    """
     values = {
         "rsltrace": __version__,
         "python": platform.python_version(),
         "implementation": platform.python_implementation(),
         "machine": platform.machine(),
         "system": platform.system(),
+        "hash_seed": os.environ.get(HASH_SEED, "random"),
     }
     for package in _PACKAGES:
         try:
             values[package] = importlib.metadata.version(package)
         except importlib.metadata.PackageNotFoundError:
             continue
-    return {**values, **pinned_values(), "numerics": numerics()}
+    kernels = "" if job is None else numerics(job)
+    if kernels:
+        values["numerics"] = kernels
+    return values

@@ -184,7 +184,7 @@ class Session:
             )
             world.core.recorder = Recorder(writer, keep_payload=payload_filter(job))
             write_job(writer, job)
-            writer.add_metadata(METADATA_ENVIRONMENT, environment())
+            writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
             writer.add_metadata(METADATA_SOURCES, sources(job))
             if job.stop.size is not None:
                 loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)

@@ -200,6 +200,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "progress": None,
         "guard": {
             "enabled": True,
+            "pin": True,
             "state": "false",
             **{
                 name: {"mode": "virtual", "allow": []}

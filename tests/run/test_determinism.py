@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.run.perturb import KERNEL, Recorded, Surroundings, record_in, surroundings
+from rsltrace.campaign.perturb import Recorded, record_in, surroundings
 
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
@@ -62,9 +62,7 @@ class Mixed(Node):
 
 def recorded(number: int, job: Path, out: Path) -> Recorded:
     """Record the job in surroundings of its own."""
-    values = dict(surroundings(number).values)
-    values.pop(KERNEL, None)  # the trace says which one it was
-    done = record_in(Surroundings(number, values), job, out)
+    done = record_in(surroundings(number), [str(job)], out)
     assert done.exit_code == 0, done.errors
     left = [path for path in out.rglob("*.cwd/**/*") if path.is_file()]
     assert left == [], "a run leaves nothing behind but its trace"

@@ -6,17 +6,21 @@ differ: a job whose digest stays the same does not depend on it.
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import shutil
+import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
-from rsltrace.guard.pin import MARK, THREADS
+from rsltrace.campaign.processes import Done, Processes
+from rsltrace.guard.pin import THREADS
 
 HASH_SEED = "hash seed"
 FOLDER = "working directory"
@@ -56,6 +60,15 @@ sys.argv = ['rsltrace'] + sys.argv[1:]
 runpy.run_module('rsltrace', run_name='__main__')
 """
 
+# Keeps a processor busy as long as whoever started it is there.
+_BUSY = """
+import os
+parent = os.getppid()
+while os.getppid() == parent:
+    for _ in range(1000000):
+        pass
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
@@ -63,24 +76,39 @@ class Surroundings:
 
     number: int
     values: Mapping[str, str]
+    alone: str = ""
+    """What sets a run apart from others of its number: the only kind that is perturbed."""
 
     def only(self, kind: str) -> Surroundings:
         """Return these surroundings with nothing but one kind perturbed."""
-        return Surroundings(self.number, {kind: self.values[kind]})
+        return Surroundings(self.number, {kind: self.values[kind]}, kind)
 
     def __str__(self) -> str:
+        if not self.values:
+            return "nothing perturbed"
         return ", ".join(f"{kind} {value}".rstrip() for kind, value in self.values.items())
 
 
 @dataclass(frozen=True, slots=True)
 class Recorded:
-    """What came of one run: its trace (if there is one), digest, exit status, and what it said."""
+    """What came of one run.
+
+    ``digest`` is empty if the process did not get to the end of a trace. ``failure`` says what went
+    wrong, if anything did; ``errors`` is all that it wrote to stderr.
+    """
 
     surroundings: Surroundings
     path: Path
     digest: str
+    events: int
     exit_code: int
+    failure: str
     errors: str
+
+    @property
+    def outcome(self) -> tuple[str, int]:
+        """What must be the same in every run."""
+        return self.digest, self.exit_code
 
 
 def surroundings(number: int, seed: int = 0) -> Surroundings:
@@ -98,10 +126,11 @@ def surroundings(number: int, seed: int = 0) -> Surroundings:
         LOCALE: chance.choice(_LOCALES),
         TIME_ZONE: chance.choice(_ZONES),
         HEAP: str(chance.randrange(2**32)),
-        ADDRESSES: "random",
         LOAD: chance.choice(("one more process, nice 5", "one more process")),
         THREAD_COUNT: str(chance.choice((1, 2, 3, 4, 8))),
     }
+    if can_fix_addresses():
+        values[ADDRESSES] = "random"
     kernels = core_types()
     if len(kernels) > 1:
         values[KERNEL] = chance.choice(kernels)
@@ -118,40 +147,68 @@ def core_types() -> tuple[str, ...]:
     return tuple(kernel for flag, kernel in _KERNELS.items() if flag in flags | {"sse3"})
 
 
+@lru_cache
+def can_fix_addresses() -> bool:
+    """Return whether a program can be started with fixed addresses; containers may forbid it."""
+    setarch = shutil.which("setarch")
+    if setarch is None:
+        return False
+    done = subprocess.run([setarch, "-R", "true"], capture_output=True, check=False)
+    return done.returncode == 0
+
+
 def record_in(
-    around: Surroundings, job: Path, folder: Path, arguments: Iterable[str] = ()
+    around: Surroundings,
+    arguments: Sequence[str],
+    folder: Path,
+    *,
+    path: Path | None = None,
+    processes: Processes | None = None,
+    timeout_s: float | None = None,
 ) -> Recorded:
-    """Record a job in a process with these surroundings; the trace goes below ``folder``."""
+    """Record in a process with these surroundings; ``arguments`` are those of ``rsltrace record``.
+
+    The trace goes to ``path``, or below ``folder`` under a name of its own. Paths in ``arguments``
+    must be absolute.
+    """
     values = around.values
-    name = f"{around.number}-{len(values)}-{next(iter(values), 'plain').replace(' ', '_')}"
+    name = "-".join(("run", str(around.number), *around.alone.split()))
     cwd = folder / f"{name}.cwd" / values.get(FOLDER, ".")
     cwd.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{name}.mcap"
+    path = path or folder / f"{name}.mcap"
     command = [sys.executable]
     command += ["-c", _NOISE, values[HEAP]] if HEAP in values else ["-m", "rsltrace"]
-    command += ["record", str(job), "-o", str(path), "--force", "--quiet", *arguments]
+    command += ["record", *arguments, "-o", str(path), "--force", "--quiet", "--json"]
     if "nice" in values.get(LOAD, "") and shutil.which("nice"):
         command = ["nice", "-n", "5", *command]
-    if ADDRESSES not in values and shutil.which("setarch"):
+    if ADDRESSES not in values and can_fix_addresses():
         command = ["setarch", "-R", *command]
-    with _load(LOAD in values):
-        done = subprocess.run(
-            command,
-            cwd=cwd,
-            env=_environment(values, cwd),
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="backslashreplace",
-            check=False,
-        )
-    last = done.stdout.strip().splitlines()[-1:] or [""]
-    digest = last[0].split()[1] if last[0].startswith("digest ") else ""
-    return Recorded(around, path, digest, done.returncode, done.stderr)
+    started = processes or Processes()
+    load = started.beside([sys.executable, "-c", _BUSY]) if LOAD in values else nullcontext()
+    with load:
+        done = started.run(command, cwd=cwd, env=_environment(values, cwd), timeout_s=timeout_s)
+    return _recorded(around, path, done)
+
+
+def _recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
+    last = done.output.strip().splitlines()[-1:] or [""]
+    try:
+        result = json.loads(last[0])
+        digest, events = str(result["digest"]), int(result["events"])
+        failure = str(result["error"] or "")
+    except (ValueError, KeyError, TypeError):
+        digest, events, failure = "", 0, ""
+    if done.timed_out:
+        digest, failure = "", "it took too long and was killed (see --timeout)"
+    elif done.exit_code < 0:
+        digest, failure = "", f"it was killed by {signal.Signals(-done.exit_code).name}"
+    elif not digest and not failure:
+        failure = f"it ended with exit status {done.exit_code} and no trace"
+    return Recorded(around, path, digest, events, done.exit_code, failure, done.errors)
 
 
 def _environment(values: Mapping[str, str], cwd: Path) -> dict[str, str]:
-    env = {name: value for name, value in os.environ.items() if name != MARK}
+    env = dict(os.environ)
     env["PYTHONHASHSEED"] = values.get(HASH_SEED, "0")
     if FOLDER in values:
         env["HOME"] = str(cwd)
@@ -166,16 +223,3 @@ def _environment(values: Mapping[str, str], cwd: Path) -> dict[str, str]:
     if KERNEL in values:
         env["OPENBLAS_CORETYPE"] = values[KERNEL]
     return env
-
-
-@contextmanager
-def _load(wanted: bool) -> Iterator[None]:
-    if not wanted:
-        yield
-        return
-    load = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    try:
-        yield
-    finally:
-        load.kill()
-        load.wait()

@@ -1,0 +1,1 @@
+"""Many runs of one job, each in a process of its own."""

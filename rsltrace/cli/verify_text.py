@@ -1,0 +1,115 @@
+"""What ``rsltrace verify`` says: what was tried, and of two runs that differ, where and why."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rsltrace.campaign.perturb import Recorded
+    from rsltrace.campaign.verify import Verified
+
+_LINES_MAX = 40
+
+
+def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
+    """Return the answer for people; ``again`` are the commands that repeat the runs in question."""
+    if result.trouble is not None:
+        return _trouble(result, result.trouble, again[-1])
+    tried = _tried(result)
+    perturbed = f"perturbed: {', '.join(result.kinds) or 'nothing'}"
+    first, other = result.first, result.other
+    if other is None:
+        ended = f" (each ended with exit status {first.exit_code})" if first.exit_code else ""
+        lines = [f"{tried}, one digest {first.digest}{ended}", perturbed]
+        return "\n".join([*lines, f"the traces are in {folder}"] if kept else lines)
+    lines = [f"not deterministic: {tried}, {len(result.digests)} digests", perturbed, ""]
+    for recorded, command in zip((first, other), again, strict=True):
+        ended = f", exit status {recorded.exit_code}" if recorded.exit_code else ""
+        around = recorded.surroundings
+        lines.append(f"run {around.number}: digest {recorded.digest}{ended}: {around}")
+        lines.append(f"  {command}")
+    lines += ["", _provoked(result, again[-1])]
+    if other.failure:
+        lines += [f"run {other.surroundings.number} failed: {other.failure}"]
+    from rsltrace.diff import diff_files
+    from rsltrace.diff.report import render
+
+    diff = diff_files(str(_place(first, folder)), str(_place(other, folder)))
+    report = render(diff).rstrip().splitlines()
+    if not kept:  # what to do next with traces that are gone
+        report = [line for line in report if not line.startswith("next: ")]
+    lines += ["", *report]
+    lines += ["", f"the traces are in {folder}"] if kept else []
+    return "\n".join(lines)
+
+
+def as_values(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
+    """Return the answer as JSON."""
+    second = result.trouble or result.other
+    difference = None
+    if result.trouble is None and result.other is not None:
+        from rsltrace.diff import diff_files
+        from rsltrace.diff.report import render
+
+        places = (_place(result.first, folder), _place(result.other, folder))
+        difference = json.loads(render(diff_files(*map(str, places)), "json"))
+    return json.dumps(
+        {
+            "agrees": result.agrees,
+            "runs": result.runs,
+            "perturbations": list(result.kinds),
+            "digests": list(result.digests),
+            "trouble": None if result.trouble is None else result.trouble.failure,
+            "other": None if second is None else _run(second),
+            "reproduce": list(again),
+            "by_itself": result.by_itself,
+            "provoked_by": list(result.provoked_by) if result.narrowed else None,
+            "kept": str(folder) if kept else None,
+            "diff": difference,
+        }
+    )
+
+
+def _run(recorded: Recorded) -> dict[str, object]:
+    return {
+        "number": recorded.surroundings.number,
+        "surroundings": dict(recorded.surroundings.values),
+        "digest": recorded.digest,
+        "exit_code": recorded.exit_code,
+        "errors": recorded.errors,
+    }
+
+
+def _place(recorded: Recorded, folder: Path) -> Path:
+    return folder / recorded.path.name
+
+
+def _tried(result: Verified) -> str:
+    many = "s" * (len(result.kinds) != 1)
+    return f"{result.runs} runs, {len(result.kinds)} perturbation{many}"
+
+
+def _provoked(result: Verified, command: str) -> str:
+    if result.by_itself:
+        return "provoked by nothing: a second run without perturbations differs, too"
+    if not result.narrowed:
+        return "not tried, as the runs are long: which perturbation alone is enough (--only)"
+    if not result.provoked_by:
+        return "provoked by several of them together, or by chance: none alone is enough"
+    each = " (each alone is enough)" if len(result.provoked_by) > 1 else " (alone is enough)"
+    return f"provoked by: {', '.join(result.provoked_by)}{each}\n  " + (
+        f"{command} --only '{result.provoked_by[0]}'"
+    )
+
+
+def _trouble(result: Verified, run: Recorded, command: str) -> str:
+    number = run.surroundings.number
+    what = "the job" if number == 0 else f"run {number} of {result.runs}"
+    lines = [f"rsltrace: error: {what} came to no answer: {run.failure}"]
+    said = run.errors.strip().splitlines()[-_LINES_MAX:]
+    lines += [f"  | {line}" for line in said]
+    lines.append(f"with {run.surroundings}; to repeat it:\n  {command}")
+    return "\n".join(lines)

@@ -1,0 +1,145 @@
+"""``rsltrace verify``: one digest, or the two runs that differ and what made them differ."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.campaign.perturb import KINDS, surroundings
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+ORDER_OF_A_SET = "log(' '.join({'a', 'b', 'c', 'd', 'e', 'f'}))"
+Command = Callable[..., subprocess.CompletedProcess[str]]
+WriteJob = Callable[..., Path]
+
+
+def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None:
+    assert surroundings(0).values == {}
+    assert surroundings(3) == surroundings(3)
+    assert surroundings(3).values != surroundings(4).values != surroundings(4, seed=1).values
+    assert set(surroundings(1).values) <= set(KINDS)
+    assert list(surroundings(1).only(KINDS[0]).values) == [KINDS[0]]
+
+
+def test_one_digest_is_stated_as_what_was_tried(rsltrace: Command, job: WriteJob) -> None:
+    kinds = surroundings(1).values
+    done = rsltrace("verify", job(ORDER_OF_A_SET), "--runs", "3", "--jobs", "2")
+    assert done.returncode == 0, done.stderr
+    first, second = done.stdout.splitlines()
+    assert first.startswith(f"3 runs, {len(kinds)} perturbations, one digest ")
+    assert "hash seed" in second
+
+
+def test_without_the_pin_the_hash_seed_shows(
+    rsltrace: Command, job: WriteJob, tmp_path: Path
+) -> None:
+    options = ("--runs", "6", "--no-pin", "--keep", "kept", "--until", "1")
+    done = rsltrace("verify", job(ORDER_OF_A_SET), *options)
+    assert done.returncode == 1, done.stderr
+    assert "not deterministic" in done.stdout
+    assert "provoked by: hash seed (alone is enough)" in done.stdout
+    assert "environment: hash_seed  0" in done.stdout, "the diff is printed"
+    lines = done.stdout.splitlines()
+    for number in (0, 1):
+        (at,) = (n for n, line in enumerate(lines) if line.startswith(f"run {number}: digest "))
+        digest = lines[at].split()[3].rstrip(":")
+        again = rsltrace(*shlex.split(lines[at + 1].strip())[1:])
+        assert again.stdout.startswith(f"digest {digest} "), again.stderr
+        assert (tmp_path / f"run-{number}.mcap").read_bytes() == (
+            tmp_path / f"kept/run-{number}.mcap"
+        ).read_bytes()
+    narrow = lines[lines.index("provoked by: hash seed (alone is enough)") + 1]
+    assert rsltrace(*shlex.split(narrow)[1:]).stdout.startswith(f"digest {digest} ")
+
+
+def test_a_job_that_differs_by_itself_is_told_so(rsltrace: Command, job: WriteJob) -> None:
+    path = job("log(str(time.time_ns()))", "guard: false\n")
+    done = rsltrace("verify", path, "--runs", "3", "--json")
+    assert done.returncode == 1, done.stderr
+    result = json.loads(done.stdout)
+    assert result["by_itself"] is True
+    assert result["agrees"] is False
+    assert len(result["digests"]) == 2
+    assert result["diff"]["verdict"] == "same-input-different-output"
+
+
+def test_a_job_that_fails_is_trouble(rsltrace: Command, job: WriteJob) -> None:
+    done = rsltrace("verify", job("raise ValueError('bad')"))
+    assert done.returncode == 2
+    assert "ValueError: bad" in done.stderr
+    assert "--run 0" in done.stderr
+    missing = rsltrace("verify", "nothing.yaml")
+    assert missing.returncode == 2
+    assert "there is no such job file" in missing.stderr
+
+
+def test_a_run_that_crashes_is_trouble_and_says_where(rsltrace: Command, job: WriteJob) -> None:
+    crash = "os.getcwd().count('x') and (print('woe', file=sys.stderr, flush=True), os.abort())"
+    done = rsltrace("verify", job(crash), "--runs", "3")
+    assert done.returncode == 2, done.stdout
+    assert "run 1 of" in done.stderr
+    assert "it was killed by SIGABRT" in done.stderr
+    assert "| woe" in done.stderr
+
+
+def test_a_run_that_hangs_is_killed(rsltrace: Command, job: WriteJob) -> None:
+    hang = "os.getcwd().count('x') and signal.pause()"
+    done = rsltrace("verify", job(hang), "--runs", "2", "--timeout", "20", timeout=100)
+    assert done.returncode == 2, done.stdout
+    assert "took too long" in done.stderr
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interruption_leaves_nothing_behind(
+    job: WriteJob, tmp_path: Path, number: int, status: int
+) -> None:
+    path = job("open('/dev/null'); open(os.environ['HERE'], 'a').write('x'); signal.pause()")
+    here = tmp_path / "temporary"
+    here.mkdir()
+    mark = tmp_path / "mark"
+    env = {**os.environ, "TMPDIR": str(here), "HERE": str(mark)}
+    command = [sys.executable, "-m", "rsltrace", "verify", str(path)]
+    with subprocess.Popen(command, env=env, stderr=subprocess.PIPE, text=True) as process:
+        while not mark.exists() and process.poll() is None:
+            time.sleep(0.05)
+        process.send_signal(number)
+        process.communicate(timeout=60)
+    assert process.returncode == status
+    assert list(here.iterdir()) == []
+    assert not _processes_with(f"HERE={mark}"), "what it has started is gone"
+
+
+def _processes_with(text: str) -> list[str]:
+    found = []
+    for environ in Path("/proc").glob("[0-9]*/environ"):
+        try:
+            if text.encode() in environ.read_bytes():
+                found.append(environ.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+def test_what_record_takes_verify_takes(rsltrace: Command, job: WriteJob, tmp_path: Path) -> None:
+    job("log(str(self.declare_parameter('rate', 0).value) + os.environ.get('X', ''))")
+    (tmp_path / "more.yaml").write_text("n: {ros__parameters: {rate: 7}}\n")
+    words: tuple[Any, ...] = (
+        "job.yaml", "--seed", "5", "--set", "stop.duration=2s", "--until", "1",
+        "--ros-args", "--params-file", "more.yaml", "--",
+    )  # fmt: skip
+    recorded = rsltrace("record", *words, "-o", "run.mcap")
+    assert "] [n]: 7" in recorded.stderr
+    digest = recorded.stdout.split()[1]
+    done = rsltrace("verify", *words, "--runs", "2")
+    assert f"one digest {digest}" in done.stdout, done.stderr
