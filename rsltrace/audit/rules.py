@@ -12,7 +12,6 @@ from rsltrace.model.finding import Source
 _V, _P, _D, _N = Treatment.VIRTUAL, Treatment.PINNED, Treatment.DETECTED, Treatment.NOTHING
 
 _CLOCK = Rule("clock", _V, "shows simulated time", "self.get_clock().now()", source=Source.CLOCK)
-_CLOCK_PAST = Rule("clock", _N, "its clock is read in C, past the guard", "self.get_clock().now()")
 _CPU_TIME = Rule(
     "clock", _D, "a finding of the run", "leave it to a profiler outside", source=Source.CLOCK
 )
@@ -81,8 +80,8 @@ _BLOCKING = Rule(
 )
 _ASYNC_IO = Rule(
     "blocking",
-    _N,
-    "its loop waits for real: the run stands still meanwhile",
+    _V,
+    "its loop waits in simulated time",
     "async callbacks of the node: await client.call_async(…)",
 )
 _LISTING = Rule("directory", _V, "is sorted", "sorted(…)", source=Source.DIRECTORY)
@@ -111,9 +110,10 @@ _COLLECTOR = Rule(
 
 ORDER = Rule(
     "order",
-    _P,
-    "record fixes the hash seed (strings) and, where the kernel lets it, addresses (objects)",
+    _V,
+    "texts are gone through in order; a set of objects is a finding of the run",
     "sorted(…), or a dict or a list instead of the set",
+    source=Source.ORDER,
 )
 ADDRESS = Rule(
     "address",
@@ -208,7 +208,7 @@ RULES: dict[str, Rule] = {
     **_named(_CLOCK, "datetime.date", "today"),
     **_named(_CLOCK, "timeit", "default_timer"),
     **_named(_CLOCK, "email.utils", "localtime formatdate"),
-    **_named(_CLOCK_PAST, "numpy", "datetime64"),
+    **_named(_CLOCK, "numpy", "datetime64"),
     **_named(_CPU_TIME, "os", "times"),
     **_named(_CPU_TIME, "resource", "getrusage"),
     **_named(_SLEEP, "time", "sleep"),

@@ -23,6 +23,7 @@ CALLS = [
     "datetime.datetime.now()",
     "datetime.datetime.today()",
     "datetime.date.today()",
+    "numpy.datetime64('now')",
     "email.utils.formatdate()",
     "timeit.default_timer()",
     "os.times()",

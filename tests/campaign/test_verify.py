@@ -20,6 +20,7 @@ from rsltrace.campaign.perturb import KINDS, surroundings
 pytestmark = [pytest.mark.ros, pytest.mark.slow]
 
 ORDER_OF_A_SET = "log(' '.join({'a', 'b', 'c', 'd', 'e', 'f'}))"
+AS_IT_IS = "guard: {order: allow}\n"
 Command = Callable[..., subprocess.CompletedProcess[str]]
 WriteJob = Callable[..., Path]
 
@@ -34,7 +35,7 @@ def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None
 
 def test_one_digest_is_stated_as_what_was_tried(rsltrace: Command, job: WriteJob) -> None:
     kinds = surroundings(1).values
-    done = rsltrace("verify", job(ORDER_OF_A_SET), "--runs", "3", "--jobs", "2")
+    done = rsltrace("verify", job(ORDER_OF_A_SET, AS_IT_IS), "--runs", "3", "--jobs", "2")
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     assert first.startswith(f"3 runs, {len(kinds)} perturbations, one digest ")
@@ -45,7 +46,7 @@ def test_without_the_pin_the_hash_seed_shows(
     rsltrace: Command, job: WriteJob, tmp_path: Path
 ) -> None:
     options = ("--runs", "6", "--no-pin", "--keep", "kept", "--until", "1")
-    done = rsltrace("verify", job(ORDER_OF_A_SET), *options)
+    done = rsltrace("verify", job(ORDER_OF_A_SET, AS_IT_IS), *options)
     assert done.returncode == 1, done.stderr
     assert "not deterministic" in done.stdout
     assert "provoked by: hash seed (alone is enough)" in done.stdout

@@ -10,13 +10,12 @@ import json
 import os
 import random
 import re
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from rsltrace.run.perturb import (
+from rsltrace.campaign.perturb import (
     KERNEL,
     LOCALE,
     THREAD_COUNT,
@@ -45,7 +44,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[list[Seen], list[See
     for guarded in (False, True):
         for number in range(RUNS):
             job = _job(folder, number, guarded=guarded)
-            done = record_in(_around(number), job, folder)
+            done = record_in(_around(number), [str(job)], folder)
             assert done.exit_code == 0, done.errors
             with Trace.open(done.path) as trace:
                 seen[guarded].append(_said(trace))
@@ -131,8 +130,8 @@ def test_what_is_deterministic_by_itself_has_no_findings(
 
 def test_another_kernel_of_the_numerical_library_is_in_the_environment(tmp_path: Path) -> None:
     """Which code OpenBLAS runs depends on the processor: not made equal, but told."""
+    from rsltrace.campaign.perturb import core_types
     from rsltrace.diff import diff_files
-    from rsltrace.run.perturb import core_types
 
     kernels = core_types()
     if len(kernels) < 2:
@@ -141,8 +140,8 @@ def test_another_kernel_of_the_numerical_library_is_in_the_environment(tmp_path:
     content = json.loads(job.read_text())
     content["nodes"] = [n for n in content["nodes"] if n["arguments"]["case"] == "threaded_blas"]
     job.write_text(json.dumps(content))
-    record = partial(record_in, job=job, folder=tmp_path)
-    runs = [record(Surroundings(n, {KERNEL: kernels[-n]})) for n in (0, 1)]
+    around = [Surroundings(n, {KERNEL: kernels[-n]}) for n in (0, 1)]
+    runs = [record_in(one, [str(job)], tmp_path) for one in around]
     found = diff_files(str(runs[0].path), str(runs[1].path))
     with Trace.open(runs[0].path) as one, Trace.open(runs[1].path) as other:
         if one.environment["numerics"] == other.environment["numerics"]:

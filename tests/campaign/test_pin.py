@@ -1,0 +1,84 @@
+"""``rsltrace record`` runs pinned, unless it is told not to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.campaign.perturb import can_fix_addresses
+from rsltrace.trace.reader import Trace
+
+pytestmark = [pytest.mark.ros, pytest.mark.slow]
+
+SHOW = (
+    "log(' '.join([str(os.environ.get(n)) for n in "
+    "('PYTHONHASHSEED', 'TZ', 'LC_ALL', 'OMP_NUM_THREADS', 'RSLTRACE_PINNED')] "
+    "+ [str(sys.flags.hash_randomization), open('/proc/self/personality').read()]))"
+)
+OURS = {"PYTHONHASHSEED": "5", "TZ": "Asia/Kathmandu", "LC_ALL": "POSIX", "OMP_NUM_THREADS": "3"}
+
+
+@pytest.fixture
+def shown(
+    rsltrace: Callable[..., Any], job: Callable[..., Path]
+) -> Callable[..., tuple[list[str], str]]:
+    def record(*words: str, more: str = "") -> tuple[list[str], str]:
+        environment = {**os.environ, **OURS}
+        done = rsltrace(
+            "record", job(SHOW, more), "-o", "run.mcap", "--force", *words, env=environment
+        )
+        assert done.returncode == 0, done.stderr
+        line = next(line for line in done.stderr.splitlines() if "] [n]: " in line)
+        return line.partition("] [n]: ")[2].split(), done.stdout.split()[1]
+
+    return record
+
+
+def test_the_process_is_pinned_whatever_was_set(
+    shown: Callable[..., tuple[list[str], str]], tmp_path: Path
+) -> None:
+    values, _ = shown()
+    assert values[:6] == ["0", "UTC", "C.UTF-8", "1", "None", "0"]
+    if can_fix_addresses():
+        assert int(values[6], 16) & 0x0040000
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.environment["hash_seed"] == "0"
+        assert "numerics" not in trace.environment, "no module of the job uses numbers"
+
+
+@pytest.mark.parametrize(
+    ("words", "more"),
+    [(["--no-pin"], ""), ([], "guard: {pin: false}\n"), ([], "guard: false\n")],
+)
+def test_it_can_be_left_as_it_is(
+    shown: Callable[..., tuple[list[str], str]], words: list[str], more: str
+) -> None:
+    values, _ = shown(*words, more=more)
+    assert values[:5] == [*OURS.values(), "None"]
+    assert not int(values[6], 16) & 0x0040000
+
+
+def test_of_a_job_that_uses_numbers_the_kernel_is_told(
+    rsltrace: Callable[..., Any], job: Callable[..., Path], tmp_path: Path
+) -> None:
+    path = job("log('x')")
+    code = (tmp_path / "verified.py").read_text()
+    (tmp_path / "verified.py").write_text("from numpy.linalg import solve\n" + code)
+    assert rsltrace("record", path, "-o", "run.mcap").returncode == 0
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.environment["numerics"]
+
+
+def test_a_node_cannot_pin_the_process(
+    rsltrace: Callable[..., Any], job: Callable[..., Path]
+) -> None:
+    path = job("pass")
+    path.write_text("nodes:\n  - {node: 'verified:N', guard: {pin: false}}\n")
+    done = rsltrace("record", path)
+    assert done.returncode == 2
+    assert "job.yaml:2:" in done.stderr
+    assert "write it in the job's own 'guard:'" in done.stderr
