@@ -225,3 +225,32 @@ def test_libraries_work_under_the_guard(said: Said) -> None:
     first = said(code)
     assert first == said(code)
     assert first[0][0] == "1970-01-01 00:00:00.500000"
+
+
+def test_two_simulations_in_one_process_do_not_disturb_each_other(tmp_path: Path) -> None:
+    import rsltrace
+
+    (tmp_path / "twin.py").write_text(
+        node_code(
+            "self.say(time.time(), random.random(), os.urandom(2).hex(), float(np.random.rand()))",
+            imports="import os, random, time\nimport numpy as np",
+        )
+    )
+
+    def job() -> Any:
+        return rsltrace.Job(
+            nodes=[rsltrace.NodeSpec(node="twin:N")],
+            search_path=[tmp_path],
+            stop=rsltrace.StopSpec(duration="1.2s"),
+        )
+
+    alone = rsltrace.record(job(), tmp_path / "alone.mcap").digest
+    with rsltrace.Simulation(job(), tmp_path / "one.mcap") as one:
+        one.run_for("0.6s")
+        assert time.time() > 1e9, "between steps the test's own clock is real"
+        drawn = random.random(), os.urandom(4)
+        one.run_for("1s")
+        assert (random.random(), os.urandom(4)) != drawn
+        one.run()
+    assert one.result.digest == alone
+    assert rsltrace.record(job(), tmp_path / "again.mcap").digest == alone
