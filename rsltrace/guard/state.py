@@ -243,25 +243,29 @@ def array_hash(value: Any, seen: dict[tuple[str, int], int]) -> int:
         key = dtype.str, _hash64(block)
         digest = seen.get(key)
         if digest is None:
-            digest = seen[key] = _canonical_hash(block)
+            # As it is, a block nearly always is in its canonical form.
+            digest = key[1]
+            if _has_several_forms(block):
+                digest = _canonical_hash(block)
+            seen[key] = digest
         digests.append(digest)
     return digests[0] if len(digests) == 1 else _hash64(struct.pack(f"<{len(digests)}Q", *digests))
 
 
 def _canonical_hash(block: Any) -> int:
-    if _has_several_forms(block):
-        block = block + 0.0  # -0.0 + 0.0 is 0.0
-        block[np.isnan(block)] = np.nan
+    block = block + 0.0  # -0.0 + 0.0 is 0.0
+    block[np.isnan(block)] = np.nan
     return _hash64(block)
 
 
 def _has_several_forms(parts: Any) -> bool:
     """Return whether there is a -0.0 or a NaN among floats: two quick looks, rarely true."""
     lowest = _LOWEST[parts.dtype.itemsize]
-    return bool(np.isnan(parts.min()) or parts.view(lowest.dtype).min() == lowest)
+    smallest = parts.min()
+    return bool(smallest != smallest or parts.view(lowest.dtype).min() == lowest)
 
 
-_BLOCK_BYTES = 64 << 10
+_BLOCK_BYTES = 256 << 10
 _SEEN_MAX = 100_000
 _LOWEST = {size: np.array(-(2 ** (8 * size - 1)), dtype=f"<i{size}") for size in (2, 4, 8)}
 """-0.0 has this bit pattern, the smallest integer of its size."""
