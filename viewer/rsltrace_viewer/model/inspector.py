@@ -149,7 +149,7 @@ def _output_title(run: Run, output: Output) -> str:
 
 
 def _output_role(run: Run, output: Output) -> Role:
-    if output.kind in (OutputKind.EXCEPTION, OutputKind.GUARD):
+    if output.kind is OutputKind.EXCEPTION:
         return Role.ERROR
     if output.kind is OutputKind.LOG:
         record = log_of(run, output)

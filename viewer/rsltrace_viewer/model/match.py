@@ -163,6 +163,21 @@ class WithOutput(_Anywhere):
 
 
 @dataclass(frozen=True, slots=True)
+class WithFinding:
+    """Events in which the guard found something."""
+
+    def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
+        """Return the mask."""
+        found = np.fromiter(run.trace.findings, np.uint64, len(run.trace.findings))
+        mask: Mask = np.isin(segment.events["index"], found)
+        return mask
+
+    def can_be_in(self, run: Run, number: int) -> bool:
+        """Most runs have no finding at all."""
+        return bool(run.trace.findings)
+
+
+@dataclass(frozen=True, slots=True)
 class EachEvent(_Anywhere):
     """Events for which ``accept(run, index)`` says yes: the slow way, for decoded messages."""
 
@@ -267,7 +282,7 @@ def says(text: str) -> WithOutput:
 RAISED: Condition = Any(
     (WithFlag(EventFlag.RAISED), WithOutput(frozenset((OutputKind.EXCEPTION,))))
 )
-GUARD_FINDING: Condition = WithOutput(frozenset((OutputKind.GUARD,)))
+GUARD_FINDING: Condition = WithFinding()
 ANY_LOG: Condition = WithOutput(frozenset((OutputKind.LOG,)))
 
 
