@@ -141,12 +141,22 @@ def _calls(found: Divergence, width: int) -> Section:
         events = [event for event in (call.event_a, call.event_b) if event is not None]
         earlier = "" if here.intersection(events) else f", event {events[0]}"
         mark = ("! ", BAD) if call.a != call.b else ("= ", FAINT)
-        rows.append(cut(line("  ", mark, f"{call.source}: {printable(call.call)}{earlier}"), width))
-        if call.a != call.b:
-            for name, style, value in (("a", SIDE_A, call.a), ("b", SIDE_B, call.b)):
-                text = "not called" if value is None else printable(value)
-                rows.append(cut(line("      ", (f"{name} ", style), text), width))
+        what = f"{call.source}: {printable(call.call)}{earlier}"
+        if call.a == call.b:
+            rows.append(cut(line("  ", mark, what), width))
+        else:
+            a, b = ("not called" if v is None else printable(v) for v in (call.a, call.b))
+            if len(what) + len(a) + len(b) + 28 <= width:
+                pair = ((a, SIDE_A), ("  |  ", FAINT), (b, SIDE_B))
+                rows.append(cut(line("  ", mark, f"{what}  ", *pair), width))
+            else:
+                rows.append(cut(line("  ", mark, what), width))
+                for name, style, value in (("a", SIDE_A, a), ("b", SIDE_B, b)):
+                    rows.append(cut(line("      ", (f"{name} ", style), value), width))
         rows.append(cut(line((f"      at {printable(call.where)}", FAINT)), width))
+    if len(rows) == 2:  # one call, with its answers beside it, and where it was made
+        rows[0] = cut(line(("call from outside: ", TITLE), *rows[0][1:]), width)
+        return Section((), rows, 2, "", least=1)
     title = "calls whose answers come from outside"
     return Section(line((title, TITLE)), rows, 8, "lines", least=3)
 

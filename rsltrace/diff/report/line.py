@@ -133,8 +133,8 @@ class Section:
     """Some lines under a title that may be shortened when space is short.
 
     ``keep`` rows are kept if that is possible at all, ``least`` in any case; a section shortened
-    to no row disappears. ``noun`` names what the rows show: ``… 7 more fields``. ``drop`` says
-    where rows go from: ``last``, ``first`` or ``middle``.
+    to no row disappears. ``noun`` names what the rows show: ``… 7 more fields`` (empty: what is
+    left out is not worth a line). ``drop`` says where rows go: ``last``, ``first`` or ``middle``.
     """
 
     title: Line
@@ -150,14 +150,14 @@ class Section:
         """Lines it takes, the blank one before it included."""
         if not self.rows and (self.hidden or not self.title):
             return 0
-        return 1 + bool(self.title) + len(self.rows) + bool(self.hidden)
+        return 1 + bool(self.title) + len(self.rows) + bool(self.hidden and self.noun)
 
     def lines(self) -> list[Line]:
         """Return the lines, a blank one first."""
         if not self.height:
             return []
         noun = self.noun if self.hidden != 1 else _singular(self.noun)
-        more = [line((f"  … {self.hidden} more {noun}", FAINT))] if self.hidden else []
+        more = [line((f"  … {self.hidden} more {noun}", FAINT))] if self.hidden and noun else []
         gap = {"first": 0, "middle": (len(self.rows) + 1) // 2}.get(self.drop, len(self.rows))
         rows = [*self.rows[:gap], *more, *self.rows[gap:]]
         return [BLANK, *([self.title] if self.title else []), *rows]

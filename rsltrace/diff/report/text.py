@@ -152,7 +152,11 @@ def _settings(diff: Diff, width: int) -> Section:
         ],
         widest=max(room, 34),
     )
-    return Section(line(("job and environment differ", TITLE)), rows, 2, "settings")
+    title: Piece = ("job and environment differ", TITLE)
+    if len(rows) == 1:
+        (row,) = rows
+        return Section((), [cut(line(title, ": ", *row[1:]), width)], 1, "settings")
+    return Section(line(title), rows, 2, "settings")
 
 
 def _values(setting: Setting, room: int) -> tuple[str, str]:
