@@ -25,6 +25,7 @@ from rsltrace.model.finding import Mode, Source
 _NS = 1_000_000_000
 
 REAL_TIME_MODULES = {
+    "hypothesis.internal.conjecture.junkdrawer",  # times the garbage collector, whenever it runs
     "multiprocessing.connection",
     "multiprocessing.popen_fork",
     "multiprocessing.synchronize",

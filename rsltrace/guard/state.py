@@ -30,7 +30,7 @@ import xxhash
 DEPTH_MAX = 200
 """What lies deeper (a linked list of a million nodes) is left out and listed."""
 
-_hash64 = xxhash.xxh3_64_intdigest
+_hash64: Callable[[Any], int] = xxhash.xxh3_64_intdigest
 _pack_double = struct.Struct("<d").pack
 _pack_count = struct.Struct("<Q").pack
 _NAN = b"fN"
