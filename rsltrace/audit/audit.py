@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import ast
-import re
 from collections.abc import Callable
 from pathlib import Path
 
 from rsltrace.audit.files import Collection, SourceFile, collect_modules, collect_path
 from rsltrace.audit.look import Place, look
-from rsltrace.audit.model import Audit, Found, Treatment
+from rsltrace.audit.model import Audit, Found
 from rsltrace.audit.names import Names
-from rsltrace.audit.rules import allowed
+from rsltrace.audit.treating import Treating, module_of
 from rsltrace.errors import JobError
-from rsltrace.job import Job, locate, policy_of
+from rsltrace.job import Job, locate
 from rsltrace.model.finding import Policy
 
 Executables = Callable[[str, str], "str | Path"]
@@ -30,7 +29,7 @@ def audit_path(path: Path) -> Audit:
     found = collect_path(path)
     if not found.files and not found.troubles:
         raise JobError(f"{path}: there is no Python file in this folder")
-    return _audit(found, Policy())
+    return _audit(found, Treating(Policy()))
 
 
 def audit_job(job: Job, executable: Executables) -> Audit:
@@ -40,16 +39,17 @@ def audit_job(job: Job, executable: Executables) -> Audit:
     """
     names: dict[str, str] = {}
     scripts = []
+    targets: list[str | Path] = []
     for index, spec in enumerate(job.nodes):
         where = locate(job, ("nodes", index, spec.kind))
-        target = spec.target
+        target: str | Path = spec.target
         if spec.executable is not None:
-            found = executable(spec.executable, where)
-            if isinstance(found, Path):
-                scripts.append(found)
-                continue
-            target = found
-        names.setdefault(re.split("[:]", target)[0], where)
+            target = executable(spec.executable, where)
+        targets.append(target)
+        if isinstance(target, Path):
+            scripts.append(target)
+        else:
+            names.setdefault(module_of(target), where)
     folders = [job.resolve(folder).resolve() for folder in job.search_path]
     collection, missing = collect_modules(list(names), scripts, folders)
     for name in missing:
@@ -60,11 +60,10 @@ def audit_job(job: Job, executable: Executables) -> Audit:
             f"there is no module {name!r}: search_path has {', '.join(map(str, job.search_path))}",
             where=names[name],
         )
-    policy = policy_of(job.guard) if job.guard.enabled else None
-    return _audit(collection, policy)
+    return _audit(collection, Treating.of_job(job, targets, folders))
 
 
-def _audit(collection: Collection, policy: Policy | None) -> Audit:
+def _audit(collection: Collection, treating: Treating) -> Audit:
     sources = list(collection.files.values())
     names = Names({source.module.name: source.module for source in sources})
     called: set[ast.AST] = set()
@@ -82,7 +81,7 @@ def _audit(collection: Collection, policy: Policy | None) -> Audit:
         if _is_silenced(source, place):
             silenced += 1
             continue
-        found.add(_found(source, place, policy))
+        found.add(_found(source, place, treating))
     return Audit(
         tuple(sorted(found)),
         len(sources),
@@ -102,21 +101,16 @@ def _is_silenced(source: SourceFile, place: Place) -> bool:
     return False
 
 
-def _found(source: SourceFile, place: Place, policy: Policy | None) -> Found:
-    rule = place.rule
-    treatment, does = rule.treated(policy)
-    if policy is not None and rule.source is not None:
-        globs = policy.allowed.get(rule.source, ())
-        if allowed(source.module.name, globs):
-            treatment, does = Treatment.NOTHING, "the job allows it to this module"
+def _found(source: SourceFile, place: Place, treating: Treating) -> Found:
+    treatment, does = treating.done(source, place)
     node = place.node
     return Found(
         source.path,
         node.lineno,
         node.col_offset + 1,
-        rule.kind,
+        place.rule.kind,
         place.call,
         treatment,
         does,
-        rule.instead,
+        place.rule.instead,
     )

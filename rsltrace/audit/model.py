@@ -51,8 +51,8 @@ class Rule:
     is_class: bool = False
     """Naming it is harmless; calling it or deriving from it is not."""
 
-    def treated(self, policy: Policy | None) -> tuple[Treatment, str]:
-        """Return what a job with this policy (None: no guard at all) does about the call."""
+    def treated(self, policy: Policy | None, whose: str = "the job") -> tuple[Treatment, str]:
+        """Return what a guard with this policy (None: no guard at all) does about the call."""
         if policy is None:
             return Treatment.NOTHING, "the job has no guard"
         if self.source is None or self.treatment not in (Treatment.VIRTUAL, Treatment.DETECTED):
@@ -63,7 +63,7 @@ class Rule:
         treatment = _OF_MODE[mode]
         if treatment is self.treatment:
             return treatment, self.does
-        return treatment, f"the job says {self.source.value}: {mode.value}"
+        return treatment, f"{whose} says {self.source.value}: {mode.value}"
 
 
 @dataclass(frozen=True, slots=True, order=True)

@@ -235,6 +235,38 @@ def test_what_is_done_is_what_the_job_says(robot: Path, guard: str, treatments: 
     assert [one.treatment.value for one in result.found] == treatments
 
 
+def test_a_node_has_its_own_guard(tmp_path: Path) -> None:
+    (tmp_path / "helper.py").write_text("import time\ndef stamp():\n    return time.time()\n")
+    (tmp_path / "two.py").write_text(
+        "import time, helper\n"
+        "LOADED = time.time()\n"
+        "class A:\n    def tick(self):\n        return time.time(), helper.stamp()\n"
+        "class B:\n    def tick(self):\n        return time.time(), helper.stamp()\n"
+        "def shared():\n    return time.time()\n"
+    )
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        "nodes:\n- {node: 'two:A', name: a, guard: {clock: error}}\n"
+        "- {node: 'two:B', name: b, guard: {clock: allow}}\n"
+        "search_path: [.]\nguard: {clock: record}\n"
+    )
+    done = {
+        (one.path.name, one.line): (one.treatment.value, one.does)
+        for one in audit_job(load_job(job), no_executables).found
+    }
+    assert done == {
+        ("helper.py", 3): ("nothing", "node b says clock: allow (refused elsewhere)"),
+        ("two.py", 2): ("recorded", "the job says clock: record"),
+        ("two.py", 5): ("refused", "node a says clock: error"),
+        ("two.py", 8): ("nothing", "node b says clock: allow"),
+        ("two.py", 10): ("nothing", "node b says clock: allow (refused elsewhere)"),
+    }
+    job.write_text(job.read_text().replace("guard: {clock: record}", "guard: false"))
+    assert {one.does for one in audit_job(load_job(job), no_executables).found} == {
+        "the job has no guard"
+    }
+
+
 def test_a_module_that_is_not_there_is_trouble(robot: Path) -> None:
     robot.write_text("nodes: [{node: 'robot.nothing:Ekf'}]\nsearch_path: [src]\n")
     with pytest.raises(JobError, match=r"job.yaml:1:16: there is no module 'robot.nothing'"):
