@@ -27,6 +27,7 @@ from rsltrace.model.finding import Policy
 from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
 from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
+from rsltrace.ros.missing import hint_for
 from rsltrace.ros.program import Program, failure_of
 from rsltrace.ros.waitables import OWN_WAITABLES, sync_waitables
 from rsltrace.trace.chain import hash64
@@ -440,7 +441,7 @@ class Core:
             self.error = failure if isinstance(failure, RunError) else RunError(str(failure))
         else:
             self.error = NodeError(
-                f"{where} raised {type(error).__qualname__}: {said}",
+                f"{where} raised {type(error).__qualname__}: {said}{hint_for(error)}",
                 node=name,
                 entity=label,
                 stamp_ns=stamp_ns,

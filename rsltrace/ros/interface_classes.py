@@ -10,7 +10,6 @@ service or an action are named as rosidl does: ``std_srvs/srv/Trigger_Request``,
 from __future__ import annotations
 
 import difflib
-import os
 import re
 import sys
 from functools import cache
@@ -19,6 +18,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from rsltrace.errors import SetupError
+from rsltrace.ros.missing import where_to_get
 
 _NAME = re.compile(r"(?P<package>[a-z]\w*)/(?P<kind>msg|srv|action)/(?P<type>[A-Z]\w*)", re.ASCII)
 
@@ -92,7 +92,7 @@ def _import_kind(name: str, package: str, kind: str) -> Any:
         if find_spec(package) is None:
             raise SetupError(
                 f"{name} needs the package {package}, which this Python cannot import. "
-                f"Source the ROS 2 workspace that holds it, or: pip install {_wheel(package)}"
+                f"{where_to_get(package)}"
             )
         module = import_module(f"{package}.{kind}")
     except ModuleNotFoundError as error:
@@ -114,10 +114,6 @@ def _broken(name: str, package: str, error: ImportError) -> str:
         f"{name}: package {package} is there but cannot be imported: {error}. "
         "Is the ROS 2 installation sourced, and built for this version of Python?"
     )
-
-
-def _wheel(package: str) -> str:
-    return f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
 
 
 def _near(type_: str, module: Any) -> str:

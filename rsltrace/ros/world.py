@@ -31,6 +31,7 @@ from rsltrace.ros.exit_handlers import own_exit_handlers
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
+from rsltrace.ros.missing import cannot_import
 from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
@@ -313,9 +314,7 @@ def load_target(target: str, *, where: str) -> Any:
                 "path); check the name, or add its folder to search_path",
                 where=where,
             ) from error
-        raise JobError(
-            f"module {module_name!r} cannot be imported: it needs {error.name!r}", where=where
-        ) from error
+        raise JobError(cannot_import(module_name, error), where=where) from error
     for part in attribute.split("."):
         try:
             value = getattr(value, part)

@@ -100,8 +100,9 @@ def test_the_services_of_an_action_are_services() -> None:
         (
             "no_such_msgs/msg/Thing",
             "no_such_msgs/msg/Thing needs the package no_such_msgs, which this Python cannot "
-            "import. Source the ROS 2 workspace that holds it, or: "
-            "pip install ros-jazzy-no-such-msgs",
+            "import. There is no wheel of it that we know of: source the ROS 2 workspace that "
+            "holds it (one of ROS's own: apt install ros-jazzy-no-such-msgs, then source "
+            "/opt/ros/jazzy/setup.bash), and run rsltrace with the Python that it is built for",
         ),
         (
             "std_msgs/msg/Uint64",
@@ -144,7 +145,7 @@ def test_the_package_to_install_is_that_of_the_distribution(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("ROS_DISTRO", "kilted")
-    with pytest.raises(SetupError, match="pip install ros-kilted-no-such-msgs"):
+    with pytest.raises(SetupError, match="apt install ros-kilted-no-such-msgs"):
         get_service_class("no_such_msgs/srv/Thing")
 
 

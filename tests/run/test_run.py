@@ -170,9 +170,36 @@ def test_what_cannot_be_constructed_is_explained(
         assert word in message
 
 
-def test_a_module_that_needs_another_one_says_which(record_job: Any) -> None:
-    with pytest.raises(JobError, match="needs 'a_missing_library'"):
-        record_job(TALKER, "import a_missing_library\n")
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("import a_missing_library", ["'a_missing_library'", "search_path", "pip install"]),
+        (
+            "from example_interfaces_of_nobody.srv import AddTwoInts",
+            ["holds ROS interfaces", "no wheel", "apt install ros-jazzy-example-interfaces-of"],
+        ),
+        ("import nobodys_msgs.msg as m", ["holds ROS interfaces", "no wheel", "source /opt/ros/"]),
+    ],
+)
+def test_a_module_that_needs_another_one_says_which_and_what_to_do(
+    record_job: Any, tmp_path: Path, line: str, words: list[str]
+) -> None:
+    with pytest.raises(JobError) as caught:
+        record_job(TALKER, f"{line}\n")
+    number = len((tmp_path / "nodes_under_test.py").read_text().splitlines())
+    for word in ["job.yaml:1:16: ", f"nodes_under_test.py:{number})", "it needs", *words]:
+        assert word in str(caught.value)
+
+
+def test_an_interface_that_a_callback_imports_in_vain_has_a_next_step(record_job: Any) -> None:
+    code = (
+        "class Late(Talker):\n"
+        "    def tick(self):\n"
+        "        from nobodys_interfaces.action import Go\n"
+    )
+    result = record_job("nodes: [{node: nodes_under_test:Late}]\n", code)
+    assert "No module named 'nobodys_interfaces'" in str(result.error)
+    assert "apt install ros-jazzy-nobodys-interfaces" in str(result.error)
 
 
 def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:

@@ -1,0 +1,77 @@
+"""What to do about a package that cannot be imported: which one, who wants it, where to get it.
+
+Interface packages (messages, services, actions) are generated code, so ``pip install <name>`` is
+seldom the answer: a few are on package indexes under other names, the rest come from ROS 2 itself.
+"""
+
+from __future__ import annotations
+
+import linecache
+import os
+import re
+from types import TracebackType
+
+_WHEELS = frozenset(
+    """
+    action_msgs actionlib_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs
+    nav_msgs rcl_interfaces rosgraph_msgs sensor_msgs service_msgs shape_msgs std_msgs std_srvs
+    stereo_msgs test_msgs trajectory_msgs type_description_interfaces unique_identifier_msgs
+    visualization_msgs
+    """.split()
+)
+"""Interface packages of which there are wheels: those of ROS's core and of common_interfaces."""
+
+_NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")
+
+
+def where_to_get(package: str) -> str:
+    """Say how to make an interface package importable, as a sentence."""
+    distro = os.environ.get("ROS_DISTRO") or "jazzy"
+    debian = f"ros-{distro}-{package.replace('_', '-')}"
+    if package in _WHEELS:
+        return f"Source the ROS 2 workspace that holds it, or: pip install {debian}"
+    return (
+        "There is no wheel of it that we know of: source the ROS 2 workspace that holds it (one of "
+        f"ROS's own: apt install {debian}, then source /opt/ros/{distro}/setup.bash), and run "
+        "rsltrace with the Python that it is built for"
+    )
+
+
+def cannot_import(module: str, error: ModuleNotFoundError) -> str:
+    """Say why a user's module cannot be imported, and what to do."""
+    needed = error.name or "?"
+    package = needed.partition(".")[0]
+    place, line = _last_line(error.__traceback__)
+    where = f" ({place})" if place else ""
+    text = f"module {module!r} cannot be imported: it needs {needed!r}{where}. "
+    if _is_interface(package, line):
+        return f"{text}{package} holds ROS interfaces. {where_to_get(package)}"
+    return (
+        f"{text}If it is yours, add its folder to search_path; else install it for this Python "
+        f"(pip install), or source the ROS 2 workspace that holds it"
+    )
+
+
+def hint_for(error: BaseException) -> str:
+    """Return what to add to the text of an exception that user code raised while it ran."""
+    if not isinstance(error, ModuleNotFoundError) or not error.name:
+        return ""
+    package = error.name.partition(".")[0]
+    _, line = _last_line(error.__traceback__)
+    return f"\n  {where_to_get(package)}" if _is_interface(package, line) else ""
+
+
+def _is_interface(package: str, line: str) -> bool:
+    imported = re.search(rf"\b{re.escape(package)}\.(msg|srv|action)\b", line)
+    return bool(imported or _NAMED_LIKE_ONE.search(package)) or package in _WHEELS
+
+
+def _last_line(traceback: TracebackType | None) -> tuple[str, str]:
+    """Return the place of the import that failed (``file:line``), and its text."""
+    found = ("", "")
+    while traceback is not None:
+        file, number = traceback.tb_frame.f_code.co_filename, traceback.tb_lineno
+        if not file.startswith("<") and f"{os.sep}importlib{os.sep}" not in file:
+            found = (f"{file}:{number}", linecache.getline(file, number))
+        traceback = traceback.tb_next
+    return found
