@@ -292,7 +292,7 @@ def _hidden(case: Case, what: str) -> str:
 def _because_of_settings(settings: Sequence[Setting]) -> str:
     if not settings:
         return ""
-    return f"the runs were made differently: {_listed([s.place for s in settings])}"
+    return f"the runs were made differently: {_listed([str(setting) for setting in settings])}"
 
 
 def _what_differs(case: Case) -> str:

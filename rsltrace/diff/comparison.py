@@ -9,10 +9,11 @@ from rsltrace.diff.ended import judge_ended, who_ended
 from rsltrace.diff.engine import interruptions, side
 from rsltrace.diff.explain import Explainer
 from rsltrace.diff.identity import Identity, identify
+from rsltrace.diff.job_settings import job_settings
 from rsltrace.diff.model import Diff, Divergence, Setting
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.rows import Run
-from rsltrace.diff.settings import entity_settings, environment_settings, job_settings
+from rsltrace.diff.settings import entity_settings, environment_settings
 from rsltrace.diff.stretches import EqualRun, Item, Stretch, Stretches
 from rsltrace.diff.tally import Tally
 from rsltrace.diff.tolerance import messages_within

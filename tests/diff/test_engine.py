@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import inspect
-import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -432,27 +431,6 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
         compare(tmp_path, window=0)
     with pytest.raises(TraceError, match="does not exist"):
         rsltrace.diff(tmp_path / "none.mcap", tmp_path / "a.mcap")
-
-
-def test_a_resolved_job_that_differs_is_a_setting(tmp_path: Path) -> None:
-    """An override on the command line is in no job file."""
-    from rsltrace.diff.settings import job_settings
-    from rsltrace.trace.reader import Trace
-
-    Simulation(PLAN, tmp_path / "a.mcap").run()
-    with Trace.open(tmp_path / "a.mcap") as a, Trace.open(tmp_path / "a.mcap") as b:
-        resolved = {"seed": 0, "nodes": [{"parameters": {"x": 1.0}}], "stop": {"events": None}}
-        a.job["resolved"] = json.dumps(resolved)
-        resolved["seed"] = 5
-        resolved["nodes"] = [{"parameters": {"x": 2.0, "yaw_rate": True}, "later": None}]
-        resolved["of_a_later_version"] = {"mode": "virtual"}
-        b.job["resolved"] = json.dumps(resolved)
-        found = {s.place: (s.a, s.b) for s in job_settings(a, b)}
-    assert found == {
-        "job: seed": ("0", "5"),
-        "job: nodes[0].parameters.x": ("1.0", "2.0"),
-        "job: nodes[0].parameters.yaw_rate": (None, "true"),
-    }, "keys that only one version of rsltrace knows are no difference of the jobs"
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:

@@ -224,7 +224,7 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert (diff.verdict, first.root) == (Verdict.ENVIRONMENT, Root.JOB)
     assert first.a is not None
     assert first.a.entity.name == "/sensor"
-    assert [s.place for s in diff.settings] == ["job.yaml:3"]
+    assert [str(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
 
 
@@ -234,7 +234,7 @@ def test_another_seed(diffed: Callable[..., Diff]) -> None:
     assert (diff.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
     assert first.a is not None
     assert first.a.entity.node == "/sensor"
-    assert [(s.a, s.b) for s in diff.settings] == [("seed: 0", "seed: 1")]
+    assert [(s.a, s.b) for s in diff.settings] == [("0", "1")]
     assert "job.yaml:7" in first.root_sentence
 
 

@@ -142,7 +142,7 @@ def _settings(diff: Diff, width: int) -> Section:
     rows = in_columns(
         [
             [
-                (printable(setting.place), ""),
+                (printable(str(setting)), ""),
                 (a, SIDE_A),
                 ("|", FAINT),
                 (b, SIDE_B),

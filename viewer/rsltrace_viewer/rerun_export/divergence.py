@@ -151,7 +151,7 @@ def document(diff: Diff) -> str:
         lines += ["", *_divergence(divergence, number, len(diff.divergences))]
     if diff.settings:
         lines += ["", "## Job and environment", "", "| | a | b |", "|---|---|---|"]
-        lines += [f"| {_text(s.place)} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings]
+        lines += [f"| {_text(str(s))} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings]
     lines += [f"\n{_text(note)}" for note in diff.notes]
     return "\n".join(lines) + "\n"
 
