@@ -99,7 +99,7 @@ def _guard_lines(trace: Trace) -> list[str]:
         row = (f"  {met.source.value}", met.mode.value, printable(met.node) or "-")
         rows.append((*row, printable(met.call), str(met.count)))
     findings = sum(met.count for met in trace.guarded if met.is_finding)
-    title = f"guard: {findings} findings" if findings else "guard: nothing that could differ"
+    title = f"guard findings: {findings}" if findings else "guard: nothing that could differ"
     return [*lines, "", title, *table(rows, right=frozenset((4,)))]
 
 

@@ -139,7 +139,7 @@ def test_info_cat_and_diff_tell(
         assert done.returncode in (0, 1), done.stderr
         return done.stdout
 
-    assert "guard: 3 findings" in command("info", "a.mcap")
+    assert "guard findings: 3" in command("info", "a.mcap")
     assert "! environment warn: os.environ['SHIFT'] -> '9'  at " + TICK in command("cat", "b.mcap")
     last = json.loads(command("cat", "b.mcap", "--json", "--kind", "timer").splitlines()[0])
     assert last["findings"][0]["value"] == "'9'"
