@@ -14,7 +14,7 @@ def loaded_after(code: str) -> set[str]:
     """Return which of the heavy packages a fresh interpreter has loaded after running ``code``."""
     probe = f"{code}\nimport sys\nprint(*[m for m in {HEAVY!r} if m in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", probe], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", probe], capture_output=True, text=True, check=True, timeout=300
     )
     return set(done.stdout.splitlines()[-1].split())
 

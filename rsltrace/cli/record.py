@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -224,8 +225,10 @@ def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
         if not ends:
             raise KeyboardInterrupt
         name = "interrupted" if number == signal.SIGINT else "terminated"
-        click.echo(f"\nrsltrace: {name}, closing the trace (once more to force)", err=True)
         end = ends.pop()
+        # Not through sys.stderr: the signal may have come in the middle of a write to it.
+        with suppress(OSError):
+            os.write(2, f"\nrsltrace: {name}, closing the trace (once more to force)\n".encode())
         end(Stop(name, 128 + number))
 
     for caught in (signal.SIGINT, signal.SIGTERM):

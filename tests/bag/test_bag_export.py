@@ -173,7 +173,7 @@ def test_the_commands(trace: Path, tmp_path: Path) -> None:
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
             [sys.executable, "-m", "rsltrace", *arguments],
-            cwd=tmp_path, env=dict(os.environ), capture_output=True, text=True, timeout=120,
+            cwd=tmp_path, env=dict(os.environ), capture_output=True, text=True, timeout=300,
             check=False,
         )  # fmt: skip
 

@@ -96,7 +96,7 @@ def test_a_run_that_crashes_is_trouble_and_says_where(rsltrace: Command, job: Wr
 
 def test_a_run_that_hangs_is_killed(rsltrace: Command, job: WriteJob) -> None:
     hang = "os.getcwd().endswith('x') and signal.pause()"
-    done = rsltrace("verify", job(hang), "--runs", "2", "--timeout", "20", timeout=100)
+    done = rsltrace("verify", job(hang), "--runs", "2", "--timeout", "20", timeout=300)
     assert done.returncode == 2, done.stdout
     assert "took too long" in done.stderr
 
@@ -115,7 +115,7 @@ def test_an_interruption_leaves_nothing_behind(
         while not mark.exists() and process.poll() is None:
             time.sleep(0.05)
         process.send_signal(number)
-        process.communicate(timeout=60)
+        process.communicate(timeout=300)
     assert process.returncode == status
     assert list(here.iterdir()) == []
     assert not _processes_with(f"HERE={mark}"), "what it has started is gone"

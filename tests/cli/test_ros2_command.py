@@ -58,7 +58,7 @@ def ros2(tmp_path: Path) -> object:
              *arguments],
             cwd=tmp_path,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))},
-            capture_output=True, text=True, timeout=120, check=False,
+            capture_output=True, text=True, timeout=300, check=False,
         )  # fmt: skip
 
     return call
@@ -100,6 +100,6 @@ def test_ros_arguments_arrive(ros2: object, tmp_path: Path) -> None:
     assert int(fast.stdout.split()[3]) - int(slow.stdout.split()[3]) == 6
     same = subprocess.run(
         [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "c.mcap"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False,
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
     assert same.stdout == slow.stdout

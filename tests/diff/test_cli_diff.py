@@ -34,7 +34,7 @@ def diff(tmp_path: Path) -> Callable[..., Done]:
             capture_output=True,
             text=True,
             encoding="utf-8",
-            timeout=60,
+            timeout=300,
             check=False,
         )
 
@@ -292,7 +292,7 @@ def on_terminal(arguments: list[str], **environment: str) -> str:
     os.close(slave)
     shown = b""
     while True:
-        ready, _, _ = select.select([master], [], [], 30)
+        ready, _, _ = select.select([master], [], [], 240)
         try:
             piece = os.read(master, 65536) if ready else b""
         except OSError:
@@ -301,7 +301,7 @@ def on_terminal(arguments: list[str], **environment: str) -> str:
             break
         shown += piece
     os.close(master)
-    process.wait(timeout=30)
+    process.wait(timeout=300)
     return shown.decode()
 
 

@@ -429,8 +429,13 @@ def test_what_a_file_says_cannot_steer_a_terminal_or_a_build(case: str, form: st
 @settings(max_examples=50)
 @given(st.text(max_size=30))
 def test_junit_is_well_formed_whatever_the_sentence(sentence: str) -> None:
-    text = render(dataclasses.replace(missing(), sentence=sentence or "x"), "junit")
-    ElementTree.fromstring(text)
+    plain, told = (
+        ElementTree.fromstring(render(dataclasses.replace(missing(), sentence=each), "junit"))
+        for each in ("x", sentence or "x")
+    )
+    assert [each.tag for each in told.iter()] == [each.tag for each in plain.iter()]
+    shown = told[0][0][0].attrib["message"].lower()
+    assert all(word.lower() in shown for word in re.findall(r"[A-Za-z0-9]+", sentence)), shown
 
 
 def test_junit_counts() -> None:

@@ -391,7 +391,7 @@ def threaded_blas(node: Any) -> object:
 
 @case(DETECTED, "environment variables")
 def environment(node: Any) -> object:
-    return os.environ["HOME"], os.getenv("PADDING")
+    return os.environ.get("HOME"), os.getenv("PADDING")
 
 
 @case(DETECTED, "the working directory")

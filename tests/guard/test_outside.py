@@ -111,7 +111,9 @@ class Counting(http.server.BaseHTTPRequestHandler):
 
 
 @pytest.fixture
-def server() -> Iterator[http.server.HTTPServer]:
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[http.server.HTTPServer]:
+    monkeypatch.setenv("no_proxy", "*")
+    monkeypatch.setattr(Counting, "count", 0)
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Counting) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
@@ -125,7 +127,7 @@ def test_an_http_answer_is_given_again_without_the_server(
 ) -> None:
     url = f"http://127.0.0.1:{server.server_address[1]}/x"
     code = node_code(
-        f"self.say(urllib.request.urlopen({url!r}, timeout=20).read().decode())",
+        f"self.say(urllib.request.urlopen({url!r}, timeout=200).read().decode())",
         imports="import urllib.request",
     )
     first = go(code, "{socket: record}", "first")
@@ -141,7 +143,7 @@ def test_an_http_answer_is_given_again_without_the_server(
 
 def test_a_refused_connection_is_given_again(go: Callable[..., Any]) -> None:
     code = node_code(
-        "try: socket.create_connection(('127.0.0.1', 1), timeout=5)\n"
+        "try: socket.create_connection(('127.0.0.1', 1), timeout=200)\n"
         "except OSError as error: self.say(type(error).__name__, error.errno)",
         imports="import socket",
     )

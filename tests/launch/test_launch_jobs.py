@@ -65,7 +65,7 @@ def rsltrace(folder: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
             [sys.executable, "-m", "rsltrace", *map(str, arguments)],
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=300,
             cwd=folder,
             env=dict(os.environ),
             check=False,

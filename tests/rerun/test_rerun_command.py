@@ -136,6 +136,6 @@ def test_help_loads_neither_rerun_nor_numpy() -> None:
         "print(*[m for m in ('rerun', 'numpy', 'pyarrow') if m in sys.modules])"
     )
     done: Any = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=300
     )
     assert done.stdout.splitlines()[-1] == ""

@@ -62,7 +62,7 @@ def harness(*arguments: object) -> subprocess.CompletedProcess[str]:
         [sys.executable, str(SUITE), *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=300,
     )
 
 

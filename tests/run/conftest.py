@@ -87,7 +87,7 @@ def rsltrace(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
             [sys.executable, "-m", "rsltrace", *map(str, arguments)],
             capture_output=True,
             text=True,
-            timeout=120,
+            timeout=300,
             env=env,
             check=False,
             **options,

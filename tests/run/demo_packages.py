@@ -106,7 +106,7 @@ class Native:
     def stop(self, program: str) -> None:
         """End a program as Ctrl-C does."""
         self._running[program].send_signal(signal.SIGINT)
-        self.wait(program, 20)
+        self.wait(program, 120)
 
     def output(self, program: str) -> str:
         """Return what a program has printed."""
@@ -120,10 +120,10 @@ def run_natively(prefix: Path, folder: Path) -> dict[str, list[str]]:
         for program in SERVERS:
             native.start(program)
         native.start(*CENSUS)
-        native.wait("census", 60)
+        native.wait("census", 240)
         for program in CLIENTS:
             native.start(program)
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 240
         for program in CLIENTS:
             native.wait(program, max(deadline - time.monotonic(), 1))
         for program in SERVERS:

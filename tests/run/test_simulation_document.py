@@ -27,7 +27,7 @@ def test_the_gym_like_example_reaches_its_goal(tmp_path: Path) -> None:
             capture_output=True,
             text=True,
             check=True,
-            timeout=120,
+            timeout=300,
         ).stdout
         for seed in ("1", "2")
     ]

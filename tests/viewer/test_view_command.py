@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib.util
 import json
+import os
 import shutil
 import socket
 import subprocess
@@ -126,14 +127,14 @@ def test_the_traces_of_a_folder(
 
 @pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux")
 def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
-    server = f"rsltrace-test-{tmp_path.name}"
+    server = f"rsltrace-test-{os.getpid()}"
 
     def tmux(*arguments: str) -> str:
         command = ["tmux", "-L", server, "-f", "/dev/null", *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     def wait_for(*wanted: str) -> str:
-        end = time.monotonic() + 30
+        end = time.monotonic() + 120
         screen = ""
         while time.monotonic() < end:
             screen = tmux("capture-pane", "-p")
@@ -170,7 +171,7 @@ def test_in_a_browser_on_this_machine_only(made: Path) -> None:
     command = [sys.executable, "-m", "rsltrace", "view", str(made), "--serve", "--port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
-        for _ in range(200):
+        for _ in range(1200):
             with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
                 break
             time.sleep(0.1)
@@ -178,12 +179,12 @@ def test_in_a_browser_on_this_machine_only(made: Path) -> None:
         bound = [line for line in _listening() if f":{port:04X}" in line]
         assert bound
         assert all("0100007F" in line for line in bound)
-        second = subprocess.run(command, capture_output=True, text=True, check=False, timeout=30)
+        second = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
         assert second.returncode != 0
         assert f"port {port} cannot be used" in second.stderr
     finally:
         server.terminate()
-        server.wait(10)
+        server.wait(120)
 
 
 async def _browse(port: int) -> None:
@@ -209,7 +210,7 @@ async def _browse(port: int) -> None:
 async def _until(page: Any, wanted: str) -> None:
     seen = b""
     while wanted.encode() not in seen:
-        message = await asyncio.wait_for(page.receive(), 30)
+        message = await asyncio.wait_for(page.receive(), 120)
         assert isinstance(message.data, bytes | str), message
         seen += message.data if isinstance(message.data, bytes) else b""
 
