@@ -6,6 +6,7 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from rsltrace.diff.again import record_again
 from rsltrace.diff.calls import call_differences
 from rsltrace.diff.cause import NODE, Found, Mark
 from rsltrace.diff.classify import ROOT_OF, Case, Judgement, judge
@@ -246,12 +247,14 @@ class Explainer:
         verdict = judgement.verdict
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
-        if verdict is Verdict.ENVIRONMENT:
-            return f"rsltrace info --json {path_a}; rsltrace info --json {path_b}"
+        if self.settings and (verdict is Verdict.ENVIRONMENT or _told_to_differ(self.settings)):
+            if "://" in f"{path_a} {path_b}":  # which the viewer does not open
+                return f"rsltrace diff {path_a} {path_b} --all"
+            return f"rsltrace view {path_a} {path_b}"
         until = format_seconds(view.stamp_ns)
-        name = self.run_a.trace.job.get("name", "")
-        if judgement.root in _AGAIN and name and view.kind is not EventKind.CONSTRUCT:
-            again = f"rsltrace record {shlex.quote(name)} --until {until} -o again.mcap --force"
+        record = record_again(self.run_a.trace)
+        if judgement.root in _AGAIN and record and view.kind is not EventKind.CONSTRUCT:
+            again = f"{record} --until {until} -o again.mcap --force"
             return f"{again}; rsltrace diff {path_a} again.mcap"
         path = path_a if judgement.a is not None else path_b
         node = view.entity.node
@@ -261,6 +264,11 @@ class Explainer:
         if view.kind is EventKind.CONSTRUCT:
             choice = " --kind construct"
         return f"rsltrace cat {path}{choice} --from {until} --to {until} --json --payloads"
+
+
+def _told_to_differ(settings: Sequence[Setting]) -> bool:
+    """Whether job or code are others in the two runs: that needs no third run to be believed."""
+    return any(not setting.place.startswith("environment:") for setting in settings)
 
 
 def _with_call(judgement: Judgement, calls: Sequence[CallDifference]) -> str:

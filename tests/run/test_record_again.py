@@ -1,0 +1,81 @@
+"""The command that a diff says to run next: it records the run that it speaks of, and no other."""
+
+from __future__ import annotations
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.diff.again import record_again
+from rsltrace.trace.reader import Trace
+
+JOB = """\
+nodes:
+  - {node: nodes_under_test:Talker, name: a}
+  - node: nodes_under_test:Listener
+stop: {duration: 3s}   # written in flow style, as the effective job is not
+"""
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        (),
+        ("--set", "delay.default.uniform={min: 0s, max: 200ms}", "--seed", "5"),
+        ("--until", "2", "--ros-args", "-r", "__ns:=/front"),
+    ],
+)
+def test_a_run_is_recorded_again(
+    rsltrace: Any, job_file: Any, tmp_path: Path, given: tuple[str, ...]
+) -> None:
+    job_file(JOB)
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap", *given)
+    assert done.returncode == 0, done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        words = shlex.split(record_again(trace))
+    assert words[:3] == ["rsltrace", "record", "job.yaml"]
+    until = ("--until", "2") if "--until" in given else ()
+    again = rsltrace(*words[1:], *until, "-o", "again.mcap")
+    assert again.stdout == done.stdout, (words, again.stderr)
+
+
+def test_where_the_jobs_differ_both_runs_are_to_be_looked_at(rsltrace: Any, job_file: Any) -> None:
+    """A third run would say nothing: it is known that the two must differ."""
+    job_file(JOB)
+    for name, given in (("a", ()), ("b", ("--set", "nodes.a.arguments.period=0.5"))):
+        done = rsltrace("record", "job.yaml", "-o", f"{name}.mcap", *given)
+        assert done.returncode == 0, done.stderr
+    done = rsltrace("diff", "a.mcap", "b.mcap")
+    assert done.stdout.endswith("next: rsltrace view a.mcap b.mcap\n"), done.stdout
+
+
+class _Job:
+    """As much of a trace as the command is made of."""
+
+    def __init__(self, name: str, text: str) -> None:
+        self.job, self.job_text = {"name": name}, text
+
+
+@pytest.mark.parametrize(
+    ("name", "override", "command"),
+    [
+        ("", "", ""),
+        (
+            "robot.launch.xml",
+            '--set launch.+={"file": "launch/robot.launch.xml", "arguments": {"world": "a lab"}}',
+            "rsltrace record --launch launch/robot.launch.xml 'world:=a lab'",
+        ),
+        (
+            "job.yaml",
+            '--set launch.+={"file": "x.launch.py", "arguments": {}, "skip_unsupported": true}',
+            "rsltrace record job.yaml --launch x.launch.py --skip-unsupported",
+        ),
+        ("job.yaml", "--set launch.+=x.xml", "rsltrace record job.yaml --set launch.+=x.xml"),
+        ("my job.yaml", '--until stop.time="3s"', "rsltrace record 'my job.yaml'"),
+    ],
+)
+def test_launch_files_and_names(name: str, override: str, command: str) -> None:
+    text = f"# The effective job of {name}\n#   with {override}\nnodes: []\n#   with --set x=1\n"
+    assert record_again(_Job(name, text)) == command  # type: ignore[arg-type]
