@@ -1,28 +1,24 @@
-"""The object that stands where rclpy keeps its C extension, and how it gets there.
+"""The object that stands where rclpy keeps its C extension (``installing`` puts it there).
 
-``install`` exchanges the reference ``_rclpy`` in every loaded rclpy module and in
-``rclpy.impl.implementation_singleton`` (for modules that load later); ``uninstall`` puts everything
-back. What has no side effect on the machine is passed through to the real extension: enums,
-exceptions, name validation, QoS structures, time points, log levels.
+What has no side effect on the machine is passed through to the real extension: enums, exceptions,
+name validation, QoS structures, time points, log levels.
 """
 
 from __future__ import annotations
 
-import sys
 import weakref
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import SetupError, UnsupportedError
-from rsltrace.ros import graph as graph_queries
-from rsltrace.ros.actions import ActionClientHandle, ActionServerHandle, GoalHandle
+from rsltrace.errors import UnsupportedError
+from rsltrace.ros.action_client import ActionClientHandle
+from rsltrace.ros.action_server import ActionServerHandle
 from rsltrace.ros.arguments import InvalidArgumentsError, UnknownArgumentsError
 from rsltrace.ros.clock import ClockEventHandle, ClockHandle
 from rsltrace.ros.codec import codec_for
 from rsltrace.ros.context import ContextHandle
 from rsltrace.ros.destroyable import Destroyable, set_invalid_handle
+from rsltrace.ros.goal_handle import GoalHandle
+from rsltrace.ros.graph import names_and_types
 from rsltrace.ros.guard_condition import GuardConditionHandle
 from rsltrace.ros.interfaces import type_hash
 from rsltrace.ros.lifecycle import StateMachineHandle
@@ -35,7 +31,6 @@ from rsltrace.ros.qos_status import (
     LivelinessChangedStatus,
     MatchedStatus,
 )
-from rsltrace.ros.release import check_release
 from rsltrace.ros.services import (
     ClientHandle,
     RequestId,
@@ -110,6 +105,11 @@ class Boundary:
         if self._core is None:
             raise UnsupportedError("no simulation is running in this process")
         return self._core
+
+    @property
+    def is_free(self) -> bool:
+        """Whether no simulation is under way in this process."""
+        return self._core is None
 
     def now_ns(self) -> int:
         """Return simulated time, or the last one between runs."""
@@ -243,39 +243,29 @@ class Boundary:
             raise self.real.NodeNameNonExistentError(f"cannot find node {full}")
         return node
 
-    def _by_node(self, ends: Any, name_of: str, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return graph_queries.names_and_types(
-            [
-                (getattr(end, name_of), end.type_name)
-                for group in ends.values()
-                for end in group
-                if end.node is node
-            ]
-        )
-
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        target = self._node_named(name, namespace)
-        return self._by_node(self.core.graph._publishers, "topic", target)
+        found = self.core.graph.publishers_of(self._node_named(name, namespace))
+        return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        target = self._node_named(name, namespace)
-        return self._by_node(self.core.graph._subscriptions, "topic", target)
+        found = self.core.graph.subscriptions_of(self._node_named(name, namespace))
+        return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        target = self._node_named(name, namespace)
-        return self._by_node(self.core.graph._services, "service", target)
+        found = self.core.graph.services_of(self._node_named(name, namespace))
+        return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        target = self._node_named(name, namespace)
-        return self._by_node(self.core.graph._clients, "service", target)
+        found = self.core.graph.clients_of(self._node_named(name, namespace))
+        return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
@@ -288,12 +278,12 @@ class Boundary:
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, 1, p._msg_type) for p in self.core.graph.publishers(topic)]
+        return [_endpoint_info(p, _PUBLISHER) for p in self.core.graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, 2, s._msg_type) for s in self.core.graph.subscriptions(topic)]
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in self.core.graph.subscriptions(topic)]
 
     # -- messages ----------------------------------------------------------------------------------
 
@@ -347,8 +337,14 @@ class Boundary:
         pass
 
 
-def _endpoint_info(endpoint: Any, endpoint_type: int, message_type: Any) -> dict[str, Any]:
-    text = type_hash(message_type) or ""
+_PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
+
+
+def _endpoint_info(
+    endpoint: PublisherHandle | SubscriptionHandle, endpoint_type: int
+) -> dict[str, Any]:
+    assert endpoint.node is not None
+    text = type_hash(endpoint.msg_type) or ""
     value = bytes.fromhex(text.removeprefix("RIHS01_")) if text.startswith("RIHS01_") else b""
     return {
         "node_name": endpoint.node.name,
@@ -359,88 +355,3 @@ def _endpoint_info(endpoint: Any, endpoint_type: int, message_type: Any) -> dict
         "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
         "qos_profile": endpoint.qos.to_dict(),
     }
-
-
-# The classes of the objects that the boundary makes, by their names in rclpy's extension.
-_HANDLES: dict[str, type] = {
-    "ActionClient": ActionClientHandle,
-    "ActionGoalHandle": GoalHandle,
-    "ActionServer": ActionServerHandle,
-    "Client": ClientHandle,
-    "Clock": ClockHandle,
-    "ClockEvent": ClockEventHandle,
-    "Context": ContextHandle,
-    "EventHandle": EventHandle,
-    "GuardCondition": GuardConditionHandle,
-    "LifecycleStateMachine": StateMachineHandle,
-    "Node": NodeHandle,
-    "Publisher": PublisherHandle,
-    "Service": ServiceHandle,
-    "Subscription": SubscriptionHandle,
-    "Timer": TimerHandle,
-    "TypeDescriptionService": TypeDescriptionServiceHandle,
-    "WaitSet": WaitSetHandle,
-}
-
-_installed: Boundary | None = None
-
-
-def boundary() -> Boundary:
-    """Return the boundary, loading rclpy's extension (but no rclpy module that binds it).
-
-    :raises SetupError: if rclpy is not installed or cannot be loaded.
-    """
-    global _installed
-    if _installed is None:
-        try:
-            from rclpy.impl import implementation_singleton as singleton
-        except ImportError as error:
-            raise SetupError(
-                "rclpy is not installed for this Python: install the ROS wheels with "
-                "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
-                f"({error})"
-            ) from error
-        real = singleton.rclpy_implementation
-        ours = Boundary(real)
-        check_release(real, ours, _HANDLES, Path(singleton.__file__).parents[1])
-        _installed = ours
-    return _installed
-
-
-def check_free() -> None:
-    """Raise UnsupportedError if a simulation is under way in this process: rclpy can be only one's.
-
-    :raises SetupError: if rclpy is not installed or cannot be loaded.
-    """
-    if boundary()._core is not None:
-        raise UnsupportedError(
-            "another simulation is running in this process: end it first (leave the block of the "
-            "other Simulation), or use a process of its own"
-        )
-
-
-@contextmanager
-def installed() -> Iterator[Boundary]:
-    """Have rclpy use the simulated middleware within the ``with`` block."""
-    ours = boundary()
-    _exchange(ours.real, ours)
-    try:
-        yield ours
-    finally:
-        _exchange(ours, ours.real)
-
-
-def _exchange(old: Any, new: Any) -> None:
-    for module in list(sys.modules.values()):
-        names = getattr(module, "__dict__", None)
-        if not isinstance(names, dict) or module is sys.modules[__name__]:
-            continue
-        for name in ("_rclpy", "rclpy_implementation"):
-            if names.get(name) is old:
-                names[name] = new
-    logger = sys.modules.get("rclpy.impl.rcutils_logger")
-    if logger is not None:
-        # The default clock of throttled logging was made when the module was loaded.
-        from rclpy.clock import Clock
-
-        logger.Throttle.params["throttle_time_source_type"] = Clock()

@@ -7,15 +7,18 @@ hashes of addresses).
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from rsltrace.errors import UnsupportedError
 from rsltrace.ros.qos import incompatible_policy
 
 if TYPE_CHECKING:
+    from rsltrace.ros.entity_handle import EntityHandle
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.pubsub import PublisherHandle, SubscriptionHandle
     from rsltrace.ros.services import ClientHandle, ServiceHandle
+
+EndT = TypeVar("EndT", bound="EntityHandle")
 
 
 class Graph:
@@ -136,18 +139,36 @@ class Graph:
 
     def interfaces_of(self, node: NodeHandle) -> Iterator[Any]:
         """Yield the classes of the messages, services and actions that a node uses."""
-        for topics in (self._publishers, self._subscriptions):
-            for topic_ends in topics.values():
-                yield from (end._msg_type for end in topic_ends if end.node is node)
-        for services in (self._services, self._clients):
-            for service_ends in services.values():
-                yield from (end._srv_type for end in service_ends if end.node is node)
+        yield from (end.msg_type for end in self.publishers_of(node))
+        yield from (end.msg_type for end in self.subscriptions_of(node))
+        yield from (end.srv_type for end in self.services_of(node))
+        yield from (end.srv_type for end in self.clients_of(node))
         yield from (action.action_type for action in node.actions)
 
-    def endpoints_of(self, node: NodeHandle) -> list[Any]:
+    def endpoints_of(self, node: NodeHandle) -> list[EntityHandle]:
         """Return a node's publishers, subscriptions, services and clients."""
-        kinds = (self._publishers, self._subscriptions, self._services, self._clients)
-        return [end for kind in kinds for ends in kind.values() for end in ends if end.node is node]
+        return [
+            *self.publishers_of(node),
+            *self.subscriptions_of(node),
+            *self.services_of(node),
+            *self.clients_of(node),
+        ]
+
+    def publishers_of(self, node: NodeHandle) -> list[PublisherHandle]:
+        """Return the publishers of a node, topic by topic."""
+        return _of(node, self._publishers)
+
+    def subscriptions_of(self, node: NodeHandle) -> list[SubscriptionHandle]:
+        """Return the subscriptions of a node, topic by topic."""
+        return _of(node, self._subscriptions)
+
+    def services_of(self, node: NodeHandle) -> list[ServiceHandle]:
+        """Return the servers of a node, service by service."""
+        return _of(node, self._services)
+
+    def clients_of(self, node: NodeHandle) -> list[ClientHandle]:
+        """Return the clients of a node, service by service."""
+        return _of(node, self._clients)
 
     def topic_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every topic with its type, sorted by name."""
@@ -167,6 +188,10 @@ class Graph:
             services.setdefault(name, set()).update(client.type_name for client in clients)
         services = {name: types for name, types in services.items() if types}
         return [(name, sorted(services[name])) for name in sorted(services)]
+
+
+def _of(node: NodeHandle, ends: dict[str, list[EndT]]) -> list[EndT]:
+    return [end for named in ends.values() for end in named if end.node is node]
 
 
 def action_names_and_types(

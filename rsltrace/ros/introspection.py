@@ -71,6 +71,6 @@ def reconfigured(events: ServiceEvents | None, end: Any, clock: Any, qos: Any, s
             events.close()
         return None
     if events is None:
-        events = ServiceEvents(end.core, end.node, end._srv_type, end.service, clock, qos)
+        events = ServiceEvents(end.core, end.node, end.srv_type, end.service, clock, qos)
     events.set_state(int(state))
     return events

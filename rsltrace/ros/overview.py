@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.ros.actions import ActionClientHandle
+from rsltrace.ros.action_client import ActionClientHandle
 from rsltrace.ros.entity_handle import callback_name
 from rsltrace.ros.interfaces import type_name as name_of_type
 from rsltrace.ros.qos import incompatible_policy

@@ -48,7 +48,7 @@ class PublisherHandle(EntityHandle):
         self.topic = node.resolve(topic, service=False)
         codec = codec_for(msg_type)
         self.type_name = codec.type_name
-        self._msg_type = msg_type
+        self.msg_type = msg_type
         self._serialize = codec.serialize
         self._canonical = codec.canonical
         peers = [s.qos for s in core.graph.subscriptions(self.topic)]
@@ -116,7 +116,7 @@ class PublisherHandle(EntityHandle):
         if self._offers is not None:
             self._offers.sent()
         if self._watcher is not None:
-            self._watcher(self._msg_type, data)
+            self._watcher(self.msg_type, data)
 
     def send_history(self, subscription: SubscriptionHandle) -> None:
         """Give a late joiner what it asks for and this publisher kept; never by best effort."""
@@ -163,7 +163,7 @@ class PublisherHandle(EntityHandle):
         self._channel = self.core.channel(
             self.topic,
             self.type_name,
-            lambda: (schema_text(self._msg_type), type_hash(self._msg_type) or ""),
+            lambda: (schema_text(self.msg_type), type_hash(self.msg_type) or ""),
             self.qos.to_yaml(),
         )
         return self._channel
@@ -228,7 +228,7 @@ class SubscriptionHandle(Receiver):
             self.set_content_filter(*content_filter)
         codec = codec_for(msg_type)
         self.type_name = codec.type_name
-        self._msg_type = msg_type
+        self.msg_type = msg_type
         self._deserialize = codec.deserialize
         peers = [p.qos for p in core.graph.publishers(self.topic)]
         self.qos: Qos = Qos.from_rmw(qos).resolved(publisher=False, peers=peers)

@@ -68,7 +68,7 @@ class _End(Receiver):
         self.service = node.resolve(name, service=True)
         self._request = codec_for(srv_type.Request)
         self._response = codec_for(srv_type.Response)
-        self._srv_type = srv_type
+        self.srv_type = srv_type
         self.type_name = self._request.type_name.removesuffix("_Request")
         self.profile = Qos.from_rmw(qos).resolved(publisher=True, peers=[])
         super().__init__(core, node)
@@ -166,13 +166,13 @@ class ServiceHandle(_End):
         wrapper = self.wrapper
         if self._events is not None:
             self._tell(REQUEST_RECEIVED, header.request_id, request)
-        response = wrapper.callback(request, self._srv_type.Response())
+        response = wrapper.callback(request, self.srv_type.Response())
         wrapper.send_response(response, header)
 
     async def _serve_async(self, request: Any, header: ServiceInfo) -> None:
         wrapper = self.wrapper
         self._tell(REQUEST_RECEIVED, header.request_id, request)
-        response = await wrapper.callback(request, self._srv_type.Response())
+        response = await wrapper.callback(request, self.srv_type.Response())
         wrapper.send_response(response, header)
 
     def service_take_request(self, request_type: Any) -> tuple[Any, Any]:
@@ -188,7 +188,7 @@ class ServiceHandle(_End):
         """Send a response to the client that asked."""
         data = self._response.serialize(response)
         position, digest = self._emit(
-            _RESPONSE, PREFIX_RESPONSE, self._response, self._srv_type.Response, data
+            _RESPONSE, PREFIX_RESPONSE, self._response, self.srv_type.Response, data
         )
         client = request_id.client
         if not client._destroyed:
@@ -234,7 +234,7 @@ class ClientHandle(_End):
         data = self._request.serialize(request)
         self._sequence += 1
         position, digest = self._emit(
-            _REQUEST, PREFIX_REQUEST, self._request, self._srv_type.Request, data
+            _REQUEST, PREFIX_REQUEST, self._request, self.srv_type.Request, data
         )
         header = ServiceInfo(RequestId(self, self._sequence), self.core.loop.now_ns)
         exchange = (data, self.core.loop.events, position, digest, header)

@@ -23,12 +23,13 @@ from rsltrace.model.event import EventKind
 from rsltrace.model.finding import Policy
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.blocking import end_blocked, simulated_waiting
-from rsltrace.ros.boundary import Boundary, installed
+from rsltrace.ros.boundary import Boundary
 from rsltrace.ros.core import Core
 from rsltrace.ros.ending import end_programs
 from rsltrace.ros.event_loops import simulated_event_loops
 from rsltrace.ros.exit_handlers import own_exit_handlers
 from rsltrace.ros.graph import Graph
+from rsltrace.ros.installing import installed
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.missing import cannot_import

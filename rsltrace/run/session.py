@@ -130,7 +130,7 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
-        from rsltrace.ros.boundary import check_free
+        from rsltrace.ros.installing import check_free
         from rsltrace.ros.world import World
 
         check_free()

@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import pytest
 
-import rsltrace.ros.boundary as boundary_module
+import rsltrace.ros.installing as installing
 from rsltrace.errors import SetupError
-from rsltrace.ros.boundary import Boundary, boundary
+from rsltrace.ros.boundary import Boundary
+from rsltrace.ros.installing import boundary
 from rsltrace.ros.release import missing_parts
 from rsltrace.ros.timers import TimerHandle
 
@@ -18,7 +19,7 @@ pytestmark = pytest.mark.ros
 
 def test_a_missing_part_of_the_boundary_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     boundary()  # this release is complete
-    monkeypatch.setattr(boundary_module, "_installed", None)
+    monkeypatch.setattr(installing, "_installed", None)
     monkeypatch.delattr(Boundary, "rclpy_get_topic_names_and_types")
     monkeypatch.delattr(TimerHandle, "time_since_last_call")
     with pytest.raises(SetupError) as caught:
@@ -26,7 +27,7 @@ def test_a_missing_part_of_the_boundary_is_named(monkeypatch: pytest.MonkeyPatch
     text = str(caught.value)
     assert "it uses Timer.time_since_last_call, rclpy_get_topic_names_and_types of" in text
     assert "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)" in text
-    assert boundary_module._installed is None
+    assert installing._installed is None
 
 
 def test_only_what_rclpy_uses_and_has_is_missed(tmp_path: Path) -> None:
