@@ -119,7 +119,8 @@ def _place(session: Any, at: str) -> int:
 
 
 def _checked_filter(session: Any, text: str) -> str:
-    from rsltrace_viewer.model.query import QueryError, parse
+    from rsltrace_viewer.model.query import parse
+    from rsltrace_viewer.model.query_text import QueryError
 
     try:
         parse(text, session.a)

@@ -7,7 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from rsltrace_viewer.model.match import mask_of
-from rsltrace_viewer.model.query import FIELDS, QueryError, completions, parse
+from rsltrace_viewer.model.query import parse
+from rsltrace_viewer.model.query_completion import completions
+from rsltrace_viewer.model.query_fields import FIELDS
+from rsltrace_viewer.model.query_text import QueryError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.text import outputs_text
 
@@ -113,6 +116,9 @@ def test_bare_words(run: Run) -> None:
         ("kind:timer,,sub", 11, "missing"),
         ("is:happy", 3, "raised"),
         ("level:loud", 6, "no such level"),
+        ('kind:timer ""', 11, "nothing between the quotes"),
+        ("(" * 5000, 0, "nested too deeply"),
+        ("not " * 5000, 0, "nested too deeply"),
     ],
 )
 def test_errors_say_where(run: Run, text: str, start: int, part: str) -> None:

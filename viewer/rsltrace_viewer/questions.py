@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from rsltrace_viewer.model.query import completions, parse
+from rsltrace_viewer.model.query import parse
+from rsltrace_viewer.model.query_completion import completions
 from rsltrace_viewer.model.times import parse_time
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.widgets.prompt import Question

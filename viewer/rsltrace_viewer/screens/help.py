@@ -14,7 +14,7 @@ from textual.widgets import Static
 from rsltrace_viewer.keys import KEYS
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.lanes import KIND_LETTERS
-from rsltrace_viewer.model.query import FIELDS
+from rsltrace_viewer.model.query_fields import FIELDS
 
 _KEY_WIDTH = 13
 _COLUMN = 62
