@@ -100,3 +100,9 @@ def user_modules(folders: list[str]) -> dict[str, Path]:
         if not installed and any(path.is_relative_to(folder) for folder in folders):
             found[name] = path
     return found
+
+
+def is_of_pytest(name: str) -> bool:
+    """Whether a loaded module is a test module or a conftest: pytest's own loader brought it."""
+    spec = getattr(sys.modules.get(name), "__spec__", None)
+    return type(getattr(spec, "loader", None)).__module__.startswith("_pytest.")

@@ -14,8 +14,9 @@ from pathlib import Path
 from rsltrace._version import __version__
 from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
+from rsltrace.job.node import Target
 from rsltrace.run.numerics import numerics
-from rsltrace.run.process import user_modules
+from rsltrace.run.process import is_of_pytest, user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.writer import TraceWriter
 
@@ -49,13 +50,26 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def sources(job: Job) -> dict[str, str]:
     """Return a hash of the code of every module loaded from the job's search path, by name; and of
-    the files that its models come from (``file:`` and the path in the job)."""
+    the files that its models come from (``file:`` and the path in the job).
+
+    Which tests run beside it says nothing of a job, unless its nodes are theirs.
+    """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
-    modules = user_modules(folders)
+    of_nodes = {_module_of(target) for spec in job.nodes for target in (spec.node, spec.main)}
+    modules = {
+        name: path
+        for name, path in user_modules(folders).items()
+        if name in of_nodes or not is_of_pytest(name)
+    }
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in modules.items()
     }
+
+
+def _module_of(target: Target | None) -> str:
+    named = target if isinstance(target, str) else getattr(target, "__module__", "")
+    return named.partition(":")[0]
 
 
 def environment(job: Job | None = None) -> dict[str, str]:

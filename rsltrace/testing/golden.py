@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from rsltrace.errors import RsltraceError, TraceError
 
@@ -16,6 +16,13 @@ if TYPE_CHECKING:
     from rsltrace.run import RunResult
 
 UPDATE_HINT = "pytest --rsltrace-update accepts what it does now"
+
+
+class Session:
+    """What pytest was asked for, and what was done; the plugin sets and reads it."""
+
+    update: bool = False
+    written: ClassVar[list[Path]] = []
 
 
 class GoldenMismatch(AssertionError):
@@ -41,14 +48,15 @@ def assert_matches_golden(
     job_or_result: Job | RunResult | str | os.PathLike[str],
     golden: str | os.PathLike[str],
     *,
-    update: bool = False,
+    update: bool | None = None,
     options: DiffOptions | None = None,
 ) -> bool:
     """Assert that a run does the same as the golden trace.
 
     ``job_or_result`` is a job (or its file, which is then run), the result of ``run_job``, or the
-    path of a trace (``.mcap``). With ``update``, the golden trace is written instead wherever it
-    is missing or another one. ``options`` shape the report; no tolerance makes a run match.
+    path of a trace (``.mcap``). With ``update`` (default: whether this is ``pytest
+    --rsltrace-update``), the golden trace is written instead wherever it is missing or another
+    one. ``options`` shape the report; no tolerance makes a run match.
     Returns whether the golden trace was written.
 
     :raises GoldenMismatch: they part; the message is the report.
@@ -61,10 +69,12 @@ def assert_matches_golden(
         with TemporaryDirectory(prefix="rsltrace-golden-") as folder:
             result = run_job(job_or_result, folder)  # type: ignore[arg-type]
             return assert_matches_golden(result, golden, update=update, options=options)
-    if update:
-        return _write(path, target)
+    if Session.update if update is None else update:
+        written = _write(path, target)
+        Session.written += [target] if written and update is None else []
+        return written
     if not target.exists():
-        raise TraceError(f"there is no golden trace {target}: {UPDATE_HINT}")
+        raise TraceError(f"there is no golden trace {target}: pytest --rsltrace-update writes it")
     report = _report(target, path, options)
     if report is not None:
         raise GoldenMismatch(f"{report}\n{UPDATE_HINT}")

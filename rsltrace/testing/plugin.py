@@ -5,6 +5,7 @@ Loaded in every pytest run of every environment with rsltrace in it, so it impor
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-if TYPE_CHECKING:
-    import os
+from rsltrace.testing.golden import Session
 
+if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.job import Job
     from rsltrace.run import RunResult
@@ -32,6 +33,22 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Let tests without the fixture know of ``--rsltrace-update``, too."""
+    Session.update = bool(config.getoption("--rsltrace-update"))
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Begin to note which golden traces a test writes."""
+    del item
+    Session.written.clear()
+
+
+def pytest_runtest_teardown(item: pytest.Item) -> None:
+    """Put those into its report, which xdist sends on."""
+    item.user_properties += [(_PROPERTY, os.path.abspath(path)) for path in Session.written]
+
+
 class Golden:
     """What the fixture ``rsltrace_golden`` gives: call it with a job or a result.
 
@@ -41,7 +58,6 @@ class Golden:
 
     def __init__(self, request: pytest.FixtureRequest, tmp_path: Path) -> None:
         self._node: Any = request.node
-        self._update = bool(request.config.getoption("--rsltrace-update"))
         self._tmp_path = tmp_path
         self._calls = 0
 
@@ -87,9 +103,7 @@ class Golden:
             is_job = not hasattr(given, "digest")
         if is_job:
             given = result = run_job(given, self._tmp_path, name=f"run{self._number()}.mcap")
-        written = assert_matches_golden(given, golden, update=self._update, options=options)
-        if written:
-            self._node.user_properties.append((_PROPERTY, str(golden)))
+        assert_matches_golden(given, golden, options=options)
         return result
 
     def _default(self) -> Path:

@@ -13,6 +13,8 @@ import pytest
 
 from rsltrace.errors import TraceError
 from rsltrace.testing import GoldenMismatch, assert_matches_golden
+from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.reader import Trace
 
 SAMPLE = Path(__file__).parent.parent.parent / "sample_traces" / "nondeterministic_callback"
 A, B = SAMPLE / "a.mcap", SAMPLE / "b.mcap"
@@ -210,3 +212,53 @@ def test_assert_matches_golden_runs_a_job(team: Run, tmp_path: Path) -> None:
     )
     done = team()
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.ros
+def test_the_option_holds_without_the_fixture(team: Run, tmp_path: Path) -> None:
+    """What the message says to do has to help whoever it is shown to."""
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "test_plain.py").write_text(
+        "from rsltrace.testing import assert_matches_golden\n"
+        "def test_job():\n"
+        "    assert_matches_golden('job.yaml', 'golden.mcap')\n"
+        "def test_other():\n"
+        "    pass\n"
+    )
+    missing = team()
+    assert missing.returncode == 1
+    assert "golden.mcap: pytest --rsltrace-update writes it" in missing.stdout
+    made = team("--rsltrace-update")
+    assert made.returncode == 0, made.stdout
+    assert made.stdout.count(str(tmp_path / "golden.mcap")) == 1
+    assert team().returncode == 0
+    assert team(STEP="2").returncode == 1
+
+
+@pytest.mark.ros
+def test_tests_are_no_code_of_the_job(team: Run, tmp_path: Path) -> None:
+    """Another test beside it is no reason why a run is another one; a node in a test is."""
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    (tmp_path / "conftest.py").write_text("")
+    (tmp_path / "test_robot.py").write_text(
+        "def test_counts(rsltrace_golden):\n    rsltrace_golden('job.yaml')\n"
+    )
+    (tmp_path / "test_own.py").write_text(
+        "import rsltrace\n"
+        "from counting import Counter\n"
+        "class Mine(Counter):\n"
+        "    pass\n"
+        "def test_own(rsltrace_golden):\n"
+        "    node = rsltrace.NodeSpec(node=Mine)\n"
+        "    stop = rsltrace.StopSpec(duration='1s')\n"
+        "    rsltrace_golden(rsltrace.Job(nodes=[node], stop=stop, search_path=['.']))\n"
+    )
+    made = team("--rsltrace-update")
+    assert made.returncode == 0, made.stdout
+    assert _modules(tmp_path / "golden" / "test_counts.mcap") == {"counting"}
+    assert _modules(tmp_path / "golden" / "test_own.mcap") == {"counting", "test_own"}
+
+
+def _modules(path: Path) -> set[str]:
+    with Trace.open(path) as trace:
+        return set(trace.metadata(METADATA_SOURCES))
