@@ -106,10 +106,12 @@ class Channel:
             if delay_ns < 0:
                 return delay_ns
         if self.keep_order:
-            arrival_ns = now_ns + delay_ns
-            if arrival_ns < self._last_ns:
-                return self._last_ns - now_ns
-            self._last_ns = arrival_ns
+            delay_ns = max(delay_ns, self._last_ns - now_ns)
+            self._last_ns = now_ns + delay_ns
+            if self.duplicate_ns >= 0:
+                # The copy follows its message, in front of the next one.
+                self.duplicate_ns = max(delay_ns, self.duplicate_ns)
+                self._last_ns = now_ns + self.duplicate_ns
         return delay_ns
 
     def _troubled(self, now_ns: int) -> int:

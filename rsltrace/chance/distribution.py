@@ -19,6 +19,10 @@ from rsltrace.chance.stream import Stream
 
 Sampler = Callable[[int], int]
 
+LONGEST_NS = 1 << 55
+"""More than 400 days. What is drawn from a long tail ends here: it is as good as never, and
+simulated time, like ROS's own, ends at 2**63 ns."""
+
 
 class Distribution(Protocol):
     """How long something takes."""
@@ -65,7 +69,7 @@ class Normal:
             while True:
                 value = mean + sd * quantile(uniform())
                 if value >= 0.0:
-                    return int(value + 0.5)
+                    return int(min(value, LONGEST_NS) + 0.5)
 
         return draw
 
@@ -85,7 +89,7 @@ class Lognormal:
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:
         uniform, median, sigma = stream.uniform, self.median_ns, self.sigma
-        return lambda now_ns: int(median * exp(sigma * quantile(uniform())) + 0.5)
+        return lambda now_ns: int(min(median * exp(sigma * quantile(uniform())), LONGEST_NS) + 0.5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +127,7 @@ class Gamma:
             value = d * v * scale
             if small:  # a gamma of shape + 1, times a uniform to the power of 1 / shape
                 value *= exp(max(log(uniform()) * power, -700.0))
-            return int(value + 0.5)
+            return int(min(value, LONGEST_NS) + 0.5)
 
         return draw
 

@@ -7,12 +7,28 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
+from rsltrace.chance.distribution import LONGEST_NS
 from rsltrace.job.node import check_path
 from rsltrace.job.part import Part, attach, check, from_file, items, one_of, positive_time
 from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.times import TIME_SCHEMA, UNITS_NS, parse_time
 
 SAMPLE_UNITS = tuple(UNITS_NS)
+
+
+def parse_short_time(value: object) -> int:
+    """Return a time that something may take, in nanoseconds."""
+    return check_short(parse_time(value), getattr(value, "text", value))
+
+
+def check_short(time_ns: int, shown: object) -> int:
+    """Return ``time_ns`` unless it is longer than anything takes."""
+    if time_ns > LONGEST_NS:
+        raise ValueError(f"{shown} is too long: at most {LONGEST_NS // UNITS_NS['h']}h")
+    return time_ns
+
+
+attach(parse_short_time, schema=TIME_SCHEMA)
 
 
 def number(least: float, most: float | None = None, *, open_below: bool = False) -> Any:
@@ -79,10 +95,10 @@ class UniformSpec(Part):
 
     TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
 
-    min_ns: Annotated[int, check(parse_time)] = Field(
+    min_ns: Annotated[int, check(parse_short_time)] = Field(
         alias="min", description="Shortest time.", examples=["1ms"]
     )
-    max_ns: Annotated[int, check(parse_time)] = Field(
+    max_ns: Annotated[int, check(parse_short_time)] = Field(
         alias="max", description="Longest time.", examples=["3ms"]
     )
 
@@ -159,12 +175,15 @@ class GammaSpec(Part):
 class SamplesSpec(Part):
     """Measured values, each as likely as the others: listed here, or in a file."""
 
-    values_ns: Annotated[tuple[int, ...] | None, check(items(parse_time), optional=True)] = Field(
-        default=None, alias="values", description="The values.", examples=[["4.8ms", "5.1ms"]]
+    values_ns: Annotated[tuple[int, ...] | None, check(items(parse_short_time), optional=True)] = (
+        Field(
+            default=None, alias="values", description="The values.", examples=[["4.8ms", "5.1ms"]]
+        )
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A text file with one value per line; empty lines and # comments are skipped.",
+        description="A text file with one value per line, rounded to nanoseconds; empty lines and "
+        "# comments are skipped.",
         examples=["delays.txt"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
@@ -185,7 +204,7 @@ class SamplesSpec(Part):
 def _check_point(value: object) -> tuple[int, int]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
         raise Problem("expected a pair: [time since the start, value]")
-    return parse_time(value[0]), parse_time(value[1])
+    return parse_time(value[0]), parse_short_time(value[1])
 
 
 attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 2, "maxItems": 2})
@@ -203,7 +222,8 @@ class SeriesSpec(Part):
     )
     file: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
-        description="A CSV file with two columns: time since the start, value.",
+        description="A CSV file with two columns: time since the start, value. A first line "
+        "without numbers is a header.",
         examples=["link.csv"],
     )
     unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
@@ -238,7 +258,7 @@ class DistributionSpec(Part):
 
     TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
 
-    constant_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+    constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
         default=None, alias="constant", description="Always this.", examples=["5ms"]
     )
     uniform: UniformSpec | None = Field(

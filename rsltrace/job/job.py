@@ -246,6 +246,10 @@ class Job(Part):
         """Return a path of the job as an absolute path."""
         return Path(os.path.normpath(self.base_dir / path))
 
+    def shown(self, path: str) -> str:
+        """Return a path of the job as messages show it: beside the job file as it was named."""
+        return os.path.normpath(os.path.join(os.path.dirname(self.source_name), path))
+
     def to_yaml(self) -> str:
         """Return a job file that loads as this job (from ``base_dir``).
 

@@ -94,6 +94,22 @@ def parse_time(value: object) -> int:
     raise ValueError(f"{_EXPECTED}, got {_kind(value)}")
 
 
+def parse_measured(text: str, unit: str) -> int:
+    """Return a measured time in nanoseconds, rounded; ``unit`` is that of a number without one.
+
+    Programs write measured values with more digits than they mean. Raises ``ValueError``.
+    """
+    match = _TIME_TEXT.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"expected a number, or a number with a unit ({', '.join(UNITS_NS)}), got {text!r}"
+        )
+    number, own_unit = match.groups()
+    if own_unit and own_unit not in UNITS_NS:
+        return _parse_text(text)
+    return _exact(number, UNITS_NS[own_unit or unit], text.strip(), rounded=True)
+
+
 def format_time(time_ns: int) -> str:
     """Return the shortest text in seconds that ``parse_time`` reads back exactly: ``1.5s``."""
     return format_seconds(time_ns).rstrip("0").rstrip(".") + "s"
@@ -113,7 +129,7 @@ def _parse_text(text: str) -> int:
     return _exact(number, UNITS_NS[unit], text.strip())
 
 
-def _exact(number: str, unit_ns: int, shown: str) -> int:
+def _exact(number: str, unit_ns: int, shown: str, *, rounded: bool = False) -> int:
     try:
         decimal = Decimal(number.lower().replace(".inf", "inf").replace(".nan", "nan"))
     except InvalidOperation:
@@ -124,8 +140,12 @@ def _exact(number: str, unit_ns: int, shown: str) -> int:
     if decimal and decimal.adjusted() > 30:
         raise ValueError(_too_large(shown))
     if decimal and decimal.adjusted() < -30:
+        if rounded:
+            return 0
         raise ValueError(_too_fine(shown))
     time_ns = Fraction(decimal) * unit_ns
+    if rounded:
+        return _checked(round(time_ns), shown)
     if time_ns.denominator != 1:
         raise ValueError(_too_fine(shown))
     return _checked(time_ns.numerator, shown)

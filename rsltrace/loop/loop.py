@@ -41,6 +41,8 @@ class TimerOwner(Dispatchable, Protocol):
 
 
 NOTHING_LEFT = "nothing left to do"
+END_OF_TIME = "what is due next is beyond 2**63 ns, where ROS's time ends"
+TIME_NS_MAX = 2**63 - 1
 ORDER_BAG = 0
 ORDER_RELEASE = 1
 
@@ -143,6 +145,9 @@ class EventLoop:
             if next_ns > self.now_ns:
                 if self.min_step_ns:
                     next_ns = self.stepped(next_ns, quiet_ns)
+                if next_ns > TIME_NS_MAX:
+                    self.stopped = Stop(END_OF_TIME)
+                    return self.stopped
                 self.now_ns = next_ns
 
     def stepped(self, next_ns: int, end_ns: int) -> int:

@@ -125,7 +125,7 @@ class Exchanges:
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
-            draw = _LOST[delay_ns] if delay_ns < 0 else _DELAY | delay_ns
+            draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
             note(core, self._receiver.entity_id, draw)
             if delay_ns < 0:
                 return
@@ -161,7 +161,7 @@ class Link:
         self._core = core
         self._publisher = publisher
         self._channel = channel
-        self._held: deque[tuple[Delivery, int]] = deque(maxlen=publisher.qos.keep)
+        self._held: deque[tuple[Delivery, list[int]]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
         self._under_way: deque[Delivery] = deque()
         self._plain = channel.plain if channel is not None and channel.keep_order else None
@@ -219,16 +219,24 @@ class Link:
                 note(core, self.subscription.entity_id, _LOST[delay_ns])
                 self._lost += 1
                 return
-            note(core, self._receiver, _DELAY | delay_ns)
+            note(core, self._receiver, encode_draw(Draw.DELAY, delay_ns))
+            arrivals_ns = [arrival_ns + delay_ns]
             if channel.duplicate_ns >= 0:
-                self._duplicate(delivery, arrival_ns + channel.duplicate_ns)
+                copy_ns = arrival_ns + channel.duplicate_ns
+                note(core, self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+                arrivals_ns.append(copy_ns)
+            self._last_ns = max(self._last_ns, *arrivals_ns)
             if channel.held_until_ns >= 0:
-                self._last_ns = max(self._last_ns, arrival_ns + delay_ns)
-                self._hold(delivery, arrival_ns + delay_ns, channel.held_until_ns)
+                self._hold(delivery, arrivals_ns, channel.held_until_ns)
                 return
-            arrival_ns += delay_ns
-            self._last_ns = max(self._last_ns, arrival_ns)
-        if arrival_ns == now_ns:
+            for arrival_ns in arrivals_ns:
+                self._bring(delivery, arrival_ns)
+            return
+        self._bring(delivery, arrival_ns)
+
+    def _bring(self, delivery: Delivery, arrival_ns: int) -> None:
+        loop = self._core.loop
+        if arrival_ns <= loop.now_ns:
             self._arrive(delivery)
         else:
             loop.schedule(arrival_ns, partial(self._arrive, delivery))
@@ -292,27 +300,19 @@ class Link:
         if self._lease is not None:
             self._lease.gone()
 
-    def _duplicate(self, delivery: Delivery, arrival_ns: int) -> None:
-        core = self._core
-        note(
-            core,
-            self.subscription.entity_id,
-            encode_draw(Draw.DUPLICATE, arrival_ns - core.loop.now_ns),
-        )
-        core.loop.schedule(arrival_ns, partial(self._arrive, delivery))
-
-    def _hold(self, delivery: Delivery, arrival_ns: int, until_ns: int) -> None:
+    def _hold(self, delivery: Delivery, arrivals_ns: list[int], until_ns: int) -> None:
         if not self._held:
             self._core.loop.schedule(until_ns, self._release)
         elif len(self._held) == self._held.maxlen:
             self._lost += 1
-        self._held.append((delivery, arrival_ns))
+        self._held.append((delivery, arrivals_ns))
 
     def _release(self) -> None:
         """Let go of what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
         now_ns = self._core.loop.now_ns
-        for delivery, arrival_ns in held:
-            action: Callable[[], None] = partial(self._arrive, delivery)
-            self._core.loop.schedule(max(arrival_ns, now_ns), action)
+        for delivery, arrivals_ns in held:
+            for arrival_ns in arrivals_ns:
+                action: Callable[[], None] = partial(self._arrive, delivery)
+                self._core.loop.schedule(max(arrival_ns, now_ns), action)

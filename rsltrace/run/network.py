@@ -30,7 +30,7 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
         return None
     topics = [NameRule(name, model_of(job, spec)) for name, spec in delay.topics.items()]
     if delay.file is not None:
-        table = read_rslcpp(job.resolve(delay.file))
+        table = read_rslcpp(job.resolve(delay.file), job.shown(delay.file))
         topics += [NameRule(name, model_of(job, spec)) for name, spec in table.items()]
     return NetworkPlan(
         links=tuple(
@@ -89,10 +89,12 @@ def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
     if spec.samples is not None:
         samples = spec.samples
         if samples.file is not None:
-            return Samples(read_samples(samples, job.resolve(samples.file)))
+            path, name = job.resolve(samples.file), job.shown(samples.file)
+            return Samples(read_samples(samples, path, name))
         return Samples(samples.values_ns or ())
     series = spec.series
     assert series is not None
     if series.file is not None:
-        return Series(read_series(series, job.resolve(series.file)), series.steps)
+        path, name = job.resolve(series.file), job.shown(series.file)
+        return Series(read_series(series, path, name), series.steps)
     return Series(series.points or (), series.steps)

@@ -102,6 +102,22 @@ def test_no_message_overtakes_another_unless_it_may() -> None:
     assert all(late >= early for late, early in zip(ordered, free, strict=True))
 
 
+def test_a_second_copy_keeps_the_order_too() -> None:
+    model = Model(delay=Uniform(0, 50 * MS), duplicate=0.3, drop=0.1)
+    for reliable in (False, True):
+        link = channel(model, reliable=reliable)
+        arrivals, copies = [], 0
+        for i in range(2000):
+            delay_ns = link.transmit(i * MS)
+            if delay_ns >= 0:
+                arrivals.append(i * MS + delay_ns)
+                if link.duplicate_ns >= 0:
+                    arrivals.append(i * MS + link.duplicate_ns)
+                    copies += 1
+        assert copies > 400
+        assert arrivals == sorted(arrivals)
+
+
 def test_a_reliable_link_sends_again_what_it_loses() -> None:
     model = Model(delay=Constant(MS), drop=0.25, retransmit_ns=10 * MS, keep_order=False)
     delays = sent(channel(model, reliable=True))

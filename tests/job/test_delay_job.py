@@ -194,11 +194,48 @@ def test_samples_and_series_from_files(folder: Path) -> None:
     (folder / "s.csv").write_text("time,delay\n0,0.001\n10,20ms\n")
     assert model("{series: {file: s.csv}}").delay == Series(((0, MS), (10 * S, 20 * MS)))
     (folder / "bad.txt").write_text("1\nnan\n")
-    assert mistake("default: {samples: {file: bad.txt, unit: ms}}\n").startswith("bad.txt:2: ")
+    assert mistake("default: {samples: {file: bad.txt, unit: ms}}\n").startswith("bad.txt:2:1: ")
     (folder / "bad.csv").write_text("0,1\n0,2\n")
-    assert mistake("default: {series: {file: bad.csv}}\n").startswith("bad.csv:2: its time")
+    assert mistake("default: {series: {file: bad.csv}}\n").startswith("bad.csv:2:1: its time")
     (folder / "empty.txt").write_text("\n")
     assert mistake("default: {samples: {file: empty.txt}}\n").startswith("empty.txt: it has no")
+
+
+def test_measured_values_are_rounded_to_nanoseconds(folder: Path) -> None:
+    # As numpy.savetxt writes them, and a difference of two time.perf_counter().
+    (folder / "s.txt").write_text("4.812345678912345678e-03\n0.0000000005\n1e-40\n")
+    assert model("{samples: {file: s.txt}}").delay == Samples((4_812_346, 0, 0))
+    (folder / "s.csv").write_text("t0,v1\n0.1234567891,0.00123456789\n")
+    assert model("{series: {file: s.csv}}").delay == Series(((123_456_789, 1_234_568),))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("1\n 1;2\n", "sub/s.txt:2:2: expected one value per line, got '1;2'"),
+        ("1,2\n", "sub/s.txt:1:1: expected one value per line, got '1,2'"),
+        ("# ms\ndelay\n", "sub/s.txt:2:1: expected a number, or a number with a unit"),
+        ("-1\n", "sub/s.txt:1:1: a time must not be negative, got -1"),
+        ("1e400\n", "sub/s.txt:1:1: 1e400 is too large"),
+        ("20000h\n", "sub/s.txt:1:1: 20000h is too long: at most 10007h"),
+    ],
+)
+def test_a_mistake_in_a_file_is_shown_with_its_line(folder: Path, text: str, message: str) -> None:
+    (folder / "sub").mkdir()
+    (folder / "sub" / "s.txt").write_text(text)
+    with pytest.raises(JobError) as caught:
+        network_plan(load("default: {samples: {file: sub/s.txt}}\n"), 0)
+    told = str(caught.value)
+    assert told.startswith(message)
+    number = int(message.split(":")[1])
+    assert told.splitlines()[1] == f"{number:>5} | {text.splitlines()[number - 1]}"
+
+
+def test_files_in_other_encodings_are_told_what_they_are(folder: Path) -> None:
+    (folder / "s.txt").write_bytes("1\n2\n".encode("utf-16"))
+    assert "s.txt: this is UTF-16" in mistake("default: {samples: {file: s.txt}}\n")
+    (folder / "s.txt").write_bytes(b"1\n# \xe4\n")
+    assert "s.txt:2: not UTF-8: byte 0xe4" in mistake("default: {samples: {file: s.txt}}\n")
 
 
 # RSLCPP's own example, as far as it can be reproduced.
@@ -227,6 +264,15 @@ def test_rslcpps_table_of_fixed_delays(folder: Path) -> None:
     ]
 
 
+def test_a_table_without_header_does_not_lose_its_first_line(folder: Path) -> None:
+    (folder / "d.csv").write_text("/a,FIXED,5,\n/b,FIXED,5,\n")
+    assert mistake("file: d.csv\n").startswith("d.csv:1:1: the first line is a header")
+    (folder / "d.csv").write_text("\n/b,FIXED,5,\n")  # the first line is empty
+    plan = network_plan(load("file: d.csv\n"), 0)
+    assert plan is not None
+    assert [rule.name for rule in plan.topics] == ["/b"]
+
+
 @pytest.mark.parametrize(
     ("line", "message"),
     [
@@ -241,4 +287,4 @@ def test_rslcpps_table_of_fixed_delays(folder: Path) -> None:
 )
 def test_mistakes_in_rslcpps_table(folder: Path, line: str, message: str) -> None:
     (folder / "d.csv").write_text(RSLCPP + line + "\n")
-    assert mistake("file: d.csv\n").startswith(f"d.csv:5: {message}")
+    assert mistake("file: d.csv\n").startswith(f"d.csv:5:1: {message}")

@@ -113,6 +113,17 @@ def test_stop_ends_at_once_and_stop_after_step_does_not() -> None:
         assert len(log) == count
 
 
+def test_what_is_due_after_the_end_of_time_never_is() -> None:
+    log: list[str] = []
+    for options in ({}, {"stop_conditions": (lambda progress: None,)}):
+        loop = make_loop(**options)
+        loop.schedule(2**63 - 1, lambda: log.append("last"))
+        loop.schedule(2**63, lambda: log.append("too late"))
+        assert loop.run() == Stop("what is due next is beyond 2**63 ns, where ROS's time ends")
+        assert loop.now_ns == 2**63 - 1
+    assert log == ["last", "last"]
+
+
 def test_nothing_left_to_do() -> None:
     assert make_loop().run() == Stop("nothing left to do")
 

@@ -169,6 +169,34 @@ def test_duplicates_arrive_twice(run: Run) -> None:
     assert run.heard == [(1, 105), (1, 105), (2, 205), (2, 205)]
 
 
+def test_a_copy_of_what_an_outage_pushed_out_does_not_arrive_either(run: Run) -> None:
+    delay = {
+        "default": {"duplicate": 1.0},
+        "outages": [{"node": "/talker", "from": "0.25s", "to": "0.65s"}],
+    }
+    run(lambda: Talker(2), Listener, delay=delay, duration=0.75)
+    assert [number for number, _ in run.heard] == [1, 1, 2, 2, 5, 5, 6, 6, 7, 7]
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        {"lognormal": {"median": "1h", "sigma": 10}},
+        {"gamma": {"shape": 1e9, "scale": "10000h"}},
+        {"normal": {"mean": "2500000h", "sd": "2500000h"}},
+    ],
+)
+def test_the_longest_tail_is_a_delay_and_nothing_else(run: Run, model: dict[str, Any]) -> None:
+    # A delay of more than 56 bits once ran over into what the draw is.
+    recorded = run(Talker, Listener, delay={"default": model}, duration=3.0)
+    assert run.nodes["talker"].count == 30
+    with recorded.trace() as trace:
+        outputs = [out for i in range(trace.event_count) for out in trace.outputs_of(i)]
+    said = [draw_text(out.hash) for out in outputs if out.kind is OutputKind.DRAW]
+    assert {text.split()[0] for text in said} == {"delay"}
+    assert len(said) == 30
+
+
 def test_an_outage_of_a_node_cuts_topics_and_holds_what_is_reliable(run: Run) -> None:
     delay = {"outages": [{"node": "/talker", "from": "0.25s", "to": "0.65s"}]}
     run(lambda: Talker(2), Listener, delay=delay, start="100s", duration=0.85)
