@@ -6,6 +6,7 @@ What is exchanged is few and the same in all versions: how an executor learns of
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -29,10 +30,11 @@ def own_executors(core: Core) -> Iterator[None]:
     from rclpy import executors
     from rclpy.executors import Executor
 
-    real = {name: getattr(Executor, name) for name in _methods(core, {})}
+    made: list[weakref.ref[Executor]] = []
+    real = {name: getattr(Executor, name) for name in _methods(core, {}, made)}
     names = ("os", "time")
     saved = {name: getattr(executors, name) for name in names if hasattr(executors, name)}
-    for name, method in _methods(core, real).items():
+    for name, method in _methods(core, real, made).items():
         setattr(Executor, name, method)
     executors.os = SimpleNamespace(
         sched_getaffinity=lambda pid: set(range(WORKERS)), cpu_count=lambda: WORKERS
@@ -45,13 +47,31 @@ def own_executors(core: Core) -> Iterator[None]:
             setattr(Executor, name, method)
         for name, value in saved.items():
             setattr(executors, name, value)
+        _release(made)
 
 
-def _methods(core: Core, real: dict[str, Any]) -> dict[str, Callable[..., Any]]:
-    """Return what stands in for methods of ``Executor``; ``real`` are the originals."""
+def _release(made: list[weakref.ref[Any]]) -> None:
+    """Take from executors that nobody shut down what they would give back to rclpy when collected.
+
+    By then it is the real rclpy again, which never had it.
+    """
+    for reference in made:
+        executor = reference()
+        guard = getattr(executor, "_sigint_gc", None)
+        if executor is not None and guard is not None:
+            guard.handle.destroy_when_not_in_use()
+            executor._sigint_gc = None
+
+
+def _methods(
+    core: Core, real: dict[str, Any], made: list[weakref.ref[Any]]
+) -> dict[str, Callable[..., Any]]:
+    """Return what stands in for methods of ``Executor``; ``real`` are the originals, ``made``
+    gets the executors that are made."""
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real["__init__"](self, *args, **kwargs)
+        made.append(weakref.ref(self))
         for guard in (self._guard, getattr(self, "_sigint_gc", None)):
             if getattr(guard, "handle", None) in core.pending:  # they are no entities
                 core.pending.remove(guard.handle)  # type: ignore[union-attr]

@@ -56,3 +56,23 @@ def test_a_callback_keeps_the_thread_that_spins(
         logs = [trace.decode("/rosout", data).msg for _, _, data in trace.messages("/rosout")]
     heard = [text.split(" at ") for text in logs if " at " in text]
     assert [(int(number), int(at)) for number, at in heard] == list(enumerate(starts, start=1))
+
+
+def test_an_executor_that_nobody_shuts_down_leaves_quietly(rsltrace: Any, job_file: Any) -> None:
+    """It is collected when rclpy is the real one again, which knows nothing of it."""
+    code = """
+def careless():
+    rclpy.init()
+    global executor  # so that it lives as long as the process
+    executor = MultiThreadedExecutor(2)
+    executor.add_node(Slow())
+    try:
+        executor.spin()
+    except KeyboardInterrupt:
+        pass
+"""
+    job_file(JOB.replace("MAIN", "careless"), CODE + code)
+    for command in (("record", "job.yaml", "-o", "run.mcap"), ("check", "job.yaml")):
+        done = rsltrace(*command)
+        assert done.returncode == 0, done.stderr
+        assert "Exception ignored" not in done.stderr, done.stderr
