@@ -39,7 +39,8 @@ def check_bag_folder(folder: Path, *, force: bool) -> None:
     if not folder.exists() and not folder.is_symlink():
         return
     if not force:
-        raise OutputError(f"cannot write the bag {folder}: it exists; use --force to replace it")
+        force_it = "--force (in Python: force=True)"
+        raise OutputError(f"cannot write the bag {folder}: it exists; use {force_it} to replace it")
     if not folder.is_dir() or (any(folder.iterdir()) and not (folder / NAME).is_file()):
         raise OutputError(
             f"cannot write the bag {folder}: what is there is no bag (it has no {NAME}), so "

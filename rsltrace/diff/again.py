@@ -21,12 +21,16 @@ def is_effective(trace: Trace) -> bool:
     return trace.job_text.startswith(_EFFECTIVE)
 
 
+def is_of_file(trace: Trace) -> bool:
+    """Whether the job was read from a file, not made in Python: that has no name for it."""
+    return trace.job.get("name", "") not in ("", "<python>")
+
+
 def record_again(trace: Trace) -> str:
     """Return ``rsltrace record …`` for the job of ``trace``, "" if it came from no file."""
-    name = trace.job.get("name", "")
-    if not name:
+    if not is_of_file(trace):
         return ""
-    words = ["rsltrace", "record", name]
+    words = ["rsltrace", "record", trace.job["name"]]
     if is_effective(trace):
         for line in trace.job_text.splitlines()[1:]:
             if not line.startswith("#"):

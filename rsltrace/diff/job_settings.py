@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from rsltrace.diff.again import is_effective, is_of_file
 from rsltrace.diff.model import Setting
 from rsltrace.model.stamp import format_duration
 from rsltrace.trace.reader import Trace
 
-_EFFECTIVE = "# The effective job "
 _LINES_MAX = 20_000
 """Longer job files are compared as a whole: difflib takes time with the square of the lines."""
 
@@ -82,7 +82,7 @@ class _JobText:
 
     def __init__(self, trace: Trace) -> None:
         self.text: str = trace.job_text
-        self.is_file: bool = bool(self.text) and not self.text.startswith(_EFFECTIVE)
+        self.is_file: bool = bool(self.text) and is_of_file(trace) and not is_effective(trace)
         """An effective job was put together from files and options: its lines are of none."""
 
     @cached_property
@@ -239,7 +239,7 @@ def _differing_lines(a: Trace, b: Trace) -> Iterator[Setting]:
     if a.job_text == b.job_text:
         return
     name = _name(a, b)
-    if a.job_text.startswith(_EFFECTIVE) or b.job_text.startswith(_EFFECTIVE):
+    if is_effective(a) or is_effective(b):
         name = f"effective {name}"  # put together from several files: no line of one of them
     (numbers_a, lines_a), (numbers_b, lines_b) = _lines(a), _lines(b)
     if max(len(lines_a), len(lines_b)) > _LINES_MAX:

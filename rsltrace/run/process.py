@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -89,15 +90,16 @@ def user_modules(folders: list[str]) -> dict[str, Path]:
     """Return the files of the loaded modules that lie in ``folders``, by module name.
 
     Installed packages are not the user's, even where a virtual environment lies in the folder.
+    An episode of a ``Simulation`` asks more than once, of some thousand modules: these are texts.
     """
+    below = tuple(os.path.join(folder, "") for folder in folders)
     found: dict[str, Path] = {}
     for name, module in sorted(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if not file:
+        if not isinstance(file, str) or not os.path.normpath(file).startswith(below):
             continue
         path = Path(file)
-        installed = {"site-packages", "dist-packages"} & set(path.parts)
-        if not installed and any(path.is_relative_to(folder) for folder in folders):
+        if not {"site-packages", "dist-packages"} & set(path.parts):
             found[name] = path
     return found
 

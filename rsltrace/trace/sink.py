@@ -58,7 +58,8 @@ def _why_not_created(path: Path, error: OSError) -> str:
     if path.is_dir():
         return f"cannot write the trace {path}: it is a folder; name a file with -o"
     if error.errno == errno.EEXIST:
-        return f"cannot write the trace {path}: it exists; use --force to replace it, or -o"
+        force = "--force (in Python: force=True)"
+        return f"cannot write the trace {path}: it exists; use {force} to replace it, or -o"
     folder = path.parent
     if not folder.exists():
         return (

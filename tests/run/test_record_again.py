@@ -62,6 +62,7 @@ class _Job:
     ("name", "override", "command"),
     [
         ("", "", ""),
+        ("<python>", "--set x=1", ""),
         (
             "robot.launch.xml",
             '--set launch.+={"file": "launch/robot.launch.xml", "arguments": {"world": "a lab"}}',
@@ -79,3 +80,33 @@ class _Job:
 def test_launch_files_and_names(name: str, override: str, command: str) -> None:
     text = f"# The effective job of {name}\n#   with {override}\nnodes: []\n#   with --set x=1\n"
     assert record_again(_Job(name, text)) == command  # type: ignore[arg-type]
+
+
+def test_a_job_made_in_python_has_no_file_and_no_lines(tmp_path: Path) -> None:
+    from rsltrace import Job, NodeSpec, StopSpec, diff, record
+
+    for seed in (1, 2):
+        nodes = [NodeSpec(node=_drawing_node)]
+        job = Job(nodes=nodes, seed=seed, stop=StopSpec(duration="1s"))
+        record(job, tmp_path / f"{seed}.mcap")
+    found = diff(tmp_path / "1.mcap", tmp_path / "2.mcap")
+    (setting,) = found.settings
+    assert (setting.place, setting.key, setting.a, setting.b) == ("job", "seed", "1", "2")
+
+
+def _drawing_node() -> Any:
+    import random
+
+    from rclpy.node import Node
+    from std_msgs.msg import Float64
+
+    class Drawing(Node):
+        def __init__(self) -> None:
+            super().__init__("drawing")
+            self.sender = self.create_publisher(Float64, "drawn", 1)
+            self.create_timer(0.5, self.tick)
+
+        def tick(self) -> None:
+            self.sender.publish(Float64(data=random.random()))
+
+    return Drawing()
