@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.blocking import Wait
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.entity_handle import EntityHandle
+    from rsltrace.ros.entry import Entry
     from rsltrace.ros.executor import SimExecutor
     from rsltrace.ros.graph import Graph
     from rsltrace.ros.links import Network
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from rsltrace.ros.stating import NodeState
     from rsltrace.ros.tasks import TaskRun
     from rsltrace.ros.threads import SimThread
-    from rsltrace.ros.world import Entry
 
 _RAISED = int(EventFlag.RAISED)
 _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from rsltrace.ros.blocking import Wait
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.core import Core
+    from rsltrace.ros.entry import Entry
     from rsltrace.ros.exit_handlers import Handler
-    from rsltrace.ros.world import Entry
 
 # What a callback raised, which event that was, its stamp (ns), its traceback and its node.
 Failure = tuple[BaseException, str, int, str, str]

@@ -4,11 +4,9 @@ run, and the destruction of the nodes."""
 from __future__ import annotations
 
 import gc
-import importlib
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,44 +18,22 @@ from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.model.event import EventKind
-from rsltrace.model.finding import Policy
-from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.blocking import end_blocked, simulated_waiting
 from rsltrace.ros.boundary import Boundary
 from rsltrace.ros.core import Core
 from rsltrace.ros.ending import end_programs
+from rsltrace.ros.entry import Entry
 from rsltrace.ros.event_loops import simulated_event_loops
 from rsltrace.ros.exit_handlers import own_exit_handlers
 from rsltrace.ros.graph import Graph
 from rsltrace.ros.installing import installed
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
-from rsltrace.ros.missing import cannot_import
 from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
 from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
 from rsltrace.ros.threads import cooperative_threads
-
-
-@dataclass(frozen=True, slots=True)
-class Entry:
-    """One entry of a job, ready to be constructed.
-
-    ``make`` returns a node or a list of nodes; ``arguments`` are what ``ros2 run`` would give
-    them, in lists of which later ones have the last word on parameters. ``key`` is a name of its
-    own among the entries, whatever other entries there are.
-    """
-
-    name: str
-    make: Callable[[], Any]
-    arguments: list[RosArguments]
-    log_exceptions: bool = False
-    """Whether a callback of its nodes that raises is logged instead of ending the run."""
-    key: str = ""
-    policy: Policy | None = None
-    argv: list[str] | None = None
-    """The command line, if ``make`` is a main to be run in a program of its own."""
 
 
 class World:
@@ -282,13 +258,13 @@ def _fresh_rclpy(boundary: Boundary) -> Iterator[None]:
     import rclpy.context
     import rclpy.utilities
 
-    saved = [
+    first_values: list[tuple[Any, str, Any]] = [
         (rclpy.utilities, "g_default_context", None),
         (rclpy.context, "g_logging_ref_count", 0),
         (rclpy, "__executor", None),
     ]
-    saved = [(m, n, v, getattr(m, n, None)) for m, n, v in saved]  # type: ignore[misc]
-    for module, name, first, _ in saved:  # type: ignore[misc]
+    saved = [(module, name, getattr(module, name, None)) for module, name, _ in first_values]
+    for module, name, first in first_values:
         setattr(module, name, first)
     boundary.ros_clocks.clear()
     boundary.real.rclpy_logging_shutdown()  # forget the log levels of an earlier run
@@ -296,102 +272,5 @@ def _fresh_rclpy(boundary: Boundary) -> Iterator[None]:
     try:
         yield
     finally:
-        for module, name, _, old in saved:  # type: ignore[misc]
+        for module, name, old in saved:
             setattr(module, name, old)
-
-
-def load_target(target: str, *, where: str) -> Any:
-    """Import ``module:attribute``.
-
-    :raises JobError: if there is no such module or attribute, or it cannot be called.
-    """
-    module_name, _, attribute = target.partition(":")
-    try:
-        value: Any = importlib.import_module(module_name)
-    except ModuleNotFoundError as error:
-        if error.name is not None and (module_name + ".").startswith(error.name + "."):
-            raise JobError(
-                f"there is no module {module_name!r} (looked in search_path and in Python's own "
-                "path); check the name, or add its folder to search_path",
-                where=where,
-            ) from error
-        raise JobError(cannot_import(module_name, error), where=where) from error
-    for part in attribute.split("."):
-        try:
-            value = getattr(value, part)
-        except AttributeError as error:
-            near = [name for name in dir(value) if not name.startswith("_")]
-            import difflib
-
-            guess = difflib.get_close_matches(part, near, n=1)
-            hint = f"; did you mean {guess[0]!r}?" if guess else ""
-            raise JobError(
-                f"module {module_name!r} has no {attribute!r}{hint}", where=where
-            ) from error
-    if not callable(value):
-        raise JobError(f"{target} is a {type(value).__qualname__}, not callable", where=where)
-    return value
-
-
-def ros_arguments(
-    *,
-    name: str | None,
-    namespace: str | None,
-    parameters: dict[str, Any],
-    parameter_files: Sequence[Path],
-    remappings: dict[str, str],
-    where: str,
-    for_all: Sequence[str] = (),
-) -> list[RosArguments]:
-    """Return what ``ros2 run`` would be given for a node of a job, as lists of arguments.
-
-    The job's own parameters are a list of their own: rcl would let a file's entry for one node
-    win over a parameter given for all. ``for_all`` are the job's arguments for all nodes: their
-    names go before the node's own (the first rule counts), their parameters after.
-
-    :raises JobError: if rcl refuses them (a broken parameter file); it begins with ``where``.
-    """
-    arguments = list(for_all)
-    if name is not None:
-        arguments += ["-r", f"__node:={name}"]
-    if namespace is not None:
-        arguments += ["-r", f"__ns:={namespace}"]
-    for old, new in remappings.items():
-        arguments += ["-r", f"{old}:={new}"]
-    for path in parameter_files:
-        arguments += ["--params-file", str(path)]
-    own: list[str] = []
-    for key, value in parameters.items():
-        own += ["-p", f"{key}:={_yaml_value(value)}"]
-    try:
-        lists = (arguments, own, for_all) if for_all else (arguments, own)
-        return [RosArguments(["--ros-args", *part]) for part in lists]
-    except InvalidArgumentsError as error:
-        raise JobError(str(error), where=where) from error
-
-
-def _yaml_value(value: Any) -> str:
-    """Write a parameter so that rcl's YAML parser reads the same value and type again."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, int):
-        return str(int(value))
-    if isinstance(value, float):
-        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(
-            repr(float(value)), _float(value)
-        )
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
-        return '"' + escaped.replace("\t", "\\t").replace("\r", "\\r") + '"'
-    return "[" + ", ".join(_yaml_value(item) for item in value) + "]"
-
-
-def _float(value: float) -> str:
-    text = repr(float(value))
-    mantissa, _, exponent = text.partition("e")
-    if "." not in mantissa:
-        mantissa += ".0"
-    return mantissa + (f"e{exponent}" if exponent else "")
-
-
-__all__ = ["Entry", "World", "load_target", "ros_arguments"]

@@ -20,6 +20,7 @@ from types import ModuleType
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.run.target import load_target
 
 _ELF = b"\x7fELF"
 
@@ -46,8 +47,6 @@ class Mains:
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
-        from rsltrace.ros.world import load_target
-
         package = re.split("[.:]", target)[0]
         again = package in self._packages
         self._packages.add(package)

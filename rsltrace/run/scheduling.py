@@ -22,6 +22,7 @@ from rsltrace.loop.policy import (
 )
 from rsltrace.model.event import EventKind
 from rsltrace.run.network import distribution_of
+from rsltrace.run.target import load_target
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
@@ -112,8 +113,6 @@ def _events(trace: Trace) -> Iterator[RecordedEvent]:
 def _own(job: Job, function: Any) -> Policy:
     where = locate(job, ("policy", "function"))
     if isinstance(function, str):
-        from rsltrace.ros.world import load_target
-
         function = load_target(function, where=where)
     try:
         policy: Any = function()

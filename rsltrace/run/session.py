@@ -6,17 +6,15 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from rsltrace.errors import BagError, JobError, RunError
-from rsltrace.job import Job, locate, policy_of, showing_line
-from rsltrace.job.node import Target, target_text
+from rsltrace.errors import BagError, RunError
+from rsltrace.job import Job
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
@@ -33,8 +31,9 @@ from rsltrace.run.bags import (
     start_players,
 )
 from rsltrace.run.clocks import clocks_of
-from rsltrace.run.executables import Mains, why_not
-from rsltrace.run.guarding import entry_key, guarding
+from rsltrace.run.entries import hook_entries, node_entries
+from rsltrace.run.executables import why_not
+from rsltrace.run.guarding import guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
@@ -45,7 +44,8 @@ from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.ros.world import Entry, World
+    from rsltrace.ros.entry import Entry
+    from rsltrace.ros.world import World
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,9 +173,9 @@ class Session:
             )
             with world.importing():
                 self._entries = [
-                    *_hook(job, "before", job.hooks.before, lambda: job),
-                    *_prepare(job),
-                    *_hook(job, "after", job.hooks.after, world.all_nodes),
+                    *hook_entries(job, "before", job.hooks.before, lambda: job),
+                    *node_entries(job),
+                    *hook_entries(job, "after", job.hooks.after, world.all_nodes),
                 ]
         check_bag_types(self._bags)
         if self._output is not None:
@@ -277,80 +277,3 @@ class Session:
             notes=(*self._notes, *core.notes),
             guarded=self._guarded.counts,
         )
-
-
-def _prepare(job: Job) -> list[Entry]:
-    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
-    from rsltrace.ros.world import Entry, load_target, ros_arguments
-
-    entries = []
-    mains = Mains()
-    for_all = _arguments_for_all(job)
-    for index, spec in enumerate(job.nodes):
-        loc = ("nodes", index, spec.kind)
-        where = spec.origin or locate(job, loc)
-        argv = None
-        make: Any
-        with showing_line(job, loc):
-            arguments = ros_arguments(
-                name=spec.name,
-                namespace=spec.namespace,
-                parameters=spec.parameters,
-                parameter_files=[job.resolve(path) for path in spec.parameter_files],
-                remappings=spec.remappings,
-                where=where,
-                for_all=for_all,
-            )
-            if isinstance(spec.arguments, tuple) or spec.node is None:
-                name, make = mains.find(spec, where=where)
-                argv = [name, *spec.arguments]
-            else:
-                target = spec.node
-                found = load_target(target, where=where) if isinstance(target, str) else target
-                make = partial(found, **spec.arguments)
-        entries.append(
-            Entry(
-                spec.target,
-                make,
-                arguments,
-                argv=argv,
-                log_exceptions=spec.on_exception == "log",
-                key=entry_key(spec, job.nodes[:index]),
-                policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
-            )
-        )
-    return entries
-
-
-def _hook(
-    job: Job, name: str, target: Target | None, argument: Callable[[], object]
-) -> list[Entry]:
-    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
-    from rsltrace.ros.world import Entry, load_target
-
-    if target is None:
-        return []
-    where = locate(job, ("hooks", name))
-    function: Any = load_target(target, where=where) if isinstance(target, str) else target
-    title = f"hook {name}: {target_text(target)}"
-    return [Entry(title, lambda: function(argument()) or [], [], key=title)]
-
-
-def _arguments_for_all(job: Job) -> list[str]:
-    """Return the ROS arguments of all nodes, the paths in them absolute.
-
-    :raises JobError: if rcl refuses them.
-    """
-    words = list(job.ros_arguments)
-    for index, word in enumerate(words[:-1]):
-        if word == "--params-file":
-            words[index + 1] = str(job.resolve(words[index + 1]))
-    if words:
-        from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
-
-        try:
-            RosArguments(["--ros-args", *words])
-        except InvalidArgumentsError as error:
-            where = locate(job, ("ros_arguments",))
-            raise JobError(f"ros_arguments (--ros-args): {error}", where=where) from None
-    return words

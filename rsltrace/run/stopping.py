@@ -18,6 +18,7 @@ from rsltrace.loop.stop import (
     stop_when_quiet,
 )
 from rsltrace.model.stamp import format_seconds
+from rsltrace.run.target import load_target
 
 _Context = Callable[[], AbstractContextManager[None]]
 
@@ -62,8 +63,6 @@ def stop_conditions(
         function: Any = stop.function
         name = str(function)
         if isinstance(function, str):
-            from rsltrace.ros.world import load_target
-
             with showing_line(job, ("stop", "function")):
                 function = load_target(function, where=locate(job, ("stop", "function")))
         else:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 from pathlib import Path
@@ -43,6 +44,45 @@ def test_stop_conditions(record_job: Any, stop: str, end_s: int, reason: str) ->
         # The last step ran fully: the listener heard the last message.
         kinds = [trace.event(i).kind.label for i in range(trace.event_count)]
         assert kinds.count("timer") == kinds.count("subscription") == end_s - 10
+
+
+TEXTS = [
+    "\x1b[1m",
+    "\u2028",
+    "\ufeff",
+    "a\tb\nc\r",
+    'q"\\',
+    "\x7f\x85",
+    "ü",
+    "",
+    " x ",
+    "true",
+    "1",
+]
+
+
+def test_any_text_can_be_a_parameter(record_job: Any) -> None:
+    code = (
+        "class Told(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('told')\n"
+        "        one = self.declare_parameter('one', '').value\n"
+        "        many = self.declare_parameter('many', ['']).value\n"
+        "        self.get_logger().info(repr([one, *many]))\n"
+    )
+    for text in TEXTS:
+        parameters = json.dumps({"one": text, "many": TEXTS})
+        job = f"nodes: [{{node: nodes_under_test:Told, parameters: {parameters}}}]\n"
+        result = record_job(f"{job}stop: {{events: 1}}\n", code)
+        with Trace.open(result.path) as trace:
+            (log,) = [trace.decode("/rosout", data) for *_, data in trace.messages("/rosout")]
+        assert log.msg == repr([text, *TEXTS])
+
+
+@pytest.mark.parametrize("value", ['"a\\0b"', '["a", "\\0"]'])
+def test_a_parameter_that_ros_would_cut_off_is_refused(record_job: Any, value: str) -> None:
+    with pytest.raises(JobError, match=r"job\.yaml:1:.*NUL character"):
+        record_job(f"nodes: [{{node: nodes_under_test:Talker, parameters: {{p: {value}}}}}]\n")
 
 
 def test_a_trace_that_is_large_enough_ends_the_run(record_job: Any) -> None:

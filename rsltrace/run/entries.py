@@ -1,0 +1,87 @@
+"""From the nodes and hooks of a job to the entries of a world: imported, arguments parsed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from rsltrace.errors import JobError
+from rsltrace.job import Job, locate, policy_of, showing_line
+from rsltrace.job.node import Target, target_text
+from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.ros.entry import Entry, ros_arguments
+from rsltrace.run.executables import Mains
+from rsltrace.run.guarding import entry_key
+from rsltrace.run.target import load_target
+
+
+def node_entries(job: Job) -> list[Entry]:
+    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
+    entries = []
+    mains = Mains()
+    for_all = _arguments_for_all(job)
+    for index, spec in enumerate(job.nodes):
+        loc = ("nodes", index, spec.kind)
+        where = spec.origin or locate(job, loc)
+        argv = None
+        make: Any
+        with showing_line(job, loc):
+            arguments = ros_arguments(
+                name=spec.name,
+                namespace=spec.namespace,
+                parameters=spec.parameters,
+                parameter_files=[job.resolve(path) for path in spec.parameter_files],
+                remappings=spec.remappings,
+                where=where,
+                for_all=for_all,
+            )
+            if isinstance(spec.arguments, tuple) or spec.node is None:
+                name, make = mains.find(spec, where=where)
+                argv = [name, *spec.arguments]
+            else:
+                target = spec.node
+                found = load_target(target, where=where) if isinstance(target, str) else target
+                make = partial(found, **spec.arguments)
+        entries.append(
+            Entry(
+                spec.target,
+                make,
+                arguments,
+                argv=argv,
+                log_exceptions=spec.on_exception == "log",
+                key=entry_key(spec, job.nodes[:index]),
+                policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
+            )
+        )
+    return entries
+
+
+def hook_entries(
+    job: Job, name: str, target: Target | None, argument: Callable[[], object]
+) -> list[Entry]:
+    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
+    if target is None:
+        return []
+    where = locate(job, ("hooks", name))
+    function: Any = load_target(target, where=where) if isinstance(target, str) else target
+    title = f"hook {name}: {target_text(target)}"
+    return [Entry(title, lambda: function(argument()) or [], [], key=title)]
+
+
+def _arguments_for_all(job: Job) -> list[str]:
+    """Return the ROS arguments of all nodes, the paths in them absolute.
+
+    :raises JobError: if rcl refuses them.
+    """
+    words = list(job.ros_arguments)
+    for index, word in enumerate(words[:-1]):
+        if word == "--params-file":
+            words[index + 1] = str(job.resolve(words[index + 1]))
+    if words:
+        try:
+            RosArguments(["--ros-args", *words])
+        except InvalidArgumentsError as error:
+            where = locate(job, ("ros_arguments",))
+            raise JobError(f"ros_arguments (--ros-args): {error}", where=where) from None
+    return words
