@@ -101,6 +101,10 @@ class EventView:
     summary: str = ""
 
 
+ULP_TOLD_MAX = 1_000_000
+"""Reports tell smaller distances in units in the last place: larger ones are no rounding."""
+
+
 @dataclass(frozen=True, slots=True)
 class FieldDifference:
     """One field in which two decoded messages differ.

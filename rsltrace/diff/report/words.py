@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.model import EntityKey, EventView, FieldDifference, MessageDifference
+from rsltrace.diff.model import (
+    ULP_TOLD_MAX,
+    EntityKey,
+    EventView,
+    FieldDifference,
+    MessageDifference,
+)
 from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, cut, in_columns
 from rsltrace.model.event import EventFlag, OutputKind
 from rsltrace.model.printable import printable, shortened
@@ -95,7 +101,7 @@ def distance_text(difference: FieldDifference) -> str:
             parts.append(f"|a-b| {difference.largest:.6g}")
         else:
             parts.append(f"|a-b| {difference.smallest:.6g} to {difference.largest:.6g}")
-    if difference.ulp is not None:
+    if difference.ulp is not None and difference.ulp <= ULP_TOLD_MAX:
         several = difference.elements is not None and difference.elements[0] > 1
         parts.append(f"{'up to ' if several else ''}{difference.ulp} ulp")
     if difference.note:

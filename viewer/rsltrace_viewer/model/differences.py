@@ -5,7 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rsltrace.diff.evidence import message_differences
-from rsltrace.diff.model import Divergence, EventView, FieldDifference, MessageDifference
+from rsltrace.diff.model import (
+    ULP_TOLD_MAX,
+    Divergence,
+    EventView,
+    FieldDifference,
+    MessageDifference,
+)
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.views import Viewer
 from rsltrace.errors import TraceError
@@ -188,7 +194,7 @@ def _field_lines(field: FieldDifference, path: str) -> Iterator[Line]:
     notes = [field.note] if field.note else []
     if field.absolute is not None:
         notes.append(f"Δ {field.absolute:.6g}")
-    if field.ulp is not None:
+    if field.ulp is not None and field.ulp <= ULP_TOLD_MAX:
         notes.append(f"{field.ulp:,} ulp")
     if field.elements is not None:
         notes.append(f"{field.elements[0]} of {field.elements[1]} differ")

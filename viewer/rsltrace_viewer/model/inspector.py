@@ -82,12 +82,24 @@ def _input_lines(
 ) -> Iterator[Line]:
     is_open = openness.is_open("in", True)
     source = run.input_of(event)
+    if source is not None and source.kind is OutputKind.TASK:
+        source = _handed_on(run, event) or source
     if source is None:
         yield Line(0, "input", _plain_input(event), Role.SECTION, "in")
+        return
+    if source.kind not in _MESSAGES and source.sequence == NO_SEQUENCE:  # nothing to be recorded
+        yield Line(0, "input", _channel_text(run, source), Role.SECTION, "in")
         return
     yield Line(0, "input", _channel_text(run, source), Role.SECTION, "in", is_open)
     if is_open:
         yield from content_lines(run, source, "in", 1, openness)
+
+
+def _handed_on(run: Run, event: Event) -> Output | None:
+    """Return the message that a task was given by the event that made it (an action's goal)."""
+    maker = run.event(event.cause_event)
+    same = event.input_hash and maker.input_hash == event.input_hash
+    return run.input_of(maker) if same else None
 
 
 def _plain_input(event: Event) -> str:
@@ -194,7 +206,9 @@ def content_lines(
 
 def _cause_lines(run: Run, event: Event, effects: Effects | None) -> Iterator[Line]:
     if event.cause_event == NO_EVENT:
-        yield Line(0, "cause", "no other event", Role.SECTION, "cause")
+        waited = event.kind is EventKind.RESUME
+        text = "no other event: its wait was over" if waited else "no other event"
+        yield Line(0, "cause", text, Role.SECTION, "cause")
     else:
         yield Line(0, "cause", "", Role.SECTION, "cause")
         yield event_link(run, event.cause_event, "cause.event", since_ns=event.stamp_ns)
