@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 
 from rsltrace.errors import LivelockError
 from rsltrace.loop.loop import ORDER_BAG, EventLoop
+from rsltrace.loop.ordered import OrderedLoop, Place
+from rsltrace.loop.policy import Candidate
 from rsltrace.loop.stop import Progress, Stop, stop_after_events, stop_at
 from rsltrace.loop.timer import TimerState
 from rsltrace.loop.timer_queue import CreationOrderQueue
@@ -122,6 +124,41 @@ def test_what_is_due_after_the_end_of_time_never_is() -> None:
         assert loop.run() == Stop("what is due next is beyond 2**63 ns, where ROS's time ends")
         assert loop.now_ns == 2**63 - 1
     assert log == ["last", "last"]
+
+
+def test_the_step_at_the_stop_time_runs_whatever_else_is_asked() -> None:
+    loop = make_loop(stop_conditions=(stop_after_events(1000), stop_at(10, "end")))
+    log: list[object] = []
+    Tick(loop, log, "a", 5, 0)
+    assert loop.run() == Stop("end")
+    assert log == [(5, "a"), (10, "a")]
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_those_who_poll_look_again_until_nothing_comes_of_it(ordered: bool) -> None:
+    loop = ordered_loop() if ordered else make_loop()
+    log: list[object] = []
+
+    def poll() -> bool:
+        log.append("look")
+        if log.count("look") <= 2:
+            loop.ready.append(Item(loop, log, "came"))
+            return True
+        return False
+
+    loop.idle.append(poll)
+    loop.idle.append(lambda: bool(log.append("and")))
+    loop.schedule(7, lambda: loop.ready.append(Item(loop, log, "first")))
+    loop.schedule(9, lambda: loop.idle.clear())
+    assert loop.run() == Stop("nothing left to do")
+    at_start = ["look", "and", (0, "came"), "look", "and", (0, "came"), "look", "and"]
+    assert log == [*at_start, (7, "first"), "look", "and"]
+
+
+def ordered_loop() -> OrderedLoop:
+    loop = OrderedLoop(start_ns=0, timers=CreationOrderQueue())
+    loop.place = lambda item: Place(Candidate("/n", "e", "task", 1, None, (), item), None, None)
+    return loop
 
 
 def test_nothing_left_to_do() -> None:

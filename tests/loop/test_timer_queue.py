@@ -35,6 +35,12 @@ def test_an_overdue_timer_fires_once_even_on_a_grid_point() -> None:
     assert state.deadline_ns == 1100
 
 
+def test_a_timer_called_before_it_is_due_skips_to_the_deadline_after() -> None:
+    state = timer(100, 0)
+    state.call(30)
+    assert state.deadline_ns == 200
+
+
 def test_a_timer_without_period_is_always_due() -> None:
     state = timer(0, 0)
     state.call(5)
@@ -89,6 +95,18 @@ def test_heap_order_fires_the_same_timers_at_the_same_times(periods: list[int]) 
     assert sorted(e for e in a if e[0] < last) == sorted(e for e in b if e[0] < last)
 
 
+@pytest.mark.parametrize("ties", ["creation", "heap"])
+def test_a_callback_may_start_a_timer_that_is_due_before_all_others(ties: str) -> None:
+    queue = timer_queue(ties)
+    root, *others = (timer(period, order) for order, period in enumerate((50, 53, 55)))
+    for each in (root, *others):
+        queue.add(each)
+    root.call(50)
+    queue.add(timer(60, 3, now=-59))
+    queue.ran(root)
+    assert [order for _, order in run(queue, 4)] == [3, 1, 2, 3]
+
+
 def test_heap_order_is_that_of_libstdcxx() -> None:
     # Four timers of one period: traced by hand through push_heap, and the push_back, pop_heap,
     # pop_back that rclcpp's TimersManager does when its root has run.
@@ -99,7 +117,7 @@ def test_heap_order_is_that_of_libstdcxx() -> None:
 
 
 @given(
-    st.lists(st.tuples(st.sampled_from("arcm"), st.integers(0, 5), st.integers(1, 9)), max_size=40)
+    st.lists(st.tuples(st.sampled_from("arRcm"), st.integers(0, 5), st.integers(1, 9)), max_size=40)
 )
 @pytest.mark.parametrize("ties", ["creation", "heap"])
 def test_first_is_always_a_timer_with_the_smallest_deadline(
@@ -119,10 +137,14 @@ def test_first_is_always_a_timer_with_the_smallest_deadline(
         elif operation == "m" and index in inside:
             state.deadline_ns += value
             queue.moved(state)
-        elif operation == "r":
+        elif operation in "rR":
             first = queue.first()
             if first is not None:
                 first.call(first.deadline_ns)
+                if operation == "R":  # its callback starts another timer, which is due before it
+                    state.deadline_ns = min(state.deadline_ns, first.deadline_ns) - value
+                    queue.add(state)
+                    inside.add(index)
                 queue.ran(first)
         first = queue.first()
         if not inside:
