@@ -19,7 +19,7 @@ from contextlib import ExitStack, contextmanager
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
-from rsltrace.guard.callers import user_frame
+from rsltrace.guard.callers import module_of, user_frame
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.finding import Mode, Source
@@ -280,15 +280,22 @@ def _environment(stack: ExitStack) -> None:
         setattr(kind, method, _reading(method, kind.__dict__[method]))
 
 
+_NOT_READ = ("PYTHON", "ROS_PYTHON_CHECK_FIELDS")
+"""What Python looks at for itself, and what every class of messages does when it is imported."""
+
+_LAYS_OUT = {"os", "_collections_abc", "collections.abc", "shutil", "locale", "gettext", "argparse"}
+
 _SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
 
 
 def _reading(method: str, real: Callable[..., Any]) -> Any:
     def read(self: Any, *arguments: Any) -> Any:
         guard = engaged()
-        if guard is None or self is not os.environ or str(*arguments).startswith("PYTHON"):
-            return real(self, *arguments)  # PYTHON…: what Python looks at for itself
+        if guard is None or self is not os.environ or str(*arguments).startswith(_NOT_READ):
+            return real(self, *arguments)
         frame = sys._getframe(1)
+        if _lays_out_help(frame):
+            return real(self, *arguments)
         if method == "__iter__":
             guard.watched(Source.ENVIRONMENT, "os.environ", f"{len(self)} variables", frame)
             return real(self)
@@ -313,6 +320,15 @@ def _reading(method: str, real: Callable[..., Any]) -> Any:
         return value
 
     return read
+
+
+def _lays_out_help(frame: FrameType | None) -> bool:
+    """Whether argparse wants the terminal's width and language, which no node looks at."""
+    while frame is not None and (module := module_of(frame)) in _LAYS_OUT:
+        if module == "argparse":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def _shown(name: str, value: str) -> str:

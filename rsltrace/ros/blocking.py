@@ -33,6 +33,9 @@ from rsltrace.ros import groups
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
 
+POLL_NS = 1_000_000
+"""What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
+
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches

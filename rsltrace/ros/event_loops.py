@@ -8,12 +8,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.ros.blocking import Wait, simulated_core, wait
+from rsltrace.ros.blocking import POLL_NS, Wait, simulated_core, wait
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
 
 _NS_PER_S = 1_000_000_000
+
+_FREE_ROUNDS = 100
+_ROUNDS_PER_POLL = 10
+"""A loop that always has something to do polls, most often an rclpy future: asyncio asks again at
+once whatever is not its own. After the first rounds, so many of them take ``POLL_NS``."""
 
 
 class SimSelector:
@@ -26,6 +31,7 @@ class SimSelector:
         self._core = core
         self._real = real
         self._blocked: Wait | None = None
+        self._rounds = 0
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._real, name)
@@ -33,13 +39,17 @@ class SimSelector:
     def select(self, timeout: float | None = None) -> Any:
         """Return what is ready, after having waited for the loop's next timer or a wake-up."""
         found = self._real.select(0)
-        if found or (timeout is not None and timeout <= 0):
+        polls = timeout is not None and timeout <= 0
+        self._rounds = self._rounds + 1 if polls else 0
+        if found or (polls and not self._costs_time()):
             return found
         core = simulated_core()
         if core is not self._core:
             return self._real.select(timeout)
         # Rounded up, or the loop would look too early, and again without any time having passed.
         for_ns = None if timeout is None else int(timeout * _NS_PER_S) + 1
+        if polls:
+            for_ns = POLL_NS
         stack_is_thread = core.is_thread
         wait(
             core,
@@ -51,6 +61,10 @@ class SimSelector:
         )
         self._blocked = None
         return self._real.select(0)
+
+    def _costs_time(self) -> bool:
+        rounds = self._rounds
+        return rounds > _FREE_ROUNDS and rounds % _ROUNDS_PER_POLL == 0
 
     def _keep(self, blocked: Wait) -> None:
         self._blocked = blocked

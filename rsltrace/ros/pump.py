@@ -12,17 +12,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.ros import groups
-from rsltrace.ros.blocking import Wait, lose_patience, set_aside, wait
+from rsltrace.ros.blocking import POLL_NS, Wait, lose_patience, set_aside, wait
 from rsltrace.ros.groups import is_busy
 from rsltrace.ros.mailbox import Mailbox
 
 if TYPE_CHECKING:
     from rsltrace.loop.loop import Dispatchable
     from rsltrace.ros.core import Core
-
-POLL_NS = 1_000_000
-"""What a second look at one instant costs: a loop of ``spin_once(timeout_sec=0)`` takes time."""
-
 
 _WORK = "work for its executor"
 

@@ -39,11 +39,15 @@ class Mains:
         if spec.executable is not None:
             found = find_executable(spec.executable, where=where)
             name = spec.executable.partition("/")[2]
-            return name, self._load(found, where) if isinstance(found, str) else found
+            if isinstance(found, str):
+                with _command_line(name, spec):
+                    return name, self._load(found, where)
+            return name, found
         assert spec.main is not None
         if isinstance(spec.main, str):
             name = spec.main.partition(":")[0].rpartition(".")[2]
-            return name, self._load(spec.main, where)
+            with _command_line(name, spec):
+                return name, self._load(spec.main, where)
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
@@ -53,6 +57,17 @@ class Mains:
         with _own_copy(package) if again else nullcontext():
             function: Callable[[], object] = load_target(target, where=where)
         return function
+
+
+@contextmanager
+def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
+    """Let a module see its own arguments when it is imported: ``def main(args=sys.argv):``."""
+    before = sys.argv
+    sys.argv = [name, *spec.arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before
 
 
 @contextmanager

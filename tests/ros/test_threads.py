@@ -496,6 +496,41 @@ def test_asyncio_loops_keep_simulated_time_and_wake_each_other(simulate: Any) ->
     assert round(log[-1], 6) == 1.65
 
 
+def test_an_rclpy_future_awaited_in_asyncio_is_polled_and_time_passes(simulate: Any) -> None:
+    """asyncio asks again at once whatever is not its own: its loop is never idle, as in reality."""
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("mixed")
+        future: rclpy.Future[str] = rclpy.Future()
+        node.create_timer(0.5, lambda: future.set_result("done"))
+
+        async def spinning() -> None:
+            while rclpy.ok():
+                rclpy.spin_once(node, timeout_sec=0.01)
+                await asyncio.sleep(0.001)
+
+        async def yielding() -> None:
+            for _ in range(90):
+                await asyncio.sleep(0)
+            log.append(("yielded", seconds(node)))
+
+        async def main() -> None:
+            await yielding()
+            spin = asyncio.get_running_loop().create_task(spinning())
+            log.append((await future, seconds(node)))
+            spin.cancel()
+
+        asyncio.run(main())
+
+    simulate(main_spec(program), duration=2)
+    (yielded, done) = log
+    assert yielded == ("yielded", 0.0), "giving way a few times takes no time"
+    assert done[0] == "done"
+    assert 0.5 <= done[1] < 0.52
+
+
 def test_asyncio_is_real_again_after_a_run(simulate: Any) -> None:
     before = asyncio.BaseEventLoop.time, asyncio.SelectorEventLoop.__init__
     simulate(Counter, duration=1)

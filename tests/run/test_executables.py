@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import textwrap
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 PACKAGE = """
+import argparse
 import sys
 import rclpy
 from rclpy.node import Node
@@ -43,6 +45,15 @@ def listener():
     rclpy.init()
     node = Node('listener')
     node.create_subscription(String, 'chatter', lambda m: node.get_logger().info(m.data), 10)
+    rclpy.spin(node)
+
+def defaults(args=sys.argv, options=sys.argv[1:]):
+    rclpy.init(args=args)
+    node = Node('defaults')
+    parser = argparse.ArgumentParser()
+    parser.add_argument('-n', type=int, default=1)
+    chosen = parser.parse_args(options).n
+    node.get_logger().info(f'{args[0]} {chosen}, {parser.format_usage()}')
     rclpy.spin(node)
 
 def quitter():
@@ -78,7 +89,9 @@ def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_demo\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(
         "[console_scripts]\n"
-        + "".join(f"{n} = my_demo_nodes:{n}\n" for n in ("talker", "listener", "quitter"))
+        + "".join(
+            f"{n} = my_demo_nodes:{n}\n" for n in ("talker", "listener", "defaults", "quitter")
+        )
         + "broken = my_demo_nodes:not_callable\n"
     )
     prefix = tmp_path / "install"
@@ -155,6 +168,29 @@ def test_executables_of_packages_run_with_the_jobs_names_and_parameters(
     assert result.notes == ("my_scripts/scripted ended at 1.000000000 s",)
 
 
+def test_arguments_that_were_looked_at_on_import_are_those_of_the_main(
+    record_yaml: Callable[[str], Any], tmp_path: Path
+) -> None:
+    """``def main(args=sys.argv)`` is decided when the module is imported."""
+    before = list(sys.argv)
+    result = record_yaml(
+        """
+        nodes:
+          - executable: my_demo/defaults
+            arguments: [-n, 3]
+          - main: my_demo_nodes:defaults
+            name: second
+        """
+    )
+    assert result.error is None
+    assert logs(tmp_path / "run.mcap") == [
+        "defaults: defaults 3, usage: defaults [-h] [-n N]\n",
+        "second: my_demo_nodes 1, usage: my_demo_nodes [-h] [-n N]\n",
+    ]
+    assert sys.argv == before
+    assert not result.guarded, "what argparse looks at to lay out its help is no finding"
+
+
 def test_a_main_that_exits_is_reported_and_the_others_go_on(
     record_yaml: Callable[[str], Any], tmp_path: Path
 ) -> None:
@@ -172,7 +208,7 @@ def test_a_main_that_exits_is_reported_and_the_others_go_on(
         (
             "executable: my_demo/taker",
             "package 'my_demo' has no executable 'taker'; did you mean 'talker'?: "
-            "it has broken, listener, quitter, talker",
+            "it has broken, defaults, listener, quitter, talker",
         ),
         ("executable: my_demo/broken", "my_demo_nodes:not_callable is a int, not callable"),
         ("executable: my_scripts/compiled", "my_scripts/compiled is a compiled program"),
