@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from fractions import Fraction
 from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.names import check_glob
-from rsltrace.job.part import Part, attach, check, parts, positive_time, text
+from rsltrace.job.names import check_node_glob
+from rsltrace.job.part import Part, attach, check, given, parts, positive_time, text
 from rsltrace.job.problems import Problem, describe
-from rsltrace.job.times import ExactFloat, Nanoseconds, parse_time
+from rsltrace.job.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
 
 DRIFT_MAX_PPM = 100_000
+JUMPS_EVERY_NS_MIN = 1_000_000
 
 
 def parse_signed_time(value: object) -> int:
@@ -20,13 +22,21 @@ def parse_signed_time(value: object) -> int:
     if isinstance(value, Nanoseconds):
         if isinstance(value.value, int) and not isinstance(value.value, bool):
             return value.value
-    elif isinstance(value, str) and value.strip().startswith("-"):
+    elif isinstance(value, str) and re.match(r"\s*-\s*[^-+]", value):
         return -parse_time(value.strip()[1:])
     elif isinstance(value, (int, float)) and not isinstance(value, bool) and value < 0:
         if isinstance(value, ExactFloat):
             return -parse_time(f"{value.text.strip().lstrip('-')}s")
         return -parse_time(-value)
     return parse_time(value)
+
+
+def parse_interval(value: object) -> int:
+    """Return a mean time between jumps: each jump of a run is drawn and kept."""
+    time_ns = parse_time(value)
+    if time_ns < JUMPS_EVERY_NS_MIN:
+        raise Problem("must be at least 1ms")
+    return time_ns
 
 
 def parse_ppm(value: object) -> float:
@@ -39,7 +49,7 @@ def parse_ppm(value: object) -> float:
     except ValueError:
         raise Problem(f"expected parts per million such as 50ppm, got {describe(value)}") from None
     if not -DRIFT_MAX_PPM <= ppm <= DRIFT_MAX_PPM:
-        raise Problem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm")
+        raise Problem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
     return ppm
 
 
@@ -47,6 +57,7 @@ _signed = {
     "anyOf": [{"type": "number"}, {"type": "string", "pattern": r"^\s*-?"}],
 }
 attach(parse_signed_time, schema=_signed)
+attach(parse_interval, schema=TIME_SCHEMA)
 attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "pattern": "ppm\\s*$"}]})
 
 
@@ -68,7 +79,7 @@ class RandomJumpsSpec(Part):
 
     TIMES: ClassVar[dict[str, str]] = {"every": "every_ns", "most": "most_ns"}
 
-    every_ns: Annotated[int, check(positive_time)] = Field(
+    every_ns: Annotated[int, check(parse_interval)] = Field(
         alias="every", description="Mean time between two jumps.", examples=["10s"]
     )
     most_ns: Annotated[int, check(positive_time)] = Field(
@@ -79,7 +90,7 @@ class RandomJumpsSpec(Part):
 class ClockSpec(Part):
     """The clock of some nodes, compared with simulated time."""
 
-    node: Annotated[str, check(text(check_glob))] = Field(
+    node: Annotated[str, check(text(check_node_glob))] = Field(
         description="Node, a glob; the first entry that fits counts.", examples=["/lidar"]
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(
@@ -97,7 +108,7 @@ class ClockSpec(Part):
     jumps: Annotated[tuple[JumpSpec, ...], parts()] = Field(
         default=(), description="When it is set.", examples=[[{"at": "5s", "by": "100ms"}]]
     )
-    random_jumps: RandomJumpsSpec | None = Field(
+    random_jumps: Annotated[RandomJumpsSpec | None, given] = Field(
         default=None,
         description="It is set now and then.",
         examples=[{"every": "10s", "most": "50ms"}],

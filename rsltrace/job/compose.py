@@ -10,15 +10,18 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field
 
 from rsltrace.errors import JobError
+from rsltrace.job.model import shorthand_at, without_alternatives
 from rsltrace.job.names import check_variable
 from rsltrace.job.node import check_path
-from rsltrace.job.override import apply_override
+from rsltrace.job.override import apply_override, is_shorthand
 from rsltrace.job.part import Part, attach, check, items, text
+from rsltrace.job.paths import near_path
 from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.substitute import Substitution
 from rsltrace.job.tree import Item, Place
@@ -68,7 +71,8 @@ class Composition(Part):
     base: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
         description="A job file to extend, relative to this file. What is written here wins: "
-        "mappings are merged key by key, an entry of `nodes` changes the base's node of the same "
+        "mappings are merged key by key (of keys that exclude each other, such as distributions, "
+        "the base's goes), an entry of `nodes` changes the base's node of the same "
         "`name` (others are added), other lists replace the base's, and `null` takes away what "
         "the base says.",
         examples=["../robot/job.yaml"],
@@ -188,6 +192,8 @@ def _other(
     if not isinstance(item.value, str):
         raise item.place.error(f"{role}: expected a path, got {describe(item.value)}")
     path = str(early.tree(item).value)
+    if not path.strip():
+        raise item.place.error(f"{role}: expected a path, got {describe(path)}")
     full = os.path.normpath(os.path.join(root.place.source.folder or "", path))
     if os.path.realpath(full) in outer:
         raise item.place.error(
@@ -204,6 +210,8 @@ def _other(
             raise
         # The file itself is wrong, not something in it: the line that names it is to blame.
         message = str(error).removeprefix(f"{shown}: ")
+        if not os.path.exists(shown):
+            message += near_path(Path(full), path, but=os.path.basename(name))
         raise item.place.error(f"{role}: {shown}: {message}") from None
     composed.others.append(path)
     return _with_search_path(_with_others(other, shown, read, early, outer, composed))
@@ -222,13 +230,20 @@ def merge(
 ) -> Item:
     """Return ``under`` with ``over`` laid over it.
 
-    Mappings are merged by key, and null takes a key away. ``search_path`` is the sum, ``over``'s
+    Mappings are merged by key, and null takes a key away. Of keys that exclude each other (the
+    distributions of a delay) ``over``'s stays. ``search_path`` is the sum, ``over``'s
     first. ``nodes`` are merged by name; with ``add_up``, lists of nodes, launch files and bags
     are added up.
     Everything else is replaced. ``strict`` refuses a change to a node that is not there.
     """
+    from rsltrace.job.job import Job
+
+    if _is_mapping(over) and is_shorthand(under.value):
+        key = shorthand_at(Job, loc)
+        if key is not None:
+            under = replace(under, value={key: replace(under, key_place=under.place)})
     if _is_mapping(under) and _is_mapping(over):
-        low, high = under.value, over.value
+        low, high = without_alternatives(under.value, over.value, Job, loc), over.value
         if loc[:1] == ("nodes",) and loc[2:] == ("parameters",):
             low, high = _flat(low), _flat(high)
         values = dict(low)

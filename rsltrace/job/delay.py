@@ -7,9 +7,9 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from rsltrace.job.distribution import DistributionSpec, named, number, shorthand
-from rsltrace.job.names import check_glob
+from rsltrace.job.names import check_glob, check_node_glob, check_service_glob
 from rsltrace.job.node import check_path
-from rsltrace.job.part import Part, check, parts, positive_time, text
+from rsltrace.job.part import Part, check, given, parts, positive_time, text
 from rsltrace.job.problems import Problem
 from rsltrace.job.times import parse_time
 
@@ -48,7 +48,7 @@ class DelaySpec(DistributionSpec):
         "reliable it is sent again, `retransmit` later.",
         examples=[0.01],
     )
-    burst: BurstSpec | None = Field(
+    burst: Annotated[BurstSpec | None, given] = Field(
         default=None,
         description="Loss in bursts (Gilbert-Elliott).",
         examples=[{"good_to_bad": 0.01, "bad_to_good": 0.2}],
@@ -77,13 +77,13 @@ class LinkSpec(DelaySpec):
     topic: Annotated[str, check(text(check_glob))] = Field(
         default="*", description="Topic, a glob.", examples=["/scan"]
     )
-    sender: Annotated[str, check(text(check_glob))] = Field(
+    sender: Annotated[str, check(text(check_node_glob))] = Field(
         default="*",
         alias="from",
         description="Node of the publisher, a glob.",
         examples=["/lidar"],
     )
-    receiver: Annotated[str, check(text(check_glob))] = Field(
+    receiver: Annotated[str, check(text(check_node_glob))] = Field(
         default="*", alias="to", description="Node of the subscription, a glob.", examples=["/slam"]
     )
 
@@ -96,10 +96,10 @@ class OutageSpec(Part):
     topic: Annotated[str | None, check(text(check_glob), optional=True)] = Field(
         default=None, description="Topic that is cut off, a glob.", examples=["/scan"]
     )
-    service: Annotated[str | None, check(text(check_glob), optional=True)] = Field(
+    service: Annotated[str | None, check(text(check_service_glob), optional=True)] = Field(
         default=None, description="Service that is cut off, a glob.", examples=["/set_mode"]
     )
-    node: Annotated[str | None, check(text(check_glob), optional=True)] = Field(
+    node: Annotated[str | None, check(text(check_node_glob), optional=True)] = Field(
         default=None, description="Node that is cut off, a glob.", examples=["/lidar"]
     )
     from_ns: Annotated[int, check(parse_time)] = Field(
@@ -131,6 +131,8 @@ class DelaysSpec(Part):
     """Delays and losses. Of ``links`` the first that fits counts, then ``topics`` (an exact name
     before globs, globs in order), then ``file``, then ``default``."""
 
+    MEANT: ClassVar[str] = "default"
+
     default: Annotated[DelaySpec | None, shorthand("constant")] = Field(
         default=None,
         description="For every topic (except /rosout and /parameter_events) and service without a "
@@ -147,7 +149,7 @@ class DelaysSpec(Part):
         description="From some publishers to some subscriptions.",
         examples=[[{"topic": "/scan", "to": "/slam", "constant": "20ms"}]],
     )
-    services: Annotated[dict[str, DelaySpec], named("constant", check_glob)] = Field(
+    services: Annotated[dict[str, DelaySpec], named("constant", check_service_glob)] = Field(
         default_factory=dict,
         description="By service, a glob; for requests and responses alike.",
         examples=[{"/set_mode": "2ms"}],

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from rsltrace.chance.distribution import LONGEST_NS
 from rsltrace.job.node import check_path
-from rsltrace.job.part import Part, attach, check, from_file, items, one_of, positive_time
+from rsltrace.job.part import (
+    Part,
+    attach,
+    check,
+    from_file,
+    given,
+    items,
+    one_of,
+    positive_time,
+)
 from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.times import TIME_SCHEMA, UNITS_NS, parse_time
 
@@ -36,13 +46,12 @@ def number(least: float, most: float | None = None, *, open_below: bool = False)
 
     def function(value: object) -> float:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise Problem(f"expected a number, got {describe(value)}")
+            raise Problem(f"expected a number, got {describe(value)}{_as_number(value)}")
         low = value > least if open_below else value >= least
         if not low or (most is not None and not value <= most) or value in (float("inf"),):
             above = f"greater than {least:g}" if open_below else f"at least {least:g}"
-            raise Problem(
-                f"must be {above}" + (f" and at most {most:g}" if most is not None else "")
-            )
+            below = f" and at most {most:g}" if most is not None else ""
+            raise Problem(f"must be {above}{below}, got {getattr(value, 'text', value)}")
         return float(value)
 
     schema: dict[str, object] = {"type": "number"}
@@ -50,6 +59,18 @@ def number(least: float, most: float | None = None, *, open_below: bool = False)
     if most is not None:
         schema["maximum"] = most
     return attach(function, schema=schema)
+
+
+def _as_number(value: object) -> str:
+    """Say how to write a number that was written in another way: ``10%``, ``"0.1"``."""
+    if not isinstance(value, str):
+        return ""
+    try:
+        number = Decimal(value.strip().removesuffix("%"))
+    except InvalidOperation:
+        return ""
+    percent = value.strip().endswith("%") and number.is_finite()
+    return f"; write {number / 100:f}" if percent else "; take the quotes away"
 
 
 def shorthand(key: str) -> BeforeValidator:
@@ -93,6 +114,7 @@ def named(key: str, rule: Callable[[str], None]) -> BeforeValidator:
 class UniformSpec(Part):
     """Evenly between two bounds."""
 
+    LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
     TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
 
     min_ns: Annotated[int, check(parse_short_time)] = Field(
@@ -112,6 +134,7 @@ class UniformSpec(Part):
 class NormalSpec(Part):
     """Normal, truncated at zero: negative values are drawn again."""
 
+    LISTED: ClassVar[tuple[str, ...]] = ("mean", "sd")
     TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns"}
 
     mean_ns: Annotated[int, check(parse_time)] = Field(
@@ -125,6 +148,7 @@ class NormalSpec(Part):
 class LognormalSpec(Part):
     """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
 
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
     TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "median": "median_ns"}
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
@@ -144,13 +168,14 @@ class LognormalSpec(Part):
 
     @model_validator(mode="after")
     def _one_way(self) -> LognormalSpec:
-        _either(self, ("mean", "sd"), ("median", "sigma"))
+        _either(self, *self.ALTERNATIVES)
         return self
 
 
 class GammaSpec(Part):
     """Gamma: by mean and standard deviation, or by shape and scale."""
 
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
     TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "scale": "scale_ns"}
 
     mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
@@ -168,12 +193,16 @@ class GammaSpec(Part):
 
     @model_validator(mode="after")
     def _one_way(self) -> GammaSpec:
-        _either(self, ("mean", "sd"), ("shape", "scale"))
+        _either(self, *self.ALTERNATIVES)
         return self
 
 
 class SamplesSpec(Part):
     """Measured values, each as likely as the others: listed here, or in a file."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("values",), ("file", "unit"))
+    MEANT: ClassVar[str] = "values"
+    MEANT_LIST: ClassVar[bool] = True
 
     values_ns: Annotated[tuple[int, ...] | None, check(items(parse_short_time), optional=True)] = (
         Field(
@@ -212,6 +241,10 @@ attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 
 
 class SeriesSpec(Part):
     """A value that changes over time: listed here, or in a file."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("points",), ("file", "unit"))
+    MEANT: ClassVar[str] = "points"
+    MEANT_LIST: ClassVar[bool] = True
 
     points: Annotated[
         tuple[tuple[int, int], ...] | None, check(items(_check_point), optional=True)
@@ -261,30 +294,30 @@ class DistributionSpec(Part):
     constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
         default=None, alias="constant", description="Always this.", examples=["5ms"]
     )
-    uniform: UniformSpec | None = Field(
+    uniform: Annotated[UniformSpec | None, given] = Field(
         default=None,
         description="Evenly between two bounds.",
         examples=[{"min": "1ms", "max": "3ms"}],
     )
-    normal: NormalSpec | None = Field(
+    normal: Annotated[NormalSpec | None, given] = Field(
         default=None,
         description="Normal, truncated at zero.",
         examples=[{"mean": "5ms", "sd": "1ms"}],
     )
-    lognormal: LognormalSpec | None = Field(
+    lognormal: Annotated[LognormalSpec | None, given] = Field(
         default=None,
         description="Lognormal: a long tail.",
         examples=[{"median": "5ms", "sigma": 0.5}],
     )
-    gamma: GammaSpec | None = Field(
+    gamma: Annotated[GammaSpec | None, given] = Field(
         default=None, description="Gamma.", examples=[{"mean": "5ms", "sd": "2ms"}]
     )
-    samples: SamplesSpec | None = Field(
+    samples: Annotated[SamplesSpec | None, given] = Field(
         default=None,
         description="One of some measured values.",
         examples=[{"file": "delays.txt", "unit": "ms"}],
     )
-    series: SeriesSpec | None = Field(
+    series: Annotated[SeriesSpec | None, given] = Field(
         default=None,
         description="A value that changes over time.",
         examples=[{"points": [["0s", "1ms"], ["60s", "20ms"]]}],
@@ -299,6 +332,7 @@ class DistributionSpec(Part):
         "samples",
         "series",
     )
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((kind,) for kind in KINDS)
     NEEDS_ONE: ClassVar[bool] = True
 
     @model_validator(mode="after")
@@ -316,7 +350,7 @@ class DistributionSpec(Part):
         return [kind for kind in self.KINDS if values[kind] is not None]
 
 
-def _either(part: Part, one: tuple[str, str], other: tuple[str, str]) -> None:
+def _either(part: Part, one: tuple[str, ...], other: tuple[str, ...]) -> None:
     values = {key: getattr(part, part.TIMES.get(key, key)) for key in (*one, *other)}
     given = {key for key, value in values.items() if value is not None}
     if given not in (set(one), set(other)):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, ValidationInfo
 
 from rsltrace.job.part import Part, attach, check, flag, from_file, items, text
-from rsltrace.job.problems import Problem, describe
+from rsltrace.job.problems import Problem, as_flag, describe
 from rsltrace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
@@ -175,6 +175,9 @@ def guard_part() -> BeforeValidator:
     def validate(value: object, info: ValidationInfo) -> object:
         if value is None and from_file(info):
             raise Problem("no value is given: give one, or leave the key out")
+        if isinstance(value, str):
+            hint = as_flag(value)
+            raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
         return {"enabled": value} if isinstance(value, bool) else value
 
     attach(validate, shorthand="enabled")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,7 +18,8 @@ from rsltrace.job.hooks import HooksSpec
 from rsltrace.job.launch_spec import LaunchSpec
 from rsltrace.job.names import check_topic
 from rsltrace.job.node import NodeSpec, check_path
-from rsltrace.job.part import Part, attach, check, items, one_of, parts, text, whole
+from rsltrace.job.part import Part, attach, check, given, items, one_of, parts, text, whole
+from rsltrace.job.paths import near_path
 from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.scheduling import (
     ExecutionSpec,
@@ -152,7 +152,7 @@ class Job(Part):
         "them all as they are.",
         examples=[{"clock": "virtual", "thread": "warn"}, False],
     )
-    delay: DelaysSpec | None = Field(
+    delay: Annotated[DelaysSpec | None, given] = Field(
         default=None,
         description="How long messages take, which are lost, and who is cut off when.",
         examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
@@ -178,7 +178,7 @@ class Job(Part):
         "which nodes that are not listed have, too.",
         examples=["single_threaded", [{"nodes": ["/camera", "/detector"], "workers": 2}]],
     )
-    execution: ExecutionSpec | None = Field(
+    execution: Annotated[ExecutionSpec | None, given] = Field(
         default=None,
         description="How long callbacks take: their executor is busy for so long, and what they "
         "send leaves when they are over.",
@@ -353,16 +353,7 @@ class Job(Part):
 
     def _near(self, path: str) -> str:
         """Say what there is instead of a path that does not lead anywhere."""
-        full = self.resolve(path)
-        if full.exists():
-            return ""
-        if not full.parent.is_dir():
-            return f" (there is no folder {os.path.dirname(path)!r} either)"
-        names = sorted(entry.name for entry in full.parent.iterdir())
-        close = difflib.get_close_matches(full.name, names, n=1)
-        if not close:
-            return ""
-        return f"; did you mean {os.path.join(os.path.dirname(path), close[0])!r}?"
+        return near_path(self.resolve(path), path)
 
     def _ties_are_decided_once(self) -> Iterator[Problem]:
         if self.timer_ties == "heap" and not (
@@ -394,12 +385,12 @@ class Job(Part):
             path = self.resolve(file)
             if not path.is_file():
                 what = "is not a file" if path.exists() else "there is no such file"
-                yield Problem(f"{file!r}: {what}", place)
+                yield Problem(f"{file!r}: {what}{self._near(file)}", place)
         for index, launch in enumerate(self.launch):
             if not self.resolve(launch.file).is_file():
-                yield Problem(
-                    f"{launch.file!r}: there is no such launch file", ("launch", index, "file")
-                )
+                near = self._near(launch.file)
+                place = ("launch", index, "file")
+                yield Problem(f"{launch.file!r}: there is no such launch file{near}", place)
         for index, bag in enumerate(self.bags):
             if not self.resolve(bag.path).exists():
                 message = f"{bag.path!r}: there is no such bag{self._near(bag.path)}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import Field
 
 from rsltrace.job.node import check_path
-from rsltrace.job.part import Part, attach, check
+from rsltrace.job.part import Part, attach, check, flag
 from rsltrace.job.problems import Problem, describe
 
 
@@ -30,12 +30,6 @@ attach(
 )
 
 
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise Problem(f"expected true or false, got {describe(value)}")
-    return value
-
-
 class LaunchSpec(Part):
     """A launch file; a path stands for ``{file: ...}``."""
 
@@ -48,7 +42,7 @@ class LaunchSpec(Part):
         description="Launch arguments by name, as `name:=value` on a command line.",
         examples=[{"robot": "husky", "use_lidar": True}],
     )
-    skip_unsupported: Annotated[bool, check(_flag)] = Field(
+    skip_unsupported: Annotated[bool, check(flag)] = Field(
         default=False,
         description="Leave out what cannot be simulated (compiled executables, processes, timers) "
         "instead of refusing the launch file.",

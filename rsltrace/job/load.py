@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,9 +17,12 @@ from rsltrace.job.model import file_fields
 from rsltrace.job.part import FROM_FILE
 from rsltrace.job.problems import Problem, format_loc, problems_of, unknown_key
 from rsltrace.job.tree import Item, Place, YamlSource, place_at, plain
-from rsltrace.job.yaml_source import parse_yaml
+from rsltrace.job.yaml_source import Mark, parse_yaml
 
 Overrides = Sequence["str | tuple[str, str]"]
+
+FREE_PREFIX = "x-"
+"""Keys of a job that begin so mean nothing: a place for YAML anchors, as in other formats."""
 
 SIZE_MAX = 16 << 20
 """A job file of more bytes is something else."""
@@ -61,7 +65,7 @@ def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides
     for key, value in given.items():
         if key in job_keys:
             values[key] = value
-        elif key not in composing:
+        elif key not in composing and not str(key).startswith(FREE_PREFIX):
             problems.append(unknown_key(key, [*job_keys, *sorted(composing)], ()))
     values["base_dir"] = base_dir
     values["source_name"] = name
@@ -114,11 +118,12 @@ def _read(path: Path) -> str:
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise JobError("this is UTF-16; save the file as UTF-8 text", where=name) from None
         good = data[: error.start].decode("utf-8-sig", "replace")
-        line, column = good.count("\n") + 1, len(good) - good.rfind("\n")
-        raise JobError(
-            f"not UTF-8: byte 0x{data[error.start]:02x}; save the file as UTF-8 text",
-            where=f"{name}:{line}:{column}",
+        mark = Mark(good.count("\n") + 1, len(good) - good.rfind("\n"))
+        raise YamlSource(name, data.decode("utf-8-sig", "replace")).error(
+            f"not UTF-8: byte 0x{data[error.start]:02x}; save the file as UTF-8 text", mark
         ) from None
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, get_args, get_origin
 
 from pydantic import BaseModel
@@ -44,6 +44,25 @@ def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
         elif not models:
             return None
     return found
+
+
+def alternatives_at(model: type[BaseModel], loc: Loc) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of keys of the value at ``loc`` of which only one may be given."""
+    field = field_at(model, loc) if loc else None
+    models = [] if field is None else models_in(field.annotation)
+    return next((m.ALTERNATIVES for m in models if hasattr(m, "ALTERNATIVES")), ())
+
+
+def without_alternatives(
+    values: dict[Any, Any], keys: Iterable[Any], model: type[BaseModel], loc: Loc
+) -> dict[Any, Any]:
+    """Return ``values`` without what cannot stay beside the new ``keys``: another distribution
+    takes the place of the one that was there."""
+    alternatives = alternatives_at(model, loc)
+    given = {key for key in keys if isinstance(key, str)}
+    chosen = [set(group) for group in alternatives if given & set(group)]
+    gone = {key for group in alternatives for key in group if chosen} - set().union(*chosen)
+    return {key: value for key, value in values.items() if key not in gone}
 
 
 def attached(field: FieldInfo, name: str) -> Any:

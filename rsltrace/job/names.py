@@ -44,7 +44,7 @@ def check_node_name(name: str) -> None:
 
 def check_namespace(namespace: str) -> None:
     """Raise ``ValueError`` unless ``namespace`` can be a ROS namespace: ``/`` or ``/a/b``."""
-    if not namespace.startswith("/"):
+    if not namespace.startswith("/") and _NAMESPACE.fullmatch(f"/{namespace}"):
         raise ValueError(f"a namespace starts with '/': write '/{namespace}'")
     if not _NAMESPACE.fullmatch(namespace):
         raise ValueError(
@@ -60,12 +60,12 @@ def check_namespace(namespace: str) -> None:
 
 def check_topic(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` is a fully qualified topic name."""
-    if not name.startswith("/"):
+    if not name.startswith("/") and _TOPIC.fullmatch(f"/{name}"):
         raise ValueError(f"a topic is named in full, from '/': write '/{name}'")
     if not _TOPIC.fullmatch(name):
         raise ValueError(
             f"{name!r} is not a topic name: parts of letters, digits and '_', none starting with "
-            "a digit, after one '/' each"
+            "a digit, after one '/' each, as in /robot/scan"
         )
 
 
@@ -131,10 +131,24 @@ def check_remap_to(name: str) -> None:
 
 def check_glob(glob: str) -> None:
     """Raise ``ValueError`` unless ``glob`` can match a topic name."""
+    _check_glob(glob, "topic")
+
+
+def check_service_glob(glob: str) -> None:
+    """Raise ``ValueError`` unless ``glob`` can match the name of a service."""
+    _check_glob(glob, "service")
+
+
+def check_node_glob(glob: str) -> None:
+    """Raise ``ValueError`` unless ``glob`` can match a node's name with its namespace."""
+    _check_glob(glob, "node")
+
+
+def _check_glob(glob: str, what: str) -> None:
     if not glob:
-        raise ValueError("an empty pattern matches no topic: write a topic name or a glob")
+        raise ValueError(f"an empty pattern matches no {what}: write the name of one, or a glob")
     if glob[0] not in "/*?[":
-        raise ValueError(f"topic names start with '/': write '/{glob}' (or '*{glob}')")
+        raise ValueError(f"{what} names start with '/': write '/{glob}' (or '*{glob}')")
 
 
 # What the rules accept, for the JSON Schema (whose regular expressions are JavaScript's).
@@ -149,6 +163,8 @@ _PATTERNS: tuple[tuple[Any, str], ...] = (
     (check_remap_from, r"^[A-Za-z0-9_~/:]+$"),
     (check_remap_to, r"^[A-Za-z0-9_~/]+$"),
     (check_glob, r"^[/*?\[]"),
+    (check_service_glob, r"^[/*?\[]"),
+    (check_node_glob, r"^[/*?\[]"),
 )
 for _rule, _pattern in _PATTERNS:
     _rule.pattern = _pattern

@@ -8,11 +8,15 @@ from __future__ import annotations
 import difflib
 import re
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rsltrace.job.model import shorthand_at, without_alternatives
 from rsltrace.job.problems import Loc, describe
 from rsltrace.job.tree import Item, Place, YamlSource
 from rsltrace.job.yaml_source import Mark, parse_yaml
+
+if TYPE_CHECKING:
+    from rsltrace.job.job import Job
 
 _STEP = re.compile(r'"([^"]*)"|\'([^\']*)\'|([^.=\'"\[\]]+)|\[([0-9]+|\+)\]')
 _APPEND = "+"
@@ -81,7 +85,7 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
         starts_list = not step.quoted and step.text == _APPEND
         item = Item([] if starts_list else {}, step.place, step.place)
     inner: Any = item.value
-    if isinstance(inner, str) and (key := _shorthand(loc)) is not None:
+    if is_shorthand(inner) and (key := shorthand_at(_job(), loc)) is not None:
         inner = {key: replace(item, key_place=item.place)}
     if isinstance(inner, list):
         return replace(item, value=_set_in_list(inner, steps, value, loc))
@@ -90,7 +94,7 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
             f"{'.'.join(map(str, loc))} is {describe(inner)}: there is nothing below it to set"
         )
     name, used = _key(inner, steps)
-    values = dict(inner)
+    values = without_alternatives(inner, (name,), _job(), loc)
     new = _set(values.get(name), steps[used:], value, (*loc, name))
     if new.value is None and used == len(steps):
         if name not in values:
@@ -160,9 +164,12 @@ def _names(item: Item) -> list[str]:
     return []
 
 
-def _shorthand(loc: Loc) -> str | None:
-    """Return the key that text alone stands for at ``loc``: a bag's path, a topic's name."""
-    from rsltrace.job.job import Job
-    from rsltrace.job.model import shorthand_at
+def is_shorthand(value: object) -> bool:
+    """Say whether a value may stand for a part: a bag's path, a topic's name, a plain time."""
+    return isinstance(value, (str, int, float)) and not isinstance(value, bool)
 
-    return shorthand_at(Job, loc)
+
+def _job() -> type[Job]:
+    from rsltrace.job.job import Job
+
+    return Job

@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from rsltrace.errors import JobError
-from rsltrace.job.problems import Problem, Problems, describe, problems_of
+from rsltrace.job.problems import Problem, Problems, as_flag, describe, problems_of
 from rsltrace.job.times import TIME_SCHEMA, Nanoseconds, parse_time
 
 if TYPE_CHECKING:
@@ -152,7 +152,7 @@ def one_of(*choices: str) -> Callable[[Any], str]:
 
     def function(value: object) -> str:
         if not isinstance(value, str) or value not in choices:
-            close = difflib.get_close_matches(str(value), choices, n=1)
+            close = difflib.get_close_matches(str(value).lower(), choices, n=1)
             hint = f"; did you mean {close[0]}?" if close and len(choices) > 2 else ""
             raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}{hint}")
         return str(value)
@@ -164,7 +164,7 @@ def one_of(*choices: str) -> Callable[[Any], str]:
 def flag(value: object) -> bool:
     """Check true or false."""
     if not isinstance(value, bool):
-        raise Problem(f"expected true or false, got {describe(value)}")
+        raise Problem(f"expected true or false, got {describe(value)}{as_flag(value)}")
     return value
 
 
@@ -217,7 +217,17 @@ def items(function: Callable[[Any], object]) -> Callable[[Any], tuple[object, ..
 
 
 def _as_list(value: object) -> str:
-    return f"; write [{value}]" if isinstance(value, (str, int, float)) else ""
+    return f"; write [{value}]" if isinstance(value, str) and value.strip() else ""
+
+
+def _given(value: object, info: ValidationInfo) -> object:
+    if value is None and from_file(info):
+        raise Problem("no value is given: give one, or leave the key out")
+    return value
+
+
+given = BeforeValidator(_given)
+"""Refuse null in a file for a field that is None where it is not given."""
 
 
 def parts(shorthand: str | None = None) -> BeforeValidator:

@@ -70,10 +70,50 @@ def unknown_key(key: object, valid: Iterable[str], loc: Loc) -> Problem:
     """Return the finding that ``key``, below ``loc``, is none of the ``valid`` keys."""
     names = list(valid)
     inside = f" in {format_loc(loc)}" if loc else ""
-    near = nearest(str(key), names)
-    advice = f"did you mean {near!r}?" if near else f"valid keys are {', '.join(names)}"
-    place = key if isinstance(key, (str, int)) else str(key)
-    return Problem(f"unknown key {key!r}{inside}; {advice}", (*loc, place), at_key=True)
+    text = str(key)
+    near = meant_by(text, names) or nearest(text, names)
+    glued, colon, value = text.replace("\xa0", " ").partition(":")
+    if colon and glued in names:
+        advice = f"put a blank after the colon: '{glued}: {value.strip()}'"
+    elif near:
+        advice = f"did you mean {near!r}?"
+    else:
+        advice = f"valid keys are {', '.join(names)}"
+    shown = repr(key) if isinstance(key, str) else describe(key).removeprefix("the number ")
+    place = key if isinstance(key, (str, int)) else text
+    return Problem(f"unknown key {shown}{inside}; {advice}", (*loc, place), at_key=True)
+
+
+_OTHER_WORDS = {
+    "mean": ("mu", "average", "avg", "loc"),
+    "sd": ("std", "stddev", "std_dev", "sigma", "stdev", "deviation"),
+    "min": ("low", "lower", "from", "a"),
+    "max": ("high", "upper", "to", "b"),
+    "shape": ("alpha", "k"),
+    "scale": ("theta",),
+    "good_to_bad": ("p",),
+    "bad_to_good": ("r", "q"),
+    "drop": ("loss", "lose", "p", "probability"),
+    "default": ("constant", "all", "delay"),
+    "node": ("class", "plugin", "component"),
+    "executable": ("exec", "package", "pkg"),
+    "namespace": ("ns",),
+    "arguments": ("args", "kwargs", "argv"),
+    "quiescence": ("quiet", "silence", "idle"),
+    "workers": ("threads",),
+    "file": ("path", "filename", "csv"),
+    "path": ("file", "bag", "uri"),
+    "from": ("start", "begin", "since"),
+    "to": ("end", "until", "stop"),
+    "at": ("time", "when"),
+    "by": ("size", "jump"),
+}
+"""Words that other programs have for a key."""
+
+
+def meant_by(word: str, names: Iterable[str]) -> str | None:
+    """Return the name that is called ``word`` elsewhere, if there is one."""
+    return next((name for name in names if word in _OTHER_WORDS.get(name, ())), None)
 
 
 def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]:
@@ -82,9 +122,11 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
     entries = error.errors(include_url=False)
     # A misspelt key is one mistake, not two: the key that it was meant to be is not missing.
     meant = {
-        (*entry["loc"][:-1], nearest(str(entry["loc"][-1]), _keys_at(model, entry["loc"][:-1])))
+        (*entry["loc"][:-1], near)
         for entry in entries
         if entry["type"] == "extra_forbidden"
+        for names in (_keys_at(model, entry["loc"][:-1]),)
+        for near in (meant_by(str(entry["loc"][-1]), names), nearest(str(entry["loc"][-1]), names))
     }
     for entry in entries:
         loc: Loc = entry["loc"]
@@ -105,6 +147,7 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
             if is_part and isinstance(entry["input"], (str, int, float, list, tuple)):
                 keys = _keys_at(model, loc)
                 text += f"; its keys are {', '.join(keys)}" if keys else ""
+                text += _as_part(entry["input"], _models_at(model, loc))
             found.append(_named(text, loc))
     return found
 
@@ -126,16 +169,51 @@ def _wording(kind: str, message: str, cause: object, value: object) -> str:
         "bool_type": "true or false",
         "string_type": "text",
     }.get(kind)
-    return f"expected {expected}, got {describe(value)}" if expected else message
+    hint = as_flag(value) if kind == "bool_type" else ""
+    return f"expected {expected}, got {describe(value)}{hint}" if expected else message
+
+
+def as_flag(value: object) -> str:
+    """Say how to write true or false: YAML 1.2 knows neither ``yes`` nor ``on``."""
+    word = value.lower() if isinstance(value, str) else None
+    if word in ("yes", "on", "y", "true"):
+        return "; write true"
+    return "; write false" if word in ("no", "off", "n", "false") else ""
+
+
+def _as_part(value: object, models: list[type[BaseModel]]) -> str:
+    """Say how to write what was meant: ``stop: 60s`` is ``{duration: 60s}``."""
+    for inner in models:
+        keys: tuple[str, ...] = getattr(inner, "LISTED", ())
+        if isinstance(value, (list, tuple)) and len(value) == len(keys):
+            values = ", ".join(f"{k}: {_written(v)}" for k, v in zip(keys, value, strict=True))
+            return f"; write {{{values}}}"
+        key: str | None = getattr(inner, "MEANT", None)
+        wanted = (list, tuple) if getattr(inner, "MEANT_LIST", False) else (str, int, float)
+        if key is not None and isinstance(value, wanted) and not isinstance(value, bool):
+            return f"; write {{{key}: {_written(value)}}}"
+    return ""
+
+
+def _written(value: object) -> str:
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(_written, value))}]"
+    return str(getattr(value, "text", value))
 
 
 def _keys_at(model: type[BaseModel], loc: Loc) -> list[str]:
-    """Return the keys a job may have at ``loc``, found by walking the models' annotations."""
-    from rsltrace.job.model import field_at, file_fields, models_in
+    """Return the keys a job may have at ``loc``."""
+    from rsltrace.job.model import file_fields
 
-    models = [model]
-    if loc:
-        field = field_at(model, loc)
-        assert field is not None, "extra keys can only be forbidden inside a model"
-        models = models_in(field.annotation)
-    return [key for inner in models for key, _ in file_fields(inner)]
+    return [key for inner in _models_at(model, loc) for key, _ in file_fields(inner)]
+
+
+def _models_at(model: type[BaseModel], loc: Loc) -> list[type[BaseModel]]:
+    """Return the parts that may be at ``loc``, found by walking the models' annotations."""
+    from rsltrace.job.model import field_at, models_in
+
+    if not loc:
+        return [model]
+    field = field_at(model, loc)
+    assert field is not None, "extra keys can only be forbidden inside a model"
+    return models_in(field.annotation)

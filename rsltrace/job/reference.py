@@ -31,9 +31,11 @@ A job file is YAML. It says which nodes run, what plays in, what ends the run an
 it, and a mistake is an error with file, line, column and what was expected.
 
 - **Times** are a number of seconds (`0.5`) or a number with a unit: `5ms`, `0.2s`, `2min`. Units
-  are `ns`, `us`, `ms`, `s`, `min` and `h`. They are read exactly, never through a float.
+  are `ns`, `us` (`µs`), `ms`, `s`, `min` and `h`. They are read exactly, never through a float.
 - **Sizes** are a number of bytes or a number with a unit: `500kB`, `4MiB`.
 - **Paths** start in the folder of the file they stand in.
+- **YAML anchors** (`&name`, `*name`, `<<`) work; keys that begin with `x-` mean nothing and may
+  hold what they refer to.
 - **Globs** are shell patterns over whole names; `*` matches `/`, too.
 - **Editors** complete and check: `rsltrace schema > job.schema.json`, and as the first line of the
   job `# yaml-language-server: $schema=job.schema.json`.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from typing import Annotated, Any, ClassVar
 
 from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
 
 from rsltrace.job.distribution import DistributionSpec, named, shorthand
-from rsltrace.job.names import check_glob
+from rsltrace.job.names import check_node_glob
 from rsltrace.job.node import Target, check_callable_target, check_path
 from rsltrace.job.part import Part, attach, check, from_file, items, one_of, parts, text, whole
 from rsltrace.job.problems import Problem, describe
@@ -15,7 +16,7 @@ from rsltrace.job.problems import Problem, describe
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
 
-NodeGlob = Annotated[str, check(text(check_glob))]
+NodeGlob = Annotated[str, check(text(check_node_glob))]
 NameGlob = Annotated[str | None, check(text(), optional=True)]
 
 
@@ -49,6 +50,7 @@ class PolicySpec(Part):
     ``order``."""
 
     ONE_OF: ClassVar[tuple[str, ...]] = ("order", "priority", "recorded", "function")
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((key,) for key in ONE_OF)
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
@@ -84,7 +86,7 @@ class PolicySpec(Part):
 class ExecutorSpec(Part):
     """A simulated executor: so many workers for some nodes."""
 
-    nodes: Annotated[tuple[str, ...], check(items(text(check_glob)))] = Field(
+    nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
         default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]
     )
     workers: Annotated[int, check(whole(1, 1024))] = Field(
@@ -107,10 +109,12 @@ class ExecutionSpec(Part):
     """How long callbacks take. Of ``entities`` the first that fits counts, then ``nodes``, then
     ``default``."""
 
+    MEANT: ClassVar[str] = "default"
+
     default: Annotated[DistributionSpec | None, shorthand("constant")] = Field(
         default=None, description="For every callback without a time of its own.", examples=["1ms"]
     )
-    nodes: Annotated[dict[str, DistributionSpec], named("constant", check_glob)] = Field(
+    nodes: Annotated[dict[str, DistributionSpec], named("constant", check_node_glob)] = Field(
         default_factory=dict,
         description="By node, a glob.",
         examples=[{"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}],
@@ -128,6 +132,10 @@ def policy_part() -> BeforeValidator:
     def validate(value: object, info: ValidationInfo) -> object:
         if value is None and from_file(info):
             raise Problem("no value is given: give one, or leave the key out")
+        if isinstance(value, str) and value in PolicySpec.ONE_OF:
+            example = PolicySpec.model_fields[value].examples or [None]
+            shown = json.dumps({value: example[0]}).replace('"', "")
+            raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
         return {"order": value} if isinstance(value, str) else value
 
     return BeforeValidator(attach(validate, shorthand="order"))
@@ -144,8 +152,11 @@ def executors_part() -> BeforeValidator:
         if isinstance(value, str) and value in words:
             value = words[value]
         if not isinstance(value, (list, tuple)):
+            hint = ""
+            if isinstance(value, str) and value.startswith("multi"):
+                hint = "; write [{workers: 4}]"
             raise Problem(
-                f"expected {' or '.join(words)} or a list of executors, got {describe(value)}"
+                f"expected {' or '.join(words)} or a list of executors, got {describe(value)}{hint}"
             )
         return tuple(value)
 

@@ -24,6 +24,7 @@ Schema = dict[str, Any]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _SUBSTITUTION: Schema = {"$ref": "#/$defs/Substitution"}
+FREE = "Means nothing: a place for YAML anchors."
 _NULL: Schema = {"type": "null"}
 _SCALARS: dict[Any, Schema] = {
     bool: {"type": "boolean"},
@@ -113,6 +114,8 @@ class _Maker:
         one_of = getattr(model, "ONE_OF", ())
         if one_of and not self._partial:
             definition["oneOf"] = [{"required": [key]} for key in one_of]
+        if model is Job:
+            definition["patternProperties"] = {"^x-": {"description": FREE}}
         if model is Job and not self._partial:
             needed = ("nodes", "launch", "bags")
             definition["anyOf"] = [{"required": [key]} for key in needed]

@@ -37,6 +37,7 @@ class TopicStop(Part):
 class StopSpec(Part):
     """What ends a run. Any of the conditions; times in nanoseconds, ``None`` where not given."""
 
+    MEANT: ClassVar[str] = "duration"
     TIMES: ClassVar[dict[str, str]] = {
         "duration": "duration_ns",
         "time": "time_ns",

@@ -65,7 +65,10 @@ class Substitution:
                 continue
             end = _closing(text, start)
             if end is None:
-                raise _error(item, text[start:], f"{text[start:]!r} has no closing parenthesis")
+                message = f"{text[start:]!r} has no closing parenthesis"
+                if item.is_bare:
+                    message += " (a ',' or ': ' in it may have ended the value: quote it then)"
+                raise _error(item, text[start:], message)
             written = text[start : end + 1]
             inner = self._text(text[start + 2 : end], item)
             done += text[at:start] + self._one(written, inner, item)

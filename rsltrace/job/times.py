@@ -26,8 +26,9 @@ UNITS_NS = {
 }
 
 _TIME_TEXT = re.compile(
-    r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-z]*)\s*"
+    r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-zµμ]*)\s*"
 )
+_MICRO = re.compile("[µμ]")  # the sign, and the Greek letter
 _WORDS = {
     "ns": ("nsec", "nsecs", "nanosecond", "nanoseconds"),
     "us": ("usec", "usecs", "microsecond", "microseconds"),
@@ -44,7 +45,7 @@ TIME_SCHEMA: dict[str, object] = {
         {
             "type": "string",
             "pattern": r"^\s*\+?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?"
-            r"\s*(ns|us|ms|s|min|h)\s*$",
+            r"\s*(ns|[uµμ]s|ms|s|min|h)\s*$",
         },
     ]
 }
@@ -105,6 +106,7 @@ def parse_measured(text: str, unit: str) -> int:
             f"expected a number, or a number with a unit ({', '.join(UNITS_NS)}), got {text!r}"
         )
     number, own_unit = match.groups()
+    own_unit = _MICRO.sub("u", own_unit)
     if own_unit and own_unit not in UNITS_NS:
         return _parse_text(text)
     return _exact(number, UNITS_NS[own_unit or unit], text.strip(), rounded=True)
@@ -120,10 +122,11 @@ def _parse_text(text: str) -> int:
     if match is None:
         raise ValueError(f"{_EXPECTED}, got {text!r}")
     number, unit = match.groups()
+    unit = _MICRO.sub("u", unit)
     if not unit:
         raise ValueError(f"{text!r} has no unit: write '{number}s' for seconds")
     if unit not in UNITS_NS:
-        meant = next((u for u in _WORDS if unit.lower() in _WORDS[u]), None)
+        meant = next((u for u in _WORDS if unit.lower() in (u, *_WORDS[u])), None)
         hint = f"write '{number}{meant}'" if meant else f"units are {', '.join(UNITS_NS)}"
         raise ValueError(f"unknown unit {unit!r} in {text!r}; {hint}")
     return _exact(number, UNITS_NS[unit], text.strip())

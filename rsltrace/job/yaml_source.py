@@ -25,6 +25,7 @@ SHOWN_COLUMNS = 100
 
 _TAG = "tag:yaml.org,2002:"
 _SHOWN_MAX = 40
+_DIGITS_MAX = 100
 _LINE_BREAK = re.compile("\r\n|[\n\r\x85\u2028\u2029]")
 
 
@@ -69,6 +70,7 @@ class YamlSource:
         shown = line[start : start + SHOWN_COLUMNS]
         # Tabs stay tabs, so that the caret lines up however wide a terminal draws them.
         before = "".join("\t" if c == "\t" else " " for c in shown[: column - start])
+        shown = "".join(c if c == "\t" or c.isprintable() else "\ufffd" for c in shown)
         gutter = "      | " if self.is_option else f"{mark.line:>5} | "
         return f"\n{gutter}{shown.rstrip()}\n{' ' * (len(gutter) - 2)}| {before}^"
 
@@ -216,7 +218,8 @@ class _Builder:
             return _value(kind, text)
         except ValueError:
             shown = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
-            raise self.source.error(f"{shown!r} is not a number", _mark(node)) from None
+            wrong = "too long a number" if len(text) > _DIGITS_MAX else "not a number"
+            raise self.source.error(f"{shown!r} is {wrong}", _mark(node)) from None
 
     def _unknown_tag(self, node: Node) -> JobError:
         tag = _tag(node).replace(_TAG, "!!")
@@ -278,6 +281,9 @@ def _syntax_error(source: YamlSource, error: Any) -> JobError:
     began, place = error.context_mark, error.problem_mark or error.context_mark
     mark = Mark(place.line + 1, place.column + 1) if place else Mark(1, 1)
     problem = str(error.problem or error.context)
+    glued = _glued_dash(source, began.line, mark.line) if began else None
+    if glued is not None and problem.startswith("expected <block end>"):
+        return source.error("not YAML: a list entry begins with '- ', a blank after the '-'", glued)
     advice = next((text for start, text in _ADVICE.items() if problem.startswith(start)), None)
     message = problem
     if error.context and began and began.line + 1 < mark.line:
@@ -296,8 +302,19 @@ def _syntax_error(source: YamlSource, error: Any) -> JobError:
     )
 
 
+def _glued_dash(source: YamlSource, first: int, last: int) -> Mark | None:
+    """Return the place of a list entry without the blank: ``-node: x`` (lines count from 0)."""
+    for number, line in enumerate(_LINE_BREAK.split(source.text)[first:last], first + 1):
+        found = re.match(r"\s*-[^\s-]+:", line)
+        if found:
+            return Mark(number, line.index("-") + 1)
+    return None
+
+
 def _integer(text: str) -> int:
     digits = text.replace("_", "")
+    if len(digits) > _DIGITS_MAX:
+        raise ValueError
     unsigned = digits.lstrip("+-")
     if unsigned[:2].lower() in ("0x", "0o", "0b"):
         return int(digits, 0)

@@ -231,7 +231,12 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
             "there is no ROS package 'no_such_package' in "
             f"AMENT_PREFIX_PATH or {sys.prefix}: install it, or source the workspace that has it",
         ),
-        ("$(env", 7, "'$(env' has no closing parenthesis"),
+        (
+            "$(env",
+            7,
+            "'$(env' has no closing parenthesis (a ',' or ': ' in it may have ended the value: "
+            "quote it then)",
+        ),
         ("$(dirname x)", 7, "expected $(dirname), got $(dirname x)"),
         (
             "$(command date)",
@@ -327,6 +332,69 @@ def test_a_mistake_in_an_override_is_shown_in_it(
         assert first == f"--set: {expected}"
     assert line == f"      | {override}"
     assert caret == f"      | {' ' * (column - 1)}^"
+
+
+CHOICES = """\
+nodes: [{node: m:N}]
+delay:
+  default: 5ms
+  topics:
+    /a: {constant: 1ms, drop: 0.1}
+    /b: {lognormal: {mean: 5ms, sd: 2ms}}
+    /c: {samples: {file: s.txt, unit: ms}, keep_order: false}
+policy: rate_monotonic
+"""
+
+
+def test_another_distribution_or_policy_takes_the_place_of_the_bases() -> None:
+    write("s.txt", "1")
+    write("base.yaml", CHOICES)
+    change = """\
+        base: base.yaml
+        delay:
+          default: {drop: 0.2}
+          topics:
+            /a: {uniform: {min: 1ms, max: 2ms}}
+            /b: {lognormal: {median: 5ms, sigma: 0.5}}
+            /c: {samples: {values: [1ms]}}
+        policy: {priority: [{node: /a, priority: 1}]}
+        """
+    write("job.yaml", change)
+    overrides = [
+        "delay.default.drop=0.2",
+        "delay.topics./a.uniform={min: 1ms, max: 2ms}",
+        "delay.topics./b.lognormal.median=5ms",
+        "delay.topics./b.lognormal.sigma=0.5",
+        "delay.topics./c.samples.values=[1ms]",
+        "policy.priority=[{node: /a, priority: 1}]",
+    ]
+    for job in (load_job("job.yaml"), load_job("base.yaml", overrides=overrides)):
+        resolved = job.resolved()
+        delay, topics = resolved["delay"]["default"], resolved["delay"]["topics"]
+        assert (delay["constant_ns"], delay["drop"]) == (5_000_000, 0.2)
+        assert topics["/a"]["constant_ns"] is None
+        assert topics["/a"]["uniform"] == {"min_ns": 1_000_000, "max_ns": 2_000_000}
+        assert topics["/a"]["drop"] == 0.1
+        assert topics["/b"]["lognormal"]["mean_ns"] is None
+        assert topics["/c"]["samples"]["file"] is None
+        assert topics["/c"]["keep_order"] is False
+        assert resolved["policy"]["order"] is None
+
+
+def test_keys_that_begin_with_x_hold_what_anchors_refer_to() -> None:
+    text = """\
+        x-common: &common {rate: 20.0}
+        nodes:
+          - node: m:N
+            parameters: {<<: *common, gain: 1.0}
+        """
+    write("base.yaml", text)
+    write("job.yaml", "base: base.yaml\nx-mine: 3\n")
+    (node,) = load_job("job.yaml").nodes
+    assert node.parameters == {"rate": 20.0, "gain": 1.0}
+    assert "x-" not in load_job("job.yaml").to_yaml()
+    write("job.yaml", "x_common: 3\nbase: base.yaml\n")
+    assert "unknown key 'x_common'" in message()
 
 
 def test_a_delay_of_one_topic_from_the_command_line() -> None:

@@ -146,7 +146,7 @@ def test_rules_and_outages_of_a_plan() -> None:
         ),
         (
             "default: {drop: 1.5}",
-            "job.yaml:3:19: delay.default.drop: must be at least 0 and at most 1",
+            "job.yaml:3:19: delay.default.drop: must be at least 0 and at most 1, got 1.5",
         ),
         (
             "default: {drop: 5ms}",

@@ -215,7 +215,15 @@ def test_not_utf8() -> None:
     Path("job.yaml").write_bytes("nodes:\n  - node: mü:N\n".encode("latin-1"))
     with pytest.raises(JobError) as caught:
         load_job("job.yaml")
-    assert str(caught.value) == ("job.yaml:2:12: not UTF-8: byte 0xfc; save the file as UTF-8 text")
+    assert str(caught.value) == (
+        "job.yaml:2:12: not UTF-8: byte 0xfc; save the file as UTF-8 text\n"
+        "    2 |   - node: m\ufffd:N\n"
+        "      |            ^"
+    )
+    Path("job.yaml").write_bytes("seed: 7\n".encode("utf-16"))
+    with pytest.raises(JobError) as caught:
+        load_job("job.yaml")
+    assert str(caught.value) == "job.yaml: this is UTF-16; save the file as UTF-8 text"
 
 
 @pytest.mark.parametrize("text", ["", "# only a comment\n", "---\n"])
@@ -293,7 +301,7 @@ GOLDEN = {
         "nodes:\n  - node: m:\x01N\n",
         """
         job.yaml:2:13: special characters are not allowed: '\\x01'
-            2 |   - node: m:\x01N
+            2 |   - node: m:\ufffdN
               |             ^
         """,
     ),
@@ -475,10 +483,10 @@ GOLDEN = {
         job.yaml:4:13: timer_ties: expected creation or heap, got text 'stack'
             4 | timer_ties: stack
               |             ^
-        job.yaml:5:7: stop: expected a mapping, got text '10s'; its keys are duration, time, timeout, events, topic, function, quiescence, size
+        job.yaml:5:7: stop: expected a mapping, got text '10s'; its keys are duration, time, timeout, events, topic, function, quiescence, size; write {duration: 10s}
             5 | stop: 10s
               |       ^
-        job.yaml:6:20: record.payloads: expected true or false, got text 'yes'
+        job.yaml:6:20: record.payloads: expected true or false, got text 'yes'; write true
             6 | record: {payloads: "yes"}
               |                    ^
         """,  # noqa: E501
@@ -719,7 +727,7 @@ GOLDEN = {
         job.yaml:1:27: bags[0].topics[0]: topic names start with '/': write '/imu' (or '*imu')
             1 | bags: [{path: ., topics: [imu, ""]}, {path: ., topics: []}]
               |                           ^
-        job.yaml:1:32: bags[0].topics[1]: an empty pattern matches no topic: write a topic name or a glob
+        job.yaml:1:32: bags[0].topics[1]: an empty pattern matches no topic: write the name of one, or a glob
             1 | bags: [{path: ., topics: [imu, ""]}, {path: ., topics: []}]
               |                                ^
         job.yaml:1:56: bags[1].topics: an empty list would play nothing: leave the key out to play all topics
