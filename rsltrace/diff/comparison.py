@@ -85,7 +85,7 @@ class _Comparison:
     def _ended(self, over: Trace) -> Divergence:
         explainer = self._explainer([])
         view = explainer.view(self._start, of_b=over is self._a)
-        judgement = judge_ended(self._a, self._b, over, view)
+        judgement = judge_ended(self._a, self._b, over, view, self._job)
         return explainer.ended(self._start, judgement)
 
     def _aligned(self) -> list[Divergence]:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rsltrace.diff.classify import Judgement
 from rsltrace.diff.engine import stop_reason
-from rsltrace.diff.model import EventView, Root, Verdict
+from rsltrace.diff.model import EventView, Root, Setting, Verdict
 from rsltrace.diff.views import at
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace
@@ -13,31 +15,32 @@ from rsltrace.trace.reader import Trace
 def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
     """Return the run that ended at event ``start``, where the runs part; None if neither did.
 
-    A run ends with the destruction of its nodes, which are events, or, when it was killed, just
-    so. Two runs that both ended at the same time for the same reason did not part by ending.
+    A run that ends has its mains and nodes end, which are events; when it was killed, its events
+    just cease. Two runs that both ended at the same time did not part by ending, whatever their
+    nodes did about it.
     """
-    over = _first_over(a, b, start)
-    if over is None or (a.complete and b.complete and _ended_alike(a, b)):
-        return None
-    return over
-
-
-def _first_over(a: Trace, b: Trace, start: int) -> Trace | None:
     for trace in (a, b):
-        if start >= trace.event_count:
+        if not trace.complete and start >= trace.event_count:
             return trace
-    shut_a, shut_b = (trace.event(start).kind is EventKind.SHUTDOWN for trace in (a, b))
-    if shut_a and shut_b:
-        return a if a.end_ns < b.end_ns else b
-    return a if shut_a else b if shut_b else None
+    over_a, over_b = _is_over(a, start), _is_over(b, start)
+    if over_a and over_b:
+        return None if a.end_ns == b.end_ns else a if a.end_ns < b.end_ns else b
+    return a if over_a else b if over_b else None
 
 
-def _ended_alike(a: Trace, b: Trace) -> bool:
-    return a.end_ns == b.end_ns and stop_reason(a) == stop_reason(b)
+def _is_over(trace: Trace, start: int) -> bool:
+    """Whether a run had ended before its event ``start``."""
+    if trace.ended_after is not None:
+        return start >= trace.ended_after
+    # A trace of an earlier version: one of class nodes ends with their destruction.
+    return start >= trace.event_count or trace.event(start).kind is EventKind.SHUTDOWN
 
 
-def judge_ended(a: Trace, b: Trace, over: Trace, view_a: EventView | None) -> Judgement:
-    """Put it in words. ``view_a`` is the event that only the other run has, or None."""
+def judge_ended(
+    a: Trace, b: Trace, over: Trace, view_a: EventView | None, job: Sequence[Setting]
+) -> Judgement:
+    """Put it in words. ``view_a`` is the event that only the other run has, or None; ``job`` is
+    what differs in the jobs."""
     verdict = Verdict.ENDED_EARLY if over is b else Verdict.RAN_LONGER
     name, other_name, other = ("b", "a", a) if over is b else ("a", "b", b)
     where = f" {at(over.end_ns)}" if over.event_count else ""
@@ -46,14 +49,19 @@ def judge_ended(a: Trace, b: Trace, over: Trace, view_a: EventView | None) -> Ju
         f"went on {'to' if other.end_ns != over.end_ns else 'until'} {at(other.end_ns)[3:]} "
         f"({stop_reason(other)})"
     )
+    root = Root.UNKNOWN
     if not over.complete:
         why = (
             f"the recording of {name} was cut off: its run was killed, is still going on, or the "
             "file is not whole"
         )
+    elif told := [setting for setting in job if setting.key.partition(".")[0] == "stop"]:
+        root = Root.JOB
+        differs = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in told)
+        why = f"both do the same as long as they last, and their jobs differ in {differs}"
     else:
         why = (
             f"both do the same as long as they last; {name} was told to stop, or had no more to do"
         )
     a_view, b_view = (view_a, None) if over is b else (None, view_a)
-    return Judgement(verdict, Root.UNKNOWN, sentence, why, a_view, b_view)
+    return Judgement(verdict, root, sentence, why, a_view, b_view)

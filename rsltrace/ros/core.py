@@ -90,6 +90,7 @@ class Core:
         self.main: greenlet | None = None
         self.runner_error: BaseException | None = None
         self.ending = False
+        self.ended_after: int | None = None
         self.shutdown_ns = 0
         self.refused = 0
         self.stuck: list[str] = []
@@ -231,6 +232,7 @@ class Core:
         """
         try:
             self.loop.run()
+            self.note_end()
             self.note_stuck()
         except RunEnded:
             pass
@@ -240,6 +242,11 @@ class Core:
         if any(blocked.stack is self.main for blocked in self.blocked):
             self.ending = True
         getcurrent().parent = self.main
+
+    def note_end(self) -> None:
+        """Remember how many events there were when the run ended: what follows is the ending."""
+        if self.ended_after is None:
+            self.ended_after = self.loop.events
 
     def note_stuck(self) -> None:
         """Remember who still waits if the run has ended because nothing can happen any more."""
@@ -304,6 +311,9 @@ class Core:
             if handle.wrapper is None:
                 handle.node = handle.node or node
                 handle.find_wrapper()
+        if self.unowned:  # a timer made long before its node is spun is written down now
+            self.pending += [one for one in self.unowned if getattr(one, "node", None) is node]
+            self.unowned = [one for one in self.unowned if one not in self.pending]
         sync_waitables(self, node)
 
     def deactivate_node(self, node: NodeHandle) -> None:

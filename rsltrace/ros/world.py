@@ -205,6 +205,7 @@ class World:
         core.next_runner().switch()
         if core.loop.stopped is None and core.runner_error is None:
             return  # paused
+        core.note_end()
         end_programs(core)
         end_blocked(core)
         if core.runner_error is not None:
@@ -219,6 +220,7 @@ class World:
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
         core = self.core
+        core.note_end()
         end_programs(core)
         end_blocked(core)  # constructors that still wait, if the run never began
         for node in self.nodes:

@@ -261,6 +261,7 @@ class Session:
                     "end_time": str(loop.now_ns),
                     "stop_reason": stop.reason,
                     "exit_code": str(exit_code),
+                    "ended_after": str(core.ended_after),
                 }
             )
         digest = self.digest

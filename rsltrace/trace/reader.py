@@ -172,6 +172,13 @@ class Trace:
         """When the run ended: as its result says, or else the latest event (0: none)."""
         return self._result_ns("end_time", max(self.segments["end_stamp"].tolist(), default=0))
 
+    @property
+    def ended_after(self) -> int | None:
+        """How many events there were when the run ended, and its nodes were told; None if the
+        trace does not say."""
+        text = self.result.get("ended_after", "")
+        return int(text) if text.isascii() and text.isdigit() else None
+
     @cached_property
     def result(self) -> dict[str, str]:
         """How the run ended: the metadata ``rsltrace:result``; empty for an interrupted run."""

@@ -555,3 +555,21 @@ def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
     simulate(Short, duration=1)
     assert len(alive) == 100
     assert max(alive) <= 3
+
+
+def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(
+    simulate: Any,
+) -> None:
+    def main() -> None:
+        rclpy.init()
+        node = Node("late")
+        node.create_timer(0.2, lambda: None)
+        thread = threading.Thread(target=rclpy.spin, args=(node,))
+        thread.start()  # before it runs, main has blocked, and its event has ended
+        thread.join()
+
+    recorded = simulate(main_spec(main), duration=1)
+    with recorded.trace() as trace:
+        timers = {e.entity for e in recorded.events() if e.kind.label == "timer"}
+        assert [trace.entities[number].kind.label for number in timers] == ["timer"]
+        assert [trace.entities[trace.entities[n].node].name for n in timers] == ["/late"]
