@@ -29,6 +29,7 @@ from rsltrace.errors import UnsupportedError
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
+from rsltrace.ros.waits_for import called_service
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -161,7 +162,7 @@ class Wait:
                 "callback keeps a mutually exclusive group busy, so give the client, timer or "
                 "subscription it waits for a callback group of its own"
             )
-        what = self.core.called_service(self.stack.gr_frame) or self.what
+        what = called_service(self.core, self.stack.gr_frame) or self.what
         return f"{self.describe()} waits for {what}{hint}{where}"
 
 

@@ -14,22 +14,21 @@ import uuid
 from _thread import get_ident
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.errors import EXIT_RUN, NodeError, OutputError, RsltraceError, RunError
+from rsltrace.errors import EXIT_RUN, RunError
 from rsltrace.loop.loop import NOTHING_LEFT, Dispatchable, EventLoop
 from rsltrace.loop.stop import Stop
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.finding import Policy
-from rsltrace.model.stamp import format_seconds
 from rsltrace.ros.blocking import RunEnded
-from rsltrace.ros.failure import end_child, exit_status, text_of, user_traceback
-from rsltrace.ros.missing import hint_for
-from rsltrace.ros.program import Program, failure_of
+from rsltrace.ros.failing import failed
+from rsltrace.ros.outside_event import OutsideEvent
+from rsltrace.ros.program import Program
 from rsltrace.ros.waitables import OWN_WAITABLES, sync_waitables
+from rsltrace.ros.waits_for import who_waits
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
@@ -49,32 +48,37 @@ if TYPE_CHECKING:
     from rsltrace.ros.tasks import TaskRun
     from rsltrace.ros.threads import SimThread
 
-_RAISED = int(EventFlag.RAISED)
-_LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))
-_ERROR = 40
 _pack_value = struct.Struct("<Bq").pack
 
 
 class Core:
     """The state of one simulated ROS world.
 
-    ``recorder`` is None in a run that records nothing, ``network`` in one without delay models.
-    ``current_*`` describe the event under way; what it sends leaves ``busy_ns`` later.
+    ``recorder`` is None in a run that records nothing, ``network`` in one without delay models,
+    ``clocks`` where all of them are right. What the event under way sends leaves ``busy_ns`` later
+    (execution times), and its executor is busy for ``took_ns``. A ``quiet`` event is recorded only
+    if something comes of it. ``fed`` says that messages come from outside (bags).
     """
 
     def __init__(self, loop: EventLoop, *, base_dir: Path, seed: int = 0) -> None:
+        # The run.
         self.loop = loop
         self.seed = seed
-        self.process = os.getpid()
-        self.thread = get_ident()
-        self.recorder: Recorder | None = None
         self.base_dir = base_dir
         self.graph: Graph
         self.executor: SimExecutor
+        self.logs: Logs
         self.network: Network | None = None
         self.clocks: NodeClocks | None = None
-        self.busy_ns = 0
-        self.took_ns = 0
+        self.default_policy = Policy()
+        self.states: dict[str, NodeState] = {}
+        self.notes: list[str] = []
+
+        # The process: what happens in others, or in real threads, is not simulated.
+        self.process = os.getpid()
+        self.thread = get_ident()
+
+        # The event under way, and what is done when it is over.
         self.current_node: NodeHandle | None = None
         self.current_entity = 0
         self.current_handle: Dispatchable | None = None
@@ -84,50 +88,59 @@ class Core:
         self.input_hash = 0
         self.flags = 0
         self.on_end: Callable[[], None] | None = None
+        self.quiet = False
+        self.busy_ns = 0
+        self.took_ns = 0
+        self.raised: BaseException | None = None
+
+        # The trace: what has been created in this event, and what still has no owner.
+        self.recorder: Recorder | None = None
+        self.unrecorded = 0
+        self.pending: list[EntityHandle | Program | SimThread] = []
+        self.unowned: list[EntityHandle | Program | SimThread] = []
+        self._entity_count = 0
+        self._channels: dict[tuple[str, str], int] = {}
+        self._uuids: dict[str, random.Random] = {}
+        self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
+
+        # Blocked calls, and the stacks that run the loop meanwhile.
         self.blocked: dict[Wait, None] = {}
+        self.main: greenlet | None = None
         self.runners: list[greenlet] = []
         self.runner_maker: greenlet | None = None
-        self.main: greenlet | None = None
         self.runner_error: BaseException | None = None
-        self.ending = False
-        self.ended_after: int | None = None
-        self.shutdown_ns = 0
-        self.refused = 0
-        self.stuck: list[str] = []
-        self.error: RunError | None = None
-        self.logs: Logs
-        self.main_context: ContextHandle | None = None
-        self.node_arguments: list[RosArguments] = []
-        self.log_exceptions = False
-        self.host = Program(self)
-        self.program = self.host
-        self.programs: list[Program] = []
-        self.notes: list[str] = []
-        self.closing = False
-        self.grace_ns = 0
-        self.importing = False
-        self.threads: dict[SimThread, None] = {}
-        self.thread_stacks: dict[greenlet, SimThread] = {}
-        self.thread_count = 0
-        self.fed = False
+        self._parked: dict[object, list[Callable[[], None]]] = {}
         self.arrivals = 0
-        self.quiet = False
-        self.unrecorded = 0
-        self.raised: BaseException | None = None
+
+        # Suspended coroutines, and those that are looked at when nothing else is ready.
         self.suspended: dict[TaskRun, None] = {}
         self.polled: list[TaskRun] = []
         self.polls = 0
         self.polling = False
         self.poll_stage: tuple[int, int] | None = None
-        self.pending: list[EntityHandle | Program | SimThread] = []
-        self.unowned: list[EntityHandle | Program | SimThread] = []
-        self.default_policy = Policy()
-        self.states: dict[str, NodeState] = {}
-        self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
-        self._entity_count = 0
-        self._parked: dict[object, list[Callable[[], None]]] = {}
-        self._channels: dict[str, int] = {}
-        self._uuids: dict[str, random.Random] = {}
+
+        # What is being constructed, and programs and threads of user code.
+        self.node_arguments: list[RosArguments] = []
+        self.log_exceptions = False
+        self.importing = False
+        self.main_context: ContextHandle | None = None
+        self.host = Program(self)
+        self.program = self.host
+        self.programs: list[Program] = []
+        self.threads: dict[SimThread, None] = {}
+        self.thread_stacks: dict[greenlet, SimThread] = {}
+        self.thread_count = 0
+
+        # The end of the run.
+        self.error: RunError | None = None
+        self.stuck: list[str] = []
+        self.ending = False
+        self.ended_after: int | None = None
+        self.closing = False
+        self.grace_ns = 0
+        self.shutdown_ns = 0
+        self.refused = 0
+        self.fed = False
 
     # -- the hot path ------------------------------------------------------------------------
 
@@ -154,7 +167,7 @@ class Core:
         try:
             callback(*args)
         except BaseException as error:
-            self._failed(error, handle)
+            failed(self, error, handle)
         self.end_event()
         if self.on_end is not None:
             on_end, self.on_end = self.on_end, None
@@ -252,13 +265,7 @@ class Core:
         """Remember who still waits if the run has ended because nothing can happen any more."""
         stopped = self.loop.stopped
         if stopped is not None and stopped.reason == NOTHING_LEFT and not self.stuck:
-            self.stuck = self.who_waits()
-
-    def who_waits(self) -> list[str]:
-        """Say of every suspended coroutine and blocked call what it waits for."""
-        runs = [run.waits_for() for run in self.suspended if not run.task.cancelled()]
-        runs += [blocked.waits_for() for blocked in self.blocked if not blocked.is_patient()]
-        return runs + [f"(before: {note})" for note in self.notes] if runs else []
+            self.stuck = who_waits(self)
 
     @property
     def entry(self) -> Entry | None:
@@ -333,13 +340,13 @@ class Core:
         recorder = self.recorder
         if recorder is None or not recorder.keep_payload(topic):
             return -1
-        channel = self._channels.get(topic)
+        channel = self._channels.get((topic, type_name))
         if channel is None:
             text, type_hash = schema()
             channel = recorder.writer.add_channel(
                 topic, type_name, text, qos_yaml=qos_yaml, type_hash=type_hash
             )
-            self._channels[topic] = channel
+            self._channels[topic, type_name] = channel
         return channel
 
     # -- outputs other than messages -----------------------------------------------------------
@@ -350,38 +357,6 @@ class Core:
             self.unrecorded += 1
             return 0
         return self.recorder.output(kind, entity, hash64(_pack_value(operation, value)))
-
-    def graph_name_of_future(self, future: object) -> str:
-        """Say what would complete a future: the service it is a request to, if it is one."""
-        if future is None:
-            return "something that is not an rclpy Future"
-        for client in self.graph.all_clients():
-            if future in getattr(client.wrapper, "_pending_requests", {}).values():
-                if client.queue:
-                    return (
-                        f"the response of {client.service}, which has arrived, but its client "
-                        "shares a mutually exclusive callback group with this callback, which "
-                        "keeps the group busy; give the client a callback group of its own"
-                    )
-                servers = len(self.graph.services(client.service))
-                return f"the response of {client.service} ({servers} servers)"
-        for action in (action for node in self.graph.nodes for action in node.actions):
-            what: str = action.waits_for(future)
-            if what:
-                return what
-        return "a Future that nobody completes"
-
-    def called_service(self, frame: FrameType | None) -> str:
-        """Say which service a stack waits for in ``Client.call``; empty if it is not there."""
-        from rclpy.client import Client
-
-        while frame is not None:
-            if frame.f_code is Client.call.__code__:
-                service = frame.f_locals["self"].handle.service
-                servers = len(self.graph.services(service))
-                return f"the response to a service call, of {service} ({servers} servers)"
-            frame = frame.f_back
-        return ""
 
     # -- callback groups -----------------------------------------------------------------------
 
@@ -400,69 +375,11 @@ class Core:
         """Return how many events wait until ``group`` is free."""
         return len(self._parked.get(group, ()))
 
-    # -- failures ------------------------------------------------------------------------------
-
-    def _failed(self, error: BaseException, handle: Dispatchable) -> None:
-        if isinstance(error, RunEnded):
-            return
-        if isinstance(error, OutputError):
-            raise error  # the trace cannot be written: no event may be lost quietly
-        if os.getpid() != self.process:
-            end_child(error)
-        self.flags |= _RAISED
-        name = self.current_node.fully_qualified_name if self.current_node else ""
-        label = handle.describe()
-        stamp_ns = self.loop.now_ns
-        text = user_traceback(error)
-        said = text_of(error)
-        if self.recorder is not None:
-            content = f"{type(error).__qualname__}\0{said}"
-            self.recorder.detail(
-                OutputKind.EXCEPTION, self.current_entity, stamp_ns, text, hash64(content.encode())
-            )
-        if self._belongs_to_executor(handle) and not self._goes_on(error):
-            # It comes out of the spin of whoever runs the callback; what becomes of it is theirs.
-            self.raised = error
-            self.program.failures.append((error, label, stamp_ns, text, name))
-            return
-        if isinstance(error, SystemExit):
-            reason = f"{label} raised SystemExit"
-            if error.code is not None and not isinstance(error.code, int):
-                reason += f": {said}"  # what Python would print
-            self.loop.stop(Stop(reason, exit_status(error)))
-            return
-        if isinstance(error, KeyboardInterrupt):
-            self.loop.stop(Stop("interrupted", 130))
-            return
-        if self._goes_on(error):
-            assert self.current_node is not None
-            message = f"{label} raised {type(error).__qualname__}: {said}"
-            self.logs.log(_ERROR, self.current_node.logger_name(), message, "", "", 0)
-            return
-        where = f"{label}, at simulated time {format_seconds(stamp_ns)} s"
-        earlier = failure_of(self.program, error)
-        if earlier is not None:
-            self.error = earlier
-        elif isinstance(error, RsltraceError):
-            # Raised by the middleware itself: the message says what to do, this says where.
-            failure = type(error).__new__(type(error))
-            failure.__dict__.update(error.__dict__)
-            Exception.__init__(failure, f"{said}\n  in {where}")
-            self.error = failure if isinstance(failure, RunError) else RunError(str(failure))
-        else:
-            self.error = NodeError(
-                f"{where} raised {type(error).__qualname__}: {said}{hint_for(error)}",
-                node=name,
-                entity=label,
-                stamp_ns=stamp_ns,
-                traceback_text=text,
-            )
-        self.error.__cause__ = error
-        self.loop.stop(Stop(f"{label} raised {type(error).__qualname__}", self.error.exit_code))
+    # -- who runs ------------------------------------------------------------------------------
 
     def outside(self, describe: Callable[[], str], entry: Entry | None) -> Dispatchable:
         """Return what stands for an event that is no entity's callback."""
-        return _Outside(describe, entry)
+        return OutsideEvent(describe, entry)
 
     def is_thread(self, stack: greenlet) -> bool:
         """Return whether a stack is that of a thread which user code has started."""
@@ -474,26 +391,7 @@ class Core:
 
     def in_callback(self) -> bool:
         """Return whether the event under way is a callback's, not a main's or a thread's."""
-        return not isinstance(self.current_handle, _Outside)
-
-    def _belongs_to_executor(self, handle: Any) -> bool:
-        """Say whether an event was run by an executor of the user's own."""
-        if isinstance(handle, _Outside):
-            return False
-        mailbox = getattr(handle, "mailbox", None)
-        if mailbox is None and getattr(handle, "node", None) is not None:
-            mailbox = handle.node.mailbox
-        return mailbox is not None
-
-    def _goes_on(self, error: BaseException) -> bool:
-        """Say whether an exception is only logged: of a callback whose job entry says so.
-
-        What rsltrace itself refuses always ends the run; so does a node that was never made.
-        """
-        node = self.current_node
-        if node is None or not node.log_exceptions or self.kind in _LIFE:
-            return False
-        return isinstance(error, Exception) and not isinstance(error, RsltraceError)
+        return not isinstance(self.current_handle, OutsideEvent)
 
     def run_outside(
         self,
@@ -506,7 +404,9 @@ class Core:
         entry: Entry | None = None,
     ) -> None:
         """Run an event that is no entity's callback: construction, shutdown, a clock jump."""
-        self.execute(_Outside(describe, entry), entity, node, kind, callback, (), NO_EVENT, 0, 0)
+        self.execute(
+            OutsideEvent(describe, entry), entity, node, kind, callback, (), NO_EVENT, 0, 0
+        )
 
 
 def _both(
@@ -529,14 +429,3 @@ def _handles(node: NodeHandle) -> Iterator[Any]:
             handle = getattr(waitable, name, None)
             if handle is not None:
                 yield from getattr(handle, "parts", [handle])
-
-
-class _Outside:
-    """A nameable stand-in for an entity in ``run_outside``."""
-
-    def __init__(self, describe: Callable[[], str], entry: Entry | None) -> None:
-        self.describe = describe
-        self.entry = entry
-
-    def dispatch(self) -> None:
-        raise AssertionError("never in a queue")

@@ -9,10 +9,51 @@ import contextlib
 import os
 import sys
 import traceback
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
 
+from rsltrace.errors import NodeError
+from rsltrace.model.stamp import format_seconds
+from rsltrace.ros.missing import hint_for
+
 _PACKAGE = str(Path(__file__).resolve().parent.parent)
+
+
+@dataclass(frozen=True, slots=True)
+class Raised:
+    """An exception that came out of an event.
+
+    ``label`` names the event, ``node`` is the node's full name or empty, ``stamp_ns`` the simulated
+    time, ``traceback`` the user's frames and ``said`` the exception's own words as text.
+    """
+
+    error: BaseException
+    label: str
+    node: str
+    stamp_ns: int
+    traceback: str
+    said: str
+
+    @property
+    def kind(self) -> str:
+        """The name of the exception's class."""
+        return type(self.error).__qualname__
+
+    @property
+    def where(self) -> str:
+        """The event and its time, for an error message."""
+        return f"{self.label}, at simulated time {format_seconds(self.stamp_ns)} s"
+
+    def as_error(self) -> NodeError:
+        """Return the error with which the run ends because of it."""
+        return NodeError(
+            f"{self.where} raised {self.kind}: {self.said}{hint_for(self.error)}",
+            node=self.node,
+            entity=self.label,
+            stamp_ns=self.stamp_ns,
+            traceback_text=self.traceback,
+        )
 
 
 def exit_status(error: SystemExit) -> int:

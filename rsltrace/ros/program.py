@@ -8,16 +8,14 @@ finds its own. The nodes that the job itself constructs share one program, the h
 from __future__ import annotations
 
 import sys
+from collections import deque
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.errors import NodeError
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind
-from rsltrace.model.stamp import format_seconds
-from rsltrace.ros.failure import text_of
 
 if TYPE_CHECKING:
     from rsltrace.ros.blocking import Wait
@@ -25,9 +23,10 @@ if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.entry import Entry
     from rsltrace.ros.exit_handlers import Handler
+    from rsltrace.ros.failure import Raised
 
-# What a callback raised, which event that was, its stamp (ns), its traceback and its node.
-Failure = tuple[BaseException, str, int, str, str]
+_FAILURES_MAX = 16
+"""A main may go on after each of a million exceptions; what ends it is one of the last."""
 
 
 class Program:
@@ -50,7 +49,8 @@ class Program:
         self.entity_id = 0
         self.announced = True
         self.contexts: list[ContextHandle] = []
-        self.failures: list[Failure] = []
+        self.failures: deque[Raised] = deque(maxlen=_FAILURES_MAX)
+        """What callbacks have raised out of a spin of this program, most recent last."""
         self.exit_handlers: list[Handler] = []
         self.stack: greenlet | None = None
         self.begun = False
@@ -133,21 +133,6 @@ class Program:
     def blocked(self) -> Wait | None:
         """Return the call in which main is blocked, if it is."""
         return next((w for w in self.core.blocked if w.stack is self.stack), None)
-
-
-def failure_of(program: Program, error: BaseException) -> NodeError | None:
-    """Return the run's error for what came out of main, if a callback had raised it."""
-    for raised, label, stamp_ns, text, node in program.failures:
-        if raised is error:
-            return NodeError(
-                f"{label}, at simulated time {format_seconds(stamp_ns)} s raised "
-                f"{type(error).__qualname__}: {text_of(error)}",
-                node=node,
-                entity=label,
-                stamp_ns=stamp_ns,
-                traceback_text=text,
-            )
-    return None
 
 
 @lru_cache(maxsize=1)

@@ -15,6 +15,7 @@ from rsltrace.ros import groups
 from rsltrace.ros.blocking import POLL_NS, Wait, lose_patience, set_aside, wait
 from rsltrace.ros.groups import is_busy
 from rsltrace.ros.mailbox import Mailbox
+from rsltrace.ros.waits_for import awaited
 
 if TYPE_CHECKING:
     from rsltrace.loop.loop import Dispatchable
@@ -190,7 +191,7 @@ class _Awaited:
         self._future = getattr(condition, "__self__", None)
 
     def __str__(self) -> str:
-        return f"a future to be completed: {self._core.graph_name_of_future(self._future)}"
+        return f"a future to be completed: {awaited(self._core, self._future)}"
 
 
 def _is_stale(item: Any) -> bool:

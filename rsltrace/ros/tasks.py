@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
 from rsltrace.ros.mailbox import executor_of
+from rsltrace.ros.waits_for import awaited
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -88,7 +89,7 @@ class TaskRun:
         """Say what a suspended task waits for, and where in the code."""
         frame = getattr(self.task._handler, "cr_frame", None)
         where = f" at {frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
-        return f"{self.label()} waits{where} for {self.core.graph_name_of_future(self._awaited)}"
+        return f"{self.label()} waits{where} for {awaited(self.core, self._awaited)}"
 
     def _step(self) -> None:
         core = self.core

@@ -34,6 +34,7 @@ from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
 from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
 from rsltrace.ros.threads import cooperative_threads
+from rsltrace.ros.waits_for import who_waits
 
 
 class World:
@@ -215,7 +216,7 @@ class World:
 
     def waiting(self) -> str:
         """Say who waits for what, where nothing can happen any more."""
-        return _deadlock(self.core.who_waits())
+        return _deadlock(who_waits(self.core))
 
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""

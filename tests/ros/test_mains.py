@@ -527,3 +527,38 @@ def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
         job={"execution": {"nodes": {"/slow": {"constant": "0.5s"}}}},
     )
     assert log == [("a", 1.0), ("r", 1.25), ("b", 1.5), ("a", 2.0)]
+
+
+def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
+    from rsltrace.ros.program import _FAILURES_MAX, Program
+
+    kept: list[int] = []
+
+    class Faulty(Node):
+        def __init__(self) -> None:
+            super().__init__("faulty")
+            self.count = 0
+            self.create_timer(0.1, self.tick)
+
+        def tick(self) -> None:
+            self.count += 1
+            raise KeyError(self.count)
+
+    def main() -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        rclpy.init()
+        executor = SingleThreadedExecutor()
+        executor.add_node(Faulty())
+        for number in range(3 * _FAILURES_MAX):
+            with pytest.raises(KeyError, match=str(number + 1)):
+                executor.spin_once()
+        import gc
+
+        held = [each for each in gc.get_objects() if isinstance(each, Program)]
+        kept.extend(len(each.failures) for each in held if each.entry is not None)
+        rclpy.shutdown()
+
+    simulate(NodeSpec(main=main))
+    assert kept == [_FAILURES_MAX]

@@ -11,7 +11,9 @@ from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 from std_msgs.msg import Float32, String, UInt64
 
+from rsltrace import Trace
 from rsltrace.errors import RunError
+from rsltrace.model.event import OutputKind
 
 pytestmark = pytest.mark.ros
 
@@ -220,3 +222,34 @@ def test_destroyed_endpoints_are_quiet(simulate: Any) -> None:
 
     simulate(Short, duration=4)
     assert seen == [1, 1, 2]
+
+
+def test_a_topic_may_have_another_type_later(simulate: Any) -> None:
+    """Each type has a channel of its own in the trace, and each message is in its type's."""
+
+    class Talker(Node):
+        def __init__(self) -> None:
+            super().__init__("talker")
+            self.publisher = self.create_publisher(String, "x", 10)
+            self.create_timer(1.0, self.tick)
+
+        def tick(self) -> None:
+            if self.publisher.msg_type is String:
+                self.publisher.publish(String(data="first"))
+                self.destroy_publisher(self.publisher)
+                self.publisher = self.create_publisher(UInt64, "x", 10)
+            else:
+                self.publisher.publish(UInt64(data=7))
+
+    path = simulate(Talker, duration=2).path
+    with Trace.open(path) as trace:
+        sent = [
+            output
+            for index in range(trace.event_count)
+            for output in trace.outputs_of(index)
+            if output.kind is OutputKind.MESSAGE and trace.entity(output.entity).name == "/x"
+        ]
+        said = [
+            trace.decode(trace.channel_of(output), trace.payload(output)[2]).data for output in sent
+        ]
+    assert said == ["first", 7]
