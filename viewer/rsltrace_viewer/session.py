@@ -317,7 +317,7 @@ class Session:
             parts.append(f"exit code {reason}")
         parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
         nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
-        parts.append(f"{nodes} nodes")
+        parts.append(f"{nodes} node{'' if nodes == 1 else 's'}")
         if self.b is None:
             parts.append(f"digest {trace.digest}")
         return "  ".join(parts)

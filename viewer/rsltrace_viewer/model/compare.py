@@ -197,6 +197,7 @@ def _sign(item: Item, stretch: Stretch) -> Sign:
     a, b = stretch.rows_a, stretch.rows_b
     i, j = item.a - a.first, item.b - b.first
     did_the_same = (a.input[i], a.content[i], a.flags[i]) == (b.input[j], b.content[j], b.flags[j])
+    did_the_same = did_the_same and a.state[i] == b.state[j]
     return Sign.MOVED if did_the_same else Sign.DIFFERS
 
 

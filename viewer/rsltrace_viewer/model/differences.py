@@ -21,6 +21,7 @@ from rsltrace_viewer.model.compare import Comparison
 from rsltrace_viewer.model.inspector import Effects, event_link, inspect
 from rsltrace_viewer.model.lines import Line, Openness, Role
 from rsltrace_viewer.model.run import KIND_WORDS
+from rsltrace_viewer.model.states import differing_call_lines, differing_state_lines
 from rsltrace_viewer.model.timeline import Sign
 
 _SAYS = {
@@ -47,7 +48,7 @@ def pair_lines(
         if first:  # the reason comes first: in a small terminal little else fits
             lines += _why(comparison)
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
-            lines += _difference_lines(comparison, a, b, openness)
+            lines += _difference_lines(comparison, a, b, openness, first=first)
         if first and comparison.diff is not None and comparison.diff.divergences:
             lines += chain_lines(comparison, comparison.diff.divergences[0])
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
@@ -152,20 +153,22 @@ def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line
 
 
 def _difference_lines(
-    comparison: Comparison, a: int | None, b: int | None, openness: Openness
+    comparison: Comparison, a: int | None, b: int | None, openness: Openness, *, first: bool
 ) -> Iterator[Line]:
-    run_a, run_b = comparison.diff_run_a, comparison.diff_run_b
-    found = message_differences(
-        run_a,
-        run_b,
-        Viewer(run_a).view(a) if a is not None else None,
-        Viewer(run_b).view(b) if b is not None else None,
-        DiffOptions(),
-    )
-    if not found:
+    runs = comparison.diff_run_a, comparison.diff_run_b
+    view_a = Viewer(runs[0]).view(a) if a is not None else None
+    view_b = Viewer(runs[1]).view(b) if b is not None else None
+    found = message_differences(*runs, view_a, view_b, DiffOptions())
+    divergences = comparison.diff.divergences if first and comparison.diff is not None else ()
+    known = divergences[0] if divergences else None
+    beside = list(differing_state_lines(runs, (view_a, view_b), known, openness))
+    if known is not None:
+        beside += differing_call_lines(known.calls)
+    if not found and not beside:
         yield Line(0, "messages", "the same in both", Role.SECTION, "diff")
     for place, message in enumerate(found):
         yield from message_difference_lines(message, f"diff.{place}", openness)
+    yield from beside
 
 
 def message_difference_lines(

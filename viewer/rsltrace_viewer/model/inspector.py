@@ -24,6 +24,7 @@ from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.model.lines import Line, Openness, Role
 from rsltrace_viewer.model.parameters import parameters_at
 from rsltrace_viewer.model.run import KIND_WORDS, Run
+from rsltrace_viewer.model.states import state_lines
 from rsltrace_viewer.model.text import LEVEL_WARN, log_of, output_text, outputs_text
 from rsltrace_viewer.model.timeline import entity_of, node_of
 from rsltrace_viewer.model.tree import bytes_lines, message_lines, preview
@@ -60,6 +61,7 @@ def inspect(run: Run, index: int, openness: Openness, effects: Effects | None = 
         except TraceError as error:
             lines.append(Line(0, "", printable(str(error)), Role.ERROR, f"error.{make.__name__}"))
     lines += _parameter_lines(run, event, openness)
+    lines += state_lines(run, event, openness)
     lines += _detail_lines(run, event, openness)
     return lines
 

@@ -17,7 +17,15 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.diff.model import CauseStep, Diff, Divergence, EventView, MessageDifference
+from rsltrace.diff.model import (
+    CallDifference,
+    CauseStep,
+    Diff,
+    Divergence,
+    EventView,
+    MessageDifference,
+    StateDifference,
+)
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists, make_chunk
@@ -164,6 +172,7 @@ def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str
     for message in divergence.messages:
         yield ""
         yield from _message(message)
+    yield from _beside(divergence)
     if divergence.chain:
         yield ""
         yield "### From the root"
@@ -204,6 +213,22 @@ def _message(message: MessageDifference) -> Iterator[str]:
         if more:
             yield f"{more} more"
         yield "```"
+
+
+def _beside(divergence: Divergence) -> Iterator[str]:
+    """Yield what differs beside the messages: the node's state, answers that came from outside."""
+    told: list[tuple[str, str, StateDifference | CallDifference]]
+    told = [("State of the node after it", one.path, one) for one in divergence.state]
+    told += [
+        (f"Call from outside ({_text(call.source)}, at {_text(call.where)})", call.call, call)
+        for call in divergence.calls
+        if call.a != call.b
+    ]
+    for number, (title, name, one) in enumerate(told[:_FIELDS_MAX]):
+        if not number or told[number - 1][0] != title:
+            yield from ("", f"**{title}**", "")
+        a, b = ("—" if v is None else shortened(v, _VALUE_WIDTH) for v in (one.a, one.b))
+        yield from ("```", _code(f"{name}  {a}  |  {b}"), "```")
 
 
 def _step(step: CauseStep) -> str:
