@@ -19,6 +19,9 @@ _LINES_MAX = 6
 _USER, _STANDARD, _LIBRARY, _OURS, _IMPORT = range(5)
 _CALLS_BACK = (os.path.join("ros", "core.py"), f"{os.sep}rclpy{os.sep}")
 """Those of our files that call callbacks."""
+_THREADS = os.path.join(_HERE, "ros", "threads.py")
+_STANDS_IN = os.path.join(_HERE, "ros", "event_loops.py")
+"""A part of asyncio, as far as it matters who called whom."""
 _kinds: dict[str, int] = {}
 
 
@@ -27,7 +30,7 @@ def _kind_of(file: str) -> int:
     if kind is None:
         if file.startswith("<frozen importlib"):
             kind = _IMPORT
-        elif file.startswith(_GUARD):
+        elif file.startswith(_GUARD) or file == _STANDS_IN:
             kind = _STANDARD  # a redirected function: its caller counts
         elif file.startswith(_HERE) or any(
             f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
@@ -53,9 +56,10 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
 
     User code is what lies outside of Python and of the installed packages, or in ``packages``
     (where installed nodes are), and a callback in a library. What a library does while it is
-    imported is not the user's doing, nor is what rsltrace and rclpy do for themselves.
+    imported is not the user's doing, nor is what rsltrace and rclpy do for themselves. A thread
+    is the doing of whoever started it, even if it runs nothing but Python's own code.
     """
-    library = None
+    library = standard = None
     while frame is not None:
         file = frame.f_code.co_filename
         kind = _kind_of(file)
@@ -63,6 +67,10 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
             return frame
         if kind == _LIBRARY:
             library = frame
+        elif kind == _STANDARD:
+            standard = frame
+        elif file == _THREADS:
+            return library or standard
         elif kind == _OURS:
             return library if any(part in file for part in _CALLS_BACK) else None
         elif kind == _IMPORT:

@@ -44,6 +44,8 @@ _REAL_NS = {
     for name in ("monotonic", "perf_counter", "process_time", "thread_time")
 }
 
+_monotonic_ns = _REAL_NS["monotonic"]
+
 
 def clock_call(
     guard: Guard,
@@ -53,8 +55,15 @@ def clock_call(
     real: Callable[[], Any],
 ) -> Any:
     """Answer the reading of a clock as the job says."""
-    if frame.f_globals.get("__name__") in REAL_TIME_MODULES:
-        return real()
+    module = frame.f_globals.get("__name__")
+    if module in REAL_TIME_MODULES:
+        if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
+            return real()
+        if guard.context.is_aside():
+            return virtual(guard.context.now_ns())
+        return virtual(
+            guard.recorded(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame)
+        )
     mode = guard.mode(Source.CLOCK, frame)
     if mode is Mode.VIRTUAL:
         guard.clock_read()

@@ -19,7 +19,9 @@ from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import module_of, stack_of, user_frame
-from rsltrace.guard.outside import Outside, decoded
+from rsltrace.guard.descriptors import Descriptors
+from rsltrace.guard.outside import Outside, answered, decoded, numbered
+from rsltrace.guard.pace import Pace
 from rsltrace.guard.redirect import copy_of
 from rsltrace.guard.streams import Streams
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
@@ -52,6 +54,12 @@ class Context(Protocol):
     def pass_time(self, for_ns: int) -> None:
         """Let simulated time pass, if whoever runs can wait."""
 
+    def is_aside(self) -> bool:
+        """Return whether others can go on while whoever runs waits for what is outside."""
+
+    def step(self, for_ns: int) -> None:
+        """Let simulated time pass while whoever runs waits for what is outside."""
+
 
 class Guard:
     """State of one run. ``on_finding`` takes what is worth a line in the trace.
@@ -74,6 +82,8 @@ class Guard:
         self.counts: Counter[tuple[Source, Mode, str, str]] = Counter()
         self.streams = Streams(seed)
         self.outside: Outside = Outside()
+        self.descriptors = Descriptors()
+        self.pace = Pace()
         self._policy = policy
         self._thread = _thread_id()
         self._process = _process_id()
@@ -136,14 +146,23 @@ class Guard:
                     f"{ADVICE[source]}"
                 )
 
-    def recorded(self, source: Source, call: str, real: Callable[[], Any], frame: FrameType) -> Any:
+    def recorded(
+        self, source: Source, call: str, real: Callable[[], Any], frame: FrameType, of: int = 0
+    ) -> Any:
         """Return the answer to a call from outside; the trace keeps it for a re-run.
+
+        ``of`` is the number of the socket or descriptor asked, if it has one.
 
         :raises OSError: if that is what was answered.
         """
-        with engage(None):
-            text = self.outside.answer(self.context.node(), call, real)
-        self.found(source, Mode.RECORD, call, text, frame)
+        if self.outside.replays:
+            text = self.outside.next_kept(self.context.node(), call, of).text
+            assert text is not None or of
+            text = text or "null"
+        else:
+            with engage(None):
+                text = answered(real)
+        self.found(source, Mode.RECORD, call, numbered(of, 0, text) if of else text, frame)
         return decoded(text)
 
     def watched(self, source: Source, call: str, value: object, frame: FrameType) -> None:
@@ -176,7 +195,7 @@ ADVICE = {
     Source.FILE: "read the file before the run, or write 'file: record'",
     Source.ENVIRONMENT: "make it a parameter of the node",
     Source.THREAD: "use timers, tasks or callback groups",
-    Source.PROCESS: "do it before the run, or in a node of its own outside",
+    Source.PROCESS: "do it before the run, or write 'process: record'",
     Source.SOCKET: "record what comes from outside into a bag, or write 'socket: record'",
     Source.ADDRESS: "use a name or a number of your own instead of an object's address",
     Source.ORDER: "sort it, or use a dict or a list",

@@ -9,8 +9,11 @@ from __future__ import annotations
 import base64
 import binascii
 import json
+import socket
+import ssl
 from collections import deque
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Any
 
 from rsltrace.errors import GuardError
@@ -32,15 +35,38 @@ _ERRORS = {
         TimeoutError,
         BlockingIOError,
         InterruptedError,
+        ChildProcessError,
+        ProcessLookupError,
+        socket.gaierror,
+        socket.herror,
+        ssl.SSLError,
+        ssl.SSLZeroReturnError,
+        ssl.SSLWantReadError,
+        ssl.SSLWantWriteError,
+        ssl.SSLSyscallError,
+        ssl.SSLEOFError,
+        ssl.SSLCertVerificationError,
     )
 }
+_TLS_DETAILS = ("reason", "library", "verify_code", "verify_message")
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """What an earlier run has of one call: the answer, and how many steps it took to come.
+
+    ``text`` is None if the run ended before the answer came.
+    """
+
+    text: str | None
+    steps: int
 
 
 class Outside:
     """Answers of recorded sources: the real ones, or (in a re-run) those of an earlier run."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[str, str], deque[str]] | None = None
+        self._kept: dict[tuple[str, str, int], deque[Kept]] | None = None
         self._trace = ""
 
     def replay(self, findings: Iterable[Finding], trace: str) -> None:
@@ -48,29 +74,66 @@ class Outside:
         self._kept, self._trace = {}, trace
         for finding in findings:
             if finding.mode is Mode.RECORD:
-                key = finding.node, finding.call
-                self._kept.setdefault(key, deque()).append(finding.value)
+                of, kept = _parsed(finding.value)
+                self._kept.setdefault((finding.node, finding.call, of), deque()).append(kept)
 
-    def answer(self, node: str, call: str, real: Callable[[], Any]) -> str:
-        """Return the answer to a call as text.
+    @property
+    def replays(self) -> bool:
+        """Whether the answers are those of an earlier run."""
+        return self._kept is not None
 
-        :raises GuardError: if the earlier run has no further answer to this call.
+    def next_kept(self, node: str, call: str, of: int = 0) -> Kept:
+        """Return the earlier run's next answer to a call, to that object's if it has a number.
+
+        :raises GuardError: if there is no further one.
         """
-        if self._kept is not None:
-            kept = self._kept.get((node, call))
-            if kept:
-                return kept.popleft()
-            raise GuardError(
-                f"{self._trace} has no answer to {call} of {node or 'the run'} any more: this run "
-                "asks more than the recorded one did, so its code, job or data is another; compare "
-                "the two with rsltrace diff"
-            )
-        try:
-            return encoded(real())
-        except OSError as error:
-            kind = type(error).__name__
-            kind = kind if kind in _ERRORS else "OSError"
-            return json.dumps({"error": [kind, error.errno, error.strerror or str(error)]})
+        assert self._kept is not None
+        kept = self._kept.get((node, call, of)) or self._kept.get((node, call, 0))
+        if kept:
+            return kept.popleft()
+        raise GuardError(
+            f"{self._trace} has no answer to {call} of {node or 'the run'} any more: this run "
+            "asks more than the recorded one did, so its code, job or data is another; compare "
+            "the two with rsltrace diff"
+        )
+
+
+def answered(real: Callable[[], Any]) -> str:
+    """Return what a real call answers as text, be it an error of the operating system."""
+    try:
+        return encoded(real())
+    except OSError as error:
+        return _error_text(error)
+
+
+def numbered(of: int, steps: int, text: str | None) -> str:
+    """Return a value for the trace that says whose answer it is and how long it took to come."""
+    fields: dict[str, Any] = {"of": of}
+    if steps:
+        fields["waited"] = steps
+    if text is not None:
+        fields["then"] = json.loads(text)
+    return json.dumps(fields, ensure_ascii=False)
+
+
+def _parsed(value: str) -> tuple[int, Kept]:
+    if not value.startswith('{"of"'):
+        return 0, Kept(value, 0)
+    try:
+        fields = json.loads(value)
+        then = json.dumps(fields["then"], ensure_ascii=False) if "then" in fields else None
+        return int(fields["of"]), Kept(then, int(fields.get("waited", 0)))
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise GuardError(f"a recorded answer cannot be read: {error}") from error
+
+
+def _error_text(error: OSError) -> str:
+    kind = type(error).__name__
+    said = [kind if kind in _ERRORS else "OSError", error.errno, error.strerror or str(error)]
+    if isinstance(error, ssl.SSLError):
+        details = {name: _plain(getattr(error, name, None)) for name in _TLS_DETAILS}
+        return json.dumps({"error": [*said, details]})
+    return json.dumps({"error": said})
 
 
 def encoded(value: Any) -> str:
@@ -107,8 +170,12 @@ def _value(plain: Any) -> Any:
         return [_value(item) for item in plain]
     if isinstance(plain, dict):
         if "error" in plain:
-            kind, number, text = plain["error"]
-            raise _ERRORS.get(kind, OSError)(number, text)
+            kind, number, text, *details = plain["error"]
+            error = _ERRORS.get(kind, OSError)(number, text)
+            for name, detail in details[0].items() if details else ():
+                if name in _TLS_DETAILS:
+                    setattr(error, name, detail)
+            raise error
         if "bytes" in plain:
             return base64.b64decode(plain["bytes"], validate=True)
         return tuple(_value(item) for item in plain["tuple"])

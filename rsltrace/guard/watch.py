@@ -92,6 +92,8 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
                 wanted = handle(arguments, frame)
             if wanted is not None:
                 source, call, value = wanted
+                if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
+                    return  # starting it is recorded, or else is a finding of its own
                 if source is Source.ADDRESS and not guard.is_user(frame):
                     return  # libraries use id() for bookkeeping
                 guard.watched(source, call, value, frame)

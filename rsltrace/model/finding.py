@@ -44,7 +44,7 @@ MODES: Mapping[Source, tuple[Mode, ...]] = {
     Source.FILE: (Mode.RECORD, *_ALWAYS),
     Source.ENVIRONMENT: (Mode.RECORD, *_ALWAYS),
     Source.THREAD: _ALWAYS,
-    Source.PROCESS: _ALWAYS,
+    Source.PROCESS: (Mode.RECORD, *_ALWAYS),
     Source.SOCKET: (Mode.RECORD, *_ALWAYS),
     Source.ADDRESS: _ALWAYS,
     Source.ORDER: (Mode.VIRTUAL, *_ALWAYS),

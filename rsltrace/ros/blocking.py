@@ -12,6 +12,7 @@ In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RES
 from __future__ import annotations
 
 import os
+import sys
 import threading
 import time
 import traceback
@@ -26,6 +27,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import UnsupportedError
+from rsltrace.guard.recorded_processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
@@ -368,6 +370,10 @@ def _sleep(seconds: float) -> None:
         return
     if seconds < 0:
         raise ValueError("sleep length must be non-negative")
+    frame = sys._getframe(1)
+    if frame.f_globals.get("__name__") == "subprocess":
+        sleep_for_process(seconds, _real_sleep, frame)
+        return
     for_ns = int(seconds * 1_000_000_000)
     if core.ending and core.shutdown_ns < _SHUTDOWN_NS:
         # Time stands still, but destroy_node and ``finally`` shall have their say: as much as

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import asyncio.selector_events
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.guard.recorded_polls import RecordedPoll
 from rsltrace.ros.blocking import POLL_NS, Wait, simulated_core, wait
 
 if TYPE_CHECKING:
@@ -24,7 +26,8 @@ once whatever is not its own. After the first rounds, so many of them take ``POL
 class SimSelector:
     """Wraps the selector of an asyncio loop: where it would wait, simulated time passes.
 
-    Descriptors are looked at whenever the loop runs, and never waited for.
+    Descriptors are looked at whenever the loop runs. They are only waited for where they lead
+    outside of the run and what comes is recorded.
     """
 
     def __init__(self, core: Core, real: Any) -> None:
@@ -46,13 +49,23 @@ class SimSelector:
         core = simulated_core()
         if core is not self._core:
             return self._real.select(timeout)
+        poller = getattr(self._real, "_selector", None)
+        if not polls and isinstance(poller, RecordedPoll) and poller.has_outside():
+            poller.step = self._step
+            try:
+                return self._real.select(timeout)
+            finally:
+                poller.step = None
         # Rounded up, or the loop would look too early, and again without any time having passed.
         for_ns = None if timeout is None else int(timeout * _NS_PER_S) + 1
-        if polls:
-            for_ns = POLL_NS
-        stack_is_thread = core.is_thread
-        wait(
-            core,
+        self._step(POLL_NS if polls else for_ns)
+        return self._real.select(0)
+
+    def _step(self, for_ns: int | None) -> bool:
+        """Wait in simulated time; return whether something woke the loop."""
+        stack_is_thread = self._core.is_thread
+        is_woken = wait(
+            self._core,
             "something to do in its asyncio loop",
             until=self._keep,
             for_ns=for_ns,
@@ -60,7 +73,7 @@ class SimSelector:
             patient=lambda: self._blocked is not None and stack_is_thread(self._blocked.stack),
         )
         self._blocked = None
-        return self._real.select(0)
+        return is_woken
 
     def _costs_time(self) -> bool:
         rounds = self._rounds
@@ -92,6 +105,10 @@ def simulated_event_loops(core: Core) -> Iterator[None]:
         real_init(self, *args, **kwargs)
         if simulated_core() is core:
             self._selector = SimSelector(core, self._selector)
+            # In seconds since 1970 a float cannot tell 100 ns apart; a timer that is due by less
+            # than asyncio can see would never run, and time would never go on.
+            now_s = core.loop.now_ns / _NS_PER_S
+            self._clock_resolution = max(self._clock_resolution, 2 * math.ulp(now_s))
 
     def _write_to_self(self: Any) -> None:
         real_write(self)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from greenlet import getcurrent
+
 from rsltrace.model.finding import Policy
 from rsltrace.ros.blocking import wait
 
@@ -46,3 +48,15 @@ class GuardContext:
         core = self._core
         if core.current_handle is not None and not core.ending:
             wait(core, "time to pass (it reads a clock again and again)", for_ns=for_ns)
+
+    def is_aside(self) -> bool:
+        """Return whether a thread or a main waits, not a callback: others can go on meanwhile."""
+        core = self._core
+        if core.current_handle is None or core.ending or core.in_callback():
+            return False
+        stack = getcurrent()
+        return core.is_thread(stack) or core.program_of(stack) is not None
+
+    def step(self, for_ns: int) -> None:
+        """Let simulated time pass, and others go on."""
+        wait(self._core, "something outside of the run", for_ns=for_ns, quiet=True)

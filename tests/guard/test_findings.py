@@ -182,7 +182,7 @@ def test_a_diff_remembers_what_the_node_read_before(
     [
         ("{clock: vrtual}", "guard.clock: expected one of virtual, record, warn, error, allow"),
         ("{thread: virtual}", "the answers of this source cannot be made 'virtual'"),
-        ("{process: record}", "what this source answers cannot be recorded"),
+        ("{thread: record}", "what this source answers cannot be recorded"),
         ("{clok: warn}", "unknown key 'clok' in guard; did you mean 'clock'?"),
         ("{file: {mode: warn, allow: [a/b]}}", "expected the name of a module"),
         ("{state: maybe}", "guard.state: expected true, false or record"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.server
+import json
 import os
 import threading
 from collections.abc import Callable, Iterator
@@ -169,3 +170,107 @@ def test_a_replay_needs_a_trace_and_a_guard(go: Callable[..., Any], tmp_path: Pa
         go(code, "{}", "again", replay=tmp_path / "no.mcap")
     with pytest.raises(JobError, match="guard: false"):
         go(code, "false", "again", replay=tmp_path / "no.mcap")
+
+
+ONCE = "if vars(self).setdefault('done', False): return\nself.done = True\n"
+PROCESSES = """
+def one():
+    return subprocess.run(['date', '+%N'], capture_output=True, text=True).stdout
+def piped():
+    code = 'rev; date +%N; exit 3'
+    done = subprocess.run(['sh', '-c', code], input=b'abc', capture_output=True)
+    return done.stdout.decode(), done.returncode
+def lines():
+    with subprocess.Popen('date +%N; sleep 0.02; date +%N >&2; date +%N', shell=True, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.STDOUT) as process:
+        return process.pid, [line for line in process.stdout], process.wait()
+def missing():
+    try: subprocess.run(['/no/such/program'])
+    except FileNotFoundError as error: return str(error)
+def impatient():
+    try: subprocess.run('date +%N; exec sleep 60', shell=True, capture_output=True, timeout=0.3)
+    except subprocess.TimeoutExpired as error: return error.stdout.decode()
+def waiting():
+    process = subprocess.Popen(['sleep', '60'])
+    try: process.wait(0.1)
+    except subprocess.TimeoutExpired: process.terminate()
+    return process.wait(timeout=20)
+def shells():
+    with os.popen('date +%N') as lines:
+        return lines.read(), os.system(
+        f'touch {MARKER}; exit $((1$(date +%N | tail -c 3) % 100))')
+"""
+IN_ASYNCIO = """
+async def talk():
+    process = await asyncio.create_subprocess_exec('sh', '-c', 'rev; date +%N; exit 3',
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE)
+    out, _ = await process.communicate(b'abc')
+    return process.pid, out.decode(), process.returncode
+def looped():
+    return asyncio.run(talk())
+"""
+
+
+def test_the_output_of_processes_is_given_again_without_starting_any(
+    go: Callable[..., Any], tmp_path: Path
+) -> None:
+    marker = tmp_path / "marker"
+    code = node_code(
+        f"{ONCE}self.say(one(), piped(), lines(), missing(), impatient(), waiting(), shells(),\n"
+        "    looped())",
+        imports="import asyncio, os, subprocess, sys",
+        module=f"MARKER = {str(marker)!r}{PROCESSES}{IN_ASYNCIO}",
+    )
+    first = go(code, "{process: record}", "first")
+    assert first.error is None
+    assert go(code, "{process: record}", "other").digest != first.digest
+    marker.unlink()
+    again = go(code, "{process: record}", "again", replay=first.path)
+    assert not marker.exists(), "nothing was started"
+    assert again.error is None
+    assert again.digest == first.digest
+
+
+ASIDE = """
+def talk(node):
+    process = subprocess.Popen(
+        f'date +%N; until [ -e {MARKER} ]; do sleep 0.01; done; date +%N; exit 3',
+        shell=True, stdout=subprocess.PIPE)
+    node.say(node.ticks, process.stdout.readline().decode())
+    node.say(node.ticks, process.stdout.readline().decode())
+    process.stdout.close()
+    node.say(node.ticks, process.wait(), time.time())
+    process = subprocess.Popen(['sleep', '60'])
+    start = time.time()
+    try: process.wait(0.1)
+    except subprocess.TimeoutExpired: node.say(node.ticks, time.time() - start)
+    process.kill()
+    process.wait()
+def tick(node):
+    node.ticks += 1
+    if node.ticks == 5: open(MARKER, 'w').close()
+"""
+
+
+def test_a_thread_that_waits_for_a_process_lets_time_pass(
+    go: Callable[..., Any], tmp_path: Path
+) -> None:
+    marker = tmp_path / "marker"
+    code = node_code(
+        "pass",
+        imports="import subprocess, threading, time",
+        module=f"MARKER = {str(marker)!r}{ASIDE}",
+        init="self.ticks = 0\nself.create_timer(0.01, lambda: tick(self))\n"
+        "threading.Thread(target=talk, args=(self,)).start()",
+    )
+    first = go(code, "{process: record}", "first")
+    assert first.error is None
+    marker.unlink()
+    again = go(code, "{process: record}", "again", replay=first.path)
+    assert again.digest == first.digest
+    with Trace.open(first.path) as trace:
+        texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
+    said = [json.loads(text) for text in texts]
+    assert len(said) == 4
+    assert said[1][0] >= 5, "others went on"
+    assert said[3][1] == pytest.approx(0.1, abs=1e-4)

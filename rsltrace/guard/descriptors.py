@@ -1,0 +1,120 @@
+"""Which sockets and file descriptors lead outside of the run, by a number that a re-run has, too.
+
+The operating system's numbers differ from run to run. Those here are given in the order in which a
+run first uses its sockets and descriptors.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from rsltrace.guard.redirect import copy_of
+from rsltrace.model.finding import Source
+
+_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
+_Identity = tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Descriptor:
+    """An open file descriptor whose answers are recorded. Of a folder, only what ``fstat`` says."""
+
+    number: int
+    source: Source
+    identity: _Identity
+    is_folder: bool = False
+
+
+class Descriptors:
+    """What one run has open. One that was closed behind our back is noticed by its inode."""
+
+    def __init__(self) -> None:
+        self.processes: set[int] = set()
+        """Processes that were started, or (in a re-run) were in the recorded one."""
+        self._open: dict[int, Descriptor] = {}
+        self._far_ends: dict[int, tuple[_Identity, int]] = {}
+        self._numbers: WeakKeyDictionary[Any, int] = WeakKeyDictionary()
+        self._last = 0
+
+    def add(self, fd: int, source: Source, *, is_folder: bool = False) -> Descriptor:
+        """Take note of a descriptor whose answers are to be recorded."""
+        found = self.find(fd)
+        if found is None:
+            found = Descriptor(self._next(), source, _identity(fd), is_folder)
+            self._open[fd] = found
+        return found
+
+    def find(self, fd: object) -> Descriptor | None:
+        """Return what is known of a descriptor (or of something that has one)."""
+        if not self._open:
+            return None
+        number = number_of(fd)
+        found = self._open.get(number)
+        if found is None:
+            return None
+        if _identity(number) != found.identity:
+            del self._open[number]
+            return None
+        return found
+
+    def drop(self, fd: int) -> None:
+        """Forget a descriptor that is closed."""
+        self._open.pop(fd, None)
+        self._far_ends.pop(fd, None)
+
+    def join(self, one: int, other: int) -> None:
+        """Take note of two ends of one pipe or of a pair of sockets."""
+        for fd, far in ((one, other), (other, one)):
+            self._open.pop(fd, None)
+            self._far_ends[fd] = (_identity(fd), far)
+
+    def far_end(self, fd: int) -> int | None:
+        """Return the other end of a pipe or pair that was made in the run, if it is one's."""
+        found = self._far_ends.get(fd)
+        if found is None or _identity(fd) != found[0]:
+            return None
+        return found[1]
+
+    def is_outside(self, fd: object) -> bool:
+        """Return whether a descriptor leads to somebody who is not part of the run."""
+        if self.find(fd) is not None:
+            return True
+        number = number_of(fd)
+        try:
+            is_socket = stat.S_ISSOCK(_fstat(number).st_mode)
+        except OSError:
+            return False
+        return is_socket and self.far_end(number) is None
+
+    def number(self, thing: Any) -> int:
+        """Return the number of an object that has no descriptor, or that may change it."""
+        found = self._numbers.get(thing)
+        if found is None:
+            found = self._numbers[thing] = self._next()
+        return found
+
+    def _next(self) -> int:
+        self._last += 1
+        return self._last
+
+
+def number_of(fd: object) -> int:
+    """Return the descriptor's number of whatever has one, or -1."""
+    if isinstance(fd, int):
+        return fd
+    try:
+        return int(fd.fileno())  # type: ignore[attr-defined]
+    except (AttributeError, ValueError, OSError):
+        return -1
+
+
+def _identity(fd: int) -> _Identity:
+    try:
+        found = _fstat(fd)
+    except OSError:
+        return -1, -1
+    return found.st_dev, found.st_ino
