@@ -51,6 +51,11 @@ def is_user_file(file: str) -> bool:
     return _kind_of(file) == _USER
 
 
+def is_of_python(frame: FrameType) -> bool:
+    """Return whether a frame is one of Python's own modules (or of the guard)."""
+    return _kind_of(frame.f_code.co_filename) == _STANDARD
+
+
 def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
     """Return the innermost frame of user code that led to ``frame``, or None if none did.
 

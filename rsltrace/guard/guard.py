@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
-from rsltrace.guard.callers import module_of, stack_of, user_frame
+from rsltrace.guard.callers import is_of_python, module_of, stack_of, user_frame
 from rsltrace.guard.descriptors import Descriptors
 from rsltrace.guard.outside import Outside, answered, decoded, numbered
 from rsltrace.guard.pace import Pace
@@ -34,6 +34,9 @@ FINDINGS_PER_EVENT = 100
 
 _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
+_LOOK_NS = 1_000
+"""What looking at a clock again takes: ``time.time()`` of this century cannot show much less."""
+_AHEAD_NS_MAX = 1_000_000
 
 
 class Context(Protocol):
@@ -91,6 +94,7 @@ class Guard:
         self._in_event = 0
         self._reads = 0
         self._reads_event = -1
+        self._shown: dict[str, tuple[int, int]] = {}
 
     def in_charge(self) -> bool:
         """Return whether the calling thread is the simulation's (and no child process)."""
@@ -177,8 +181,14 @@ class Guard:
         told = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
         self.found(source, told, call, value, frame)
 
-    def clock_read(self) -> None:
-        """Keep whoever reads a clock until time has passed from waiting for ever."""
+    def clock_ns(self, frame: FrameType) -> int:
+        """Return what a clock of the node (of the module, where no node runs) shows: now.
+
+        Real clocks never show the same twice, and code that measures durations (to divide by them,
+        say) relies on it. So whoever looks again at one instant sees a little more each time;
+        not so Python's own modules, which wait by what they see. Whoever looks until time has
+        passed makes it pass.
+        """
         event = self.context.place()[0]
         if event != self._reads_event:
             self._reads_event, self._reads = event, 0
@@ -186,6 +196,17 @@ class Guard:
         if self._reads > _READS_PER_EVENT:
             self.context.pass_time(_BUSY_NS)
             self._reads_event = self.context.place()[0]
+        now_ns = self.context.now_ns()
+        if is_of_python(frame):
+            return now_ns
+        who = self.context.node() or module_of(frame)
+        before_ns, shown_ns = self._shown.get(who, (now_ns, now_ns - 1))
+        if now_ns > shown_ns or now_ns < before_ns:  # a node's clock may jump backwards
+            shown_ns = now_ns
+        elif shown_ns - now_ns < _AHEAD_NS_MAX:
+            shown_ns += _LOOK_NS
+        self._shown[who] = now_ns, shown_ns
+        return shown_ns
 
 
 ADVICE = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import datetime
 import os
 import random
+import sys
 import time
 import uuid
 from collections.abc import Callable
@@ -13,7 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from rsltrace.guard.guard import Guard
+from rsltrace.model.finding import Policy
 from tests.guard.conftest import node_code
 
 pytestmark = pytest.mark.ros
@@ -254,3 +259,78 @@ def test_two_simulations_in_one_process_do_not_disturb_each_other(tmp_path: Path
         one.run()
     assert one.result.digest == alone
     assert rsltrace.record(job(), tmp_path / "again.mcap").digest == alone
+
+
+class Standing:
+    """A simulation whose time the test sets, and the node that runs."""
+
+    def __init__(self) -> None:
+        self.time_ns = 0
+        self.runs = "/a"
+
+    def now_ns(self) -> int:
+        return self.time_ns
+
+    def node(self) -> str:
+        return self.runs
+
+    def policy(self) -> None:
+        return None
+
+    def place(self) -> tuple[int, int]:
+        return 0, 0
+
+    def pass_time(self, for_ns: int) -> None:
+        self.time_ns += for_ns
+
+
+@given(
+    steps=st.lists(
+        st.tuples(st.sampled_from("/a /b".split()), st.integers(0, 5_000) | st.just(10**9)),
+        max_size=60,
+    )
+)
+def test_no_clock_shows_the_same_twice(steps: list[tuple[str, int]]) -> None:
+    """Nor goes back, nor depends on how often another node has looked, nor is far from the time."""
+    frame = sys._getframe()
+
+    def shown(nodes: str) -> list[int]:
+        context, found = Standing(), []
+        guard = Guard(context, policy=Policy())
+        for node, advance_ns in steps:
+            context.time_ns += advance_ns
+            context.runs = node
+            if node in nodes:
+                found.append((node, guard.clock_ns(frame), context.time_ns))
+        assert all(0 <= clock_ns - now_ns <= 60_000 for _, clock_ns, now_ns in found)
+        return [clock_ns for node, clock_ns, _ in found if node == "/a"]
+
+    alone = shown("/a")
+    assert alone == shown("/a /b".split())
+    assert sorted(set(alone)) == alone
+
+
+def test_a_clock_that_is_looked_at_for_ever_makes_time_pass(said: Callable[..., list[Any]]) -> None:
+    """And what divides by a duration that took no simulated time works."""
+    code = node_code(
+        "start = time.perf_counter()\n"
+        "rate = 1 / (time.perf_counter() - start)\n"
+        "begun = time.time()\n"
+        "while time.time() - begun < 0.003: pass\n"
+        "self.say(rate, time.time() - begun, self.get_clock().now().nanoseconds)\n",
+        imports="import time",
+    )
+    for n, (rate, waited, now_ns) in enumerate(said(code), 1):
+        assert rate == pytest.approx(1e6, rel=1e-3)
+        assert 0.003 <= waited < 0.0031
+        assert 3_000_000 <= now_ns - n * 500_000_000 <= 3_020_000
+
+
+def test_a_clock_that_jumps_backwards_is_followed() -> None:
+    context = Standing()
+    guard = Guard(context, policy=Policy())
+    frame = sys._getframe()
+    context.time_ns = 10**9
+    assert [guard.clock_ns(frame), guard.clock_ns(frame)] == [10**9, 10**9 + 1_000]
+    context.time_ns = 10**8
+    assert [guard.clock_ns(frame), guard.clock_ns(frame)] == [10**8, 10**8 + 1_000]
