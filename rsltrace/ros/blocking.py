@@ -12,23 +12,18 @@ In the trace a wait ends the event (flag ``SUSPENDED``); what follows is a ``RES
 from __future__ import annotations
 
 import os
-import sys
 import threading
-import time
 import traceback
 from _thread import get_ident
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import UnsupportedError
-from rsltrace.guard.recorded_processes import sleep_for_process
-from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.redirect import copy_of
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
 from rsltrace.ros.waits_for import called_service
@@ -42,17 +37,16 @@ POLL_NS = 1_000_000
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 getpid = copy_of(os.getpid)  # type: ignore[arg-type]  # not the one that the guard watches
-_SHUTDOWN_NS = 10_000_000_000
-_SHORTEST_SLEEP_NS = 1_000_000
 _PATIENCE = 100
+"""How often a stack may go on to wait after the end of the run before it is left where it is."""
 _PYTHON = os.path.dirname(threading.__file__) + os.sep
 
 # Stacks that go on whatever is raised in them (`while True: try: ... except: pass`). They must not
 # be collected: that would raise in them once more.
 _abandoned: list[greenlet] = []
 
-
 Patience = bool | Callable[[], bool]
+"""Whether it is in order to wait for ever, or what says so when somebody asks."""
 
 
 class RunEnded(BaseException):
@@ -291,41 +285,6 @@ def _hold_group(core: Core) -> object:
     return group
 
 
-class SimEvent:
-    """Stands in for ``threading.Event`` where rclpy waits for what a callback will set."""
-
-    def __init__(self, core: Core, what: str = "an event to be set") -> None:
-        self._core = core
-        self._what = what
-        self._set = False
-        self._waits: list[Wait] = []
-
-    def is_set(self) -> bool:
-        """Return whether the event is set."""
-        return self._set
-
-    def set(self) -> None:
-        """Set the event and wake everybody who waits for it."""
-        self._set = True
-        waits, self._waits = self._waits, []
-        for blocked in waits:
-            blocked.wake()
-
-    def clear(self) -> None:
-        """Reset the event."""
-        self._set = False
-
-    def wait(self, timeout: float | None = None) -> bool:
-        """Wait in simulated time until the event is set; return whether it is."""
-        return self.wait_ns(None if timeout is None else int(timeout * 1_000_000_000))
-
-    def wait_ns(self, timeout_ns: int | None) -> bool:
-        """Do ``wait`` with a timeout in nanoseconds."""
-        if not self._set:
-            wait(self._core, self._what, until=self._waits.append, for_ns=timeout_ns)
-        return self._set
-
-
 def end_blocked(core: Core) -> None:
     """Unwind every blocked call at the end of a run, so that ``finally`` blocks run."""
     core.ending = True
@@ -338,87 +297,3 @@ def end_blocked(core: Core) -> None:
         if runner is not here and not runner.dead:
             runner.throw(RunEnded)
     core.runners.clear()
-
-
-class FutureWake:
-    """The done callback of a future that sets an event at once, without becoming a task."""
-
-    def __init__(self, event: SimEvent) -> None:
-        self._event = event
-
-    def __call__(self, future: Any) -> None:
-        self._event.set()
-
-
-_real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
-_world: list[Core] = []
-
-
-def simulated_core() -> Core | None:
-    """Return the world in which the calling code runs: a node's, not that of who drives it."""
-    core = _world[-1] if _world else None
-    if core is None or get_ident() != core.thread or getpid() != core.process:
-        return None
-    return core if core.current_handle is not None or core.importing else None
-
-
-def _sleep(seconds: float) -> None:
-    """Stand in for ``time.sleep`` while a run lasts."""
-    core = simulated_core()
-    if core is None or core.current_handle is None:
-        _real_sleep(seconds)
-        return
-    if seconds < 0:
-        raise ValueError("sleep length must be non-negative")
-    frame = sys._getframe(1)
-    if frame.f_globals.get("__name__") == "subprocess":
-        sleep_for_process(seconds, _real_sleep, frame)
-        return
-    for_ns = int(seconds * 1_000_000_000)
-    if core.ending and core.shutdown_ns < _SHUTDOWN_NS:
-        # Time stands still, but destroy_node and ``finally`` shall have their say: as much as
-        # ros2 launch leaves a node between SIGINT and SIGKILL.
-        core.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
-        return
-    wait(core, f"{seconds} s to pass", for_ns=for_ns)
-
-
-@contextmanager
-def simulated_waiting(core: Core) -> Iterator[None]:
-    """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
-    import rclpy.action.client
-    import rclpy.client
-    import rclpy.node
-    import rclpy.task
-    import rclpy.timer
-
-    def now() -> float:
-        return core.loop.now_ns / 1_000_000_000
-
-    replaced = [
-        (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
-        (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
-        (rclpy.client, "threading", _threading(core, "the response to a service call")),
-        (rclpy.timer, "threading", _threading(core, "the next period of a Rate")),
-        (rclpy.action.client, "threading", _threading(core, "an answer of an action server")),
-        (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
-        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=core.random_uuid)),
-    ]
-    saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
-    for module, name, value in replaced:
-        setattr(module, name, value)
-    turned = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
-    _world.append(core)
-    try:
-        yield
-    finally:
-        _world.remove(core)
-        turned.restore()
-        for module, name, value in saved:
-            setattr(module, name, value)
-
-
-def _threading(core: Core, what: str) -> SimpleNamespace:
-    return SimpleNamespace(
-        Event=partial(SimEvent, core, what), Lock=threading.Lock, RLock=threading.RLock
-    )

@@ -5,8 +5,8 @@ from __future__ import annotations
 import weakref
 from typing import Any
 
-from rsltrace.ros.blocking import SimEvent
 from rsltrace.ros.destroyable import Destroyable
+from rsltrace.ros.sim_event import SimEvent
 
 
 class _Now:

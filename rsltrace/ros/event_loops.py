@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.guard.recorded_polls import RecordedPoll
-from rsltrace.ros.blocking import POLL_NS, Wait, simulated_core, wait
+from rsltrace.ros.blocking import POLL_NS, Wait, wait
+from rsltrace.ros.simulated_waiting import simulated_core
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import Executor
 
-from rsltrace.ros.blocking import FutureWake, SimEvent, wait
+from rsltrace.ros.blocking import wait
 from rsltrace.ros.own_executors import is_bookkeeping
+from rsltrace.ros.sim_event import FutureWake, SimEvent
 from rsltrace.ros.tasks import Resume, create_task
 from rsltrace.ros.waitables import sync_waitables
 

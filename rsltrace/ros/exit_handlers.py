@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.ros.blocking import simulated_core
+from rsltrace.ros.simulated_waiting import simulated_core
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core

@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import UnsupportedError
-from rsltrace.ros.blocking import Wait, simulated_core, wait
+from rsltrace.ros.blocking import Wait, wait
+from rsltrace.ros.simulated_waiting import simulated_core
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core

@@ -28,8 +28,9 @@ from greenlet import getcurrent, greenlet
 from rsltrace.guard.callers import is_user_file
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.ros.blocking import RunEnded, Wait, simulated_core, wait
+from rsltrace.ros.blocking import RunEnded, Wait, wait
 from rsltrace.ros.locks import SimLock, SimRLock
+from rsltrace.ros.simulated_waiting import simulated_core
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.ros.blocking import SimEvent
 from rsltrace.ros.destroyable import Destroyable
+from rsltrace.ros.sim_event import SimEvent
 
 if TYPE_CHECKING:
     from rsltrace.ros.context import ContextHandle

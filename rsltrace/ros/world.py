@@ -18,7 +18,7 @@ from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.model.event import EventKind
-from rsltrace.ros.blocking import end_blocked, simulated_waiting
+from rsltrace.ros.blocking import end_blocked
 from rsltrace.ros.boundary import Boundary
 from rsltrace.ros.core import Core
 from rsltrace.ros.ending import end_programs
@@ -33,6 +33,7 @@ from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.program import Program
 from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
+from rsltrace.ros.simulated_waiting import simulated_waiting
 from rsltrace.ros.threads import cooperative_threads
 from rsltrace.ros.waits_for import who_waits
 

@@ -17,7 +17,7 @@ from std_msgs.msg import UInt64
 from std_srvs.srv import SetBool, Trigger
 
 from rsltrace.errors import DeadlockError, NodeError
-from rsltrace.ros import blocking
+from rsltrace.ros import simulated_waiting
 
 pytestmark = pytest.mark.ros
 
@@ -39,7 +39,9 @@ def seconds(node: Node) -> float:
 @contextmanager
 def no_real_sleep() -> Iterator[None]:
     """Fail if anything sleeps in real time. (What waits for a real lock here never returns.)"""
-    with mock.patch.object(blocking, "_real_sleep", side_effect=AssertionError("a real sleep")):
+    with mock.patch.object(
+        simulated_waiting, "_real_sleep", side_effect=AssertionError("a real sleep")
+    ):
         yield
 
 
