@@ -22,6 +22,8 @@ _HEAD = """\
 # Every key is explained in docs/jobs.md.
 """
 _PLACES = (".", "src", "scripts", "..")
+_OF_EVERY_NODE = ("/rosout", "/parameter_events")
+"""Recorded with everything else, and hardly ever meant: the nodes of the run have their own."""
 
 
 @click.command()
@@ -32,19 +34,24 @@ _PLACES = (".", "src", "scripts", "..")
     "--from",
     "sources",
     multiple=True,
-    metavar="BAG|MODULE:CLASS",
+    metavar="BAG|MODULE:CLASS|FILE.py:CLASS",
     help="A bag to play, or a node to run; may be given several times.",
 )
 def init(job: Path, sources: tuple[str, ...]) -> None:
     """Write a commented first job to JOB (job.yaml), from bags and nodes.
 
-    Of a bag it lists the topics, their types and how long it is, of a node the parameters that
-    its source declares. Nothing is imported or run. A file that exists is left alone.
+    Of a bag it lists the topics, their types and how long it is, of a node its name and the
+    parameters that its source declares. Nothing is imported or run. A file that exists is left
+    alone.
     """
     if job.exists():
         raise OutputError(f"{job} exists; name another file, or remove it")
     folder = job.parent
-    bags = [source for source in sources if ":" not in source or Path(source).exists()]
+    bags = [
+        source
+        for source in sources
+        if not _is_python(source) and (":" not in source or Path(source).exists())
+    ]
     nodes = [_look(source, folder) for source in sources if source not in bags]
     text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes))
     try:
@@ -59,9 +66,15 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     click.echo(f"wrote {job}; next: rsltrace check {job}", err=True)
 
 
-def _look(target: str, folder: Path) -> Found:
-    from rsltrace.job.look import look_up
+def _is_python(source: str) -> bool:
+    return source.partition(":")[0].endswith(".py")
 
+
+def _look(target: str, folder: Path) -> Found:
+    from rsltrace.job.look import look_up, look_up_file
+
+    if _is_python(target):
+        return look_up_file(target)
     places = [folder / place for place in _PLACES]
     return look_up(target, [place for place in places if place.is_dir()])
 
@@ -98,7 +111,12 @@ def _job_text(job: Path, bags: list[str], nodes: list[Found]) -> Iterator[str]:
 
 
 def _node_text(node: Found) -> Iterator[str]:
+    if node.is_main:
+        yield f"  - main: {node.target}  # it runs as it is, and makes its nodes itself\n"
+        return
     yield f"  - node: {node.target}\n"
+    if node.name:
+        yield f"    name: {_yaml(node.name)}\n"
     known = {name: value for name, value in node.parameters.items() if value is not None}
     if known:
         yield "    # parameters:  # as declared in its source\n"
@@ -129,13 +147,17 @@ def _bag_text(source: str, folder: Path) -> str:
                 "    topics:",
             ]
             width = max(len(topic.name) for topic in bag.topics)
+            heard = [topic for topic in bag.topics if topic.name not in _OF_EVERY_NODE]
             lines += [
-                f"      - {t.name:<{width}}  # {t.type_name}, {t.message_count} messages"
-                for t in bag.topics
+                f"      {'-' if topic in heard or not heard else '# -'} "
+                f"{topic.name:<{width}}  # {topic.type_name}, {topic.message_count} messages"
+                for topic in bag.topics
             ]
             if bag.skipped:
                 lines.append(f"    # not played: {', '.join(bag.skipped)}")
             lines += ["    # rate: 1.0", "    # remappings: {/recorded: /other}"]
             return "\n".join(lines) + "\n"
     except BagError as error:
-        raise BagError(f"{error} (a node is named as module:Class)") from None
+        raise BagError(
+            f"{error} (a node is named as module:Class or path/to/file.py:Class)"
+        ) from None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import difflib
+import os
 import sys
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.job.names import check_target
+from rsltrace.job.names import check_node_name, check_target
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"
@@ -25,12 +26,15 @@ class Found:
     """A target in its source. ``folder`` is where its module was found (None: Python's own path).
 
     ``parameters`` are those that are declared with a literal name; the value is None where the
-    source does not give a literal default.
+    source does not give a literal default. ``name`` is the node's, "" where the source does not
+    give it literally. ``is_main`` is a function that returns nothing, so no node.
     """
 
     target: str
     folder: Path | None
     parameters: dict[str, Any]
+    name: str = ""
+    is_main: bool = False
 
 
 def look_up(target: str, folders: list[Path]) -> Found:
@@ -44,10 +48,7 @@ def look_up(target: str, folders: list[Path]) -> Found:
         raise JobError(str(error)) from None
     module, _, attribute = target.partition(":")
     folder, file = _file_of(module, folders)
-    try:
-        tree = ast.parse(file.read_text("utf-8", "replace"))
-    except SyntaxError as error:
-        raise JobError(f"{file}:{error.lineno}: not Python: {error.msg}") from None
+    tree = _parsed(file)
     name = attribute.partition(".")[0]
     body = next((n for n in ast.walk(tree) if getattr(n, "name", None) == name), None)
     if body is None:
@@ -56,7 +57,77 @@ def look_up(target: str, folders: list[Path]) -> Found:
             close = difflib.get_close_matches(name, names, n=1)
             hint = f"; did you mean {close[0]!r}?" if close else ""
             raise JobError(f"{target}: {file} has no {name!r}{hint}")
-    return Found(target, folder, {} if body is None else _parameters(body))
+    if body is None:
+        return Found(target, folder, {})
+    return Found(target, folder, _parameters(body), _node_name(body), _is_main(body))
+
+
+def look_up_file(source: str) -> Found:
+    """Find ``path/to/file.py:Class``, or the one class of nodes in ``path/to/file.py``.
+
+    Its module is named from the folder above the outermost package that the file is in.
+
+    :raises JobError: if there is no such file, or it has no such class or function.
+    """
+    path, _, attribute = source.partition(":")
+    file = Path(path)
+    if not file.is_file():
+        raise JobError(f"{source}: there is no file {path}")
+    if not attribute:
+        classes = [
+            node.name
+            for node in _parsed(file).body
+            if isinstance(node, ast.ClassDef) and _is_of_nodes(node)
+        ]
+        if len(classes) != 1:
+            some = f"one of {', '.join(classes)}" if classes else "the class of the node"
+            raise JobError(f"{path}: say which class: {path}:Class ({some})")
+        attribute = classes[0]
+    folder, module = Path(os.path.abspath(file.parent)), file.stem
+    while (folder / "__init__.py").is_file() and folder.name:
+        folder, module = folder.parent, f"{folder.name}.{module}"
+    return look_up(f"{module}:{attribute}", [folder])
+
+
+def _parsed(file: Path) -> ast.Module:
+    try:
+        return ast.parse(file.read_text("utf-8", "replace"))
+    except SyntaxError as error:
+        raise JobError(f"{file}:{error.lineno}: not Python: {error.msg}") from None
+
+
+def _is_of_nodes(node: ast.ClassDef) -> bool:
+    bases = (getattr(base, "attr", getattr(base, "id", "")) for base in node.bases)
+    return any(base.endswith("Node") for base in bases)
+
+
+def _node_name(body: ast.AST) -> str:
+    """Return the literal name that a class gives ``super().__init__`` of its node."""
+    for node in ast.walk(body):
+        if not (
+            isinstance(node, ast.Call)
+            and isinstance(node.func, ast.Attribute)
+            and node.func.attr == "__init__"
+            and isinstance(body, ast.ClassDef)
+            and _is_of_nodes(body)
+        ):
+            continue
+        keyword = next((k.value for k in node.keywords if k.arg == "node_name"), None)
+        first = node.args[0] if node.args else keyword
+        name = _literal(first) if first is not None else None
+        try:
+            check_node_name(str(name))
+        except ValueError:
+            return ""
+        return name if isinstance(name, str) else ""
+    return ""
+
+
+def _is_main(body: ast.AST) -> bool:
+    if not isinstance(body, ast.FunctionDef):
+        return False
+    returned = (node.value for node in ast.walk(body) if isinstance(node, ast.Return))
+    return all(value is None or isinstance(value, ast.Constant) for value in returned)
 
 
 def _file_of(module: str, folders: list[Path]) -> tuple[Path | None, Path]:

@@ -29,6 +29,24 @@ class Hearer(Node):
         self.declare_parameters('', [('c',)])
         self.create_subscription(UInt64, '/n', lambda message: None, 10)
 """
+MAINS = """
+import rclpy
+from rclpy.node import Node
+
+class One(Node):
+    pass
+
+class Two(rclpy.node.Node):
+    def __init__(self, name):
+        super().__init__(name)
+
+def main(args=None):
+    rclpy.init(args=args)
+    rclpy.spin(Two('two'))
+
+def make():
+    return One('one')
+"""
 
 
 def write_bag(path: Path) -> None:
@@ -39,6 +57,7 @@ def write_bag(path: Path) -> None:
         "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER,"
         " data BLOB);"
         "INSERT INTO topics VALUES (1, '/n', 'std_msgs/msg/UInt64', 'cdr', '');"
+        "INSERT INTO topics VALUES (3, '/rosout', 'rcl_interfaces/msg/Log', 'cdr', '');"
         "INSERT INTO topics VALUES (2, '/go/_action/status', 'x/msg/Y', 'cdr', '');"
     )
     for i in range(3):
@@ -53,6 +72,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "src" / "robot").mkdir(parents=True)
     (tmp_path / "src" / "robot" / "__init__.py").touch()
     (tmp_path / "src" / "robot" / "nodes.py").write_text(NODE)
+    (tmp_path / "src" / "robot" / "mains.py").write_text(MAINS)
     write_bag(tmp_path / "a.db3")
     return tmp_path
 
@@ -71,7 +91,9 @@ def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
         "    #   deep.b: [1.0, 2.0]",
         "    # more parameters: c, computed",
         "search_path: [., src]",
-        "      - /n  # std_msgs/msg/UInt64, 3 messages",
+        "    name: hearer",
+        "      - /n       # std_msgs/msg/UInt64, 3 messages",
+        "      # - /rosout  # rcl_interfaces/msg/Log, 0 messages",
         "    # from 5.000000000 s on, 2 s long",
         "    # not played: /go/_action/status",
     ):
@@ -106,9 +128,12 @@ def test_a_file_that_exists_is_left_alone(rsltrace: Any, folder: Path) -> None:
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
-        ("nowhere", "nowhere: there is no such bag (a node is named as module:Class)"),
+        ("nowhere", "nowhere: there is no such bag (a node is named as module:Class or"),
         ("robot.nodes:Herer", "nodes.py has no 'Herer'; did you mean 'Hearer'?"),
         ("robot.no_nodes:Hearer", "there is no module 'robot.no_nodes' in"),
+        ("src/robot/no.py:Hearer", "src/robot/no.py:Hearer: there is no file src/robot/no.py"),
+        ("src/robot/mains.py", "say which class: src/robot/mains.py:Class (one of One, Two)"),
+        ("src/robot/mains.py:Thre", "mains.py has no 'Thre'"),
         ("robot.nodes:2", "expected module:Class or module:function, got 'robot.nodes:2'"),
     ],
 )
@@ -125,3 +150,32 @@ def test_a_module_on_pythons_own_path(folder: Path) -> None:
     (folder / "src" / "robot" / "nodes.py").write_text("class (")
     with pytest.raises(JobError, match=r"nodes\.py:1: not Python"):
         look_up("robot.nodes:Hearer", [folder / "src"])
+
+
+@pytest.mark.parametrize("at", [".", "src", "src/robot"])
+@pytest.mark.parametrize("chosen", ["", ":Hearer"])
+def test_a_node_named_by_its_file(rsltrace: Any, folder: Path, at: str, chosen: str) -> None:
+    """As the shell completes it, from wherever one is."""
+    place = folder / at
+    file = f"{(folder / 'src/robot/nodes.py').relative_to(folder)}"
+    source = file if at == "." else file.removeprefix(f"{at}/")
+    done = rsltrace("init", "--from", f"{source}{chosen}", cwd=place)
+    assert done.returncode == 0, done.stderr
+    job = load_job(place / "job.yaml")
+    assert (job.nodes[0].node, job.nodes[0].name) == ("robot.nodes:Hearer", "hearer")
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap", cwd=place)
+    assert done.returncode == 0, done.stderr
+
+
+def test_functions_are_mains_unless_they_return_a_node(folder: Path) -> None:
+    found = {name: look_up(f"robot.mains:{name}", [folder / "src"]) for name in ("main", "make")}
+    assert [found[name].is_main for name in ("main", "make")] == [True, False]
+    assert not look_up("robot.mains:Two", [folder / "src"]).name, "it is told its name"
+
+
+def test_a_job_of_a_main_runs(rsltrace: Any, folder: Path) -> None:
+    done = rsltrace("init", "--from", "robot.mains:main")
+    assert done.returncode == 0, done.stderr
+    assert "  - main: robot.mains:main  # it runs as it is" in (folder / "job.yaml").read_text()
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap", "--until", "1")
+    assert done.returncode == 0, done.stderr
