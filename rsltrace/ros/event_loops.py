@@ -118,9 +118,16 @@ def simulated_event_loops(core: Core) -> Iterator[None]:
 
     base.time, selecting.__init__ = time, __init__
     selecting._write_to_self = _write_to_self
+    # Who waits for child processes numbers its threads: those of another run are none of ours.
+    policy: Any = asyncio.get_event_loop_policy()
+    watcher = getattr(policy, "_watcher", None)
+    if watcher is not None:
+        policy._watcher = None
     try:
         yield
     finally:
+        if hasattr(policy, "_watcher"):
+            policy._watcher = watcher
         base.time, selecting.__init__ = real_time, real_init
         selecting._write_to_self = real_write
 
