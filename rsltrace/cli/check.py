@@ -56,7 +56,7 @@ def check(
 
     The exit status is 0 if all is well, 1 if something in the graph looks wrong (QoS that keeps a
     publisher and a subscription apart, a subscription or a client without anybody at the other
-    end), 2 if the job cannot run.
+    end, a rule of the job that fits nothing), 2 if the job cannot run.
     """
     from rsltrace.run.checking import check_job
 
@@ -78,7 +78,7 @@ def check(
         for note in checked.notes:
             click.echo(f"rsltrace: note: {note}", err=True)
         click.echo("\n".join(map(printable, _text(checked.job, checked))))
-    return 1 if checked.overview.problems else 0
+    return 1 if checked.problems else 0
 
 
 def _draw(checked: Checked, path: Path) -> None:
@@ -96,6 +96,7 @@ def _values(job: Job, checked: Checked) -> dict[str, Any]:
         "job": job.resolved(),
         "start_ns": checked.start_ns,
         "graph": asdict(checked.overview),
+        "unused": list(checked.unused),
         "notes": list(checked.notes),
     }
 
@@ -118,8 +119,8 @@ def _text(job: Job, checked: Checked) -> list[str]:
     for wait in found.waiting:
         lines += ["", *f"still {wait}".splitlines()]
     lines.append("")
-    if found.problems:
-        lines += ["to look at:", *(f"  {problem}" for problem in found.problems)]
+    if checked.problems:
+        lines += ["to look at:", *(f"  {problem}" for problem in checked.problems)]
     else:
         lines.append("nothing looks wrong")
     return lines

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.graph import Graph
     from rsltrace.ros.links import Network
     from rsltrace.ros.logs import Logs
+    from rsltrace.ros.met import Met
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.node_clocks import NodeClocks
     from rsltrace.ros.stating import NodeState
@@ -99,6 +100,7 @@ class Core:
         self.pending: list[EntityHandle | Program | SimThread] = []
         self.unowned: list[EntityHandle | Program | SimThread] = []
         self._entity_count = 0
+        self.met: Met | None = None
         self._channels: dict[tuple[str, str], int] = {}
         self._uuids: dict[str, random.Random] = {}
         self.watchers: dict[str, Callable[[Any, bytes], None]] = {}
@@ -294,6 +296,8 @@ class Core:
         created, self.pending = self.pending, []
         for handle in [*waiting, *created]:
             if handle.settle():
+                if self.met is not None and handle.announced:
+                    self.met.add(handle.entity())
                 if self.recorder is not None and handle.announced:
                     self.recorder.entity(handle.entity())
             else:

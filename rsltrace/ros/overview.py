@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.node import NodeHandle
 
 _ACTION = "/_action/"
-_PARAMETER_SERVICES = (
+NODE_SERVICES = (
     "describe_parameters",
     "get_parameter_types",
     "get_parameters",
@@ -159,7 +159,7 @@ def _is_everywhere(link: Link) -> bool:
     if link.kind == "topic":
         return link.name in _SYSTEM_TOPICS and not link.receivers
     return link.kind == "service" and (
-        link.name.rpartition("/")[2] in _PARAMETER_SERVICES and not link.senders
+        link.name.rpartition("/")[2] in NODE_SERVICES and not link.senders
     )
 
 

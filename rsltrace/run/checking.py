@@ -22,6 +22,13 @@ class Checked:
     start_ns: int
     overview: Overview
     notes: tuple[str, ...]
+    unused: tuple[str, ...]
+    """What in the job had nothing to do: it names what is not there."""
+
+    @property
+    def problems(self) -> tuple[str, ...]:
+        """What looks wrong."""
+        return (*self.overview.problems, *self.unused)
 
 
 def check_job(job: Job, *, everything: bool = False) -> Checked:
@@ -41,6 +48,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.finish()
             raise error
         found = overview(session.world.core, everything=everything)
+        unused = session.unused()
         session.stop = Stop("checked")
         session.finish()
-        return Checked(session.job, session.start_ns, found, tuple(notes))
+        return Checked(session.job, session.start_ns, found, tuple(notes), unused)

@@ -22,6 +22,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
+from rsltrace.ros.met import Met, parameters_of
 from rsltrace.run.bags import (
     BagInput,
     check_bag_types,
@@ -39,6 +40,7 @@ from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
 from rsltrace.run.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
+from rsltrace.run.unused import has_rules, unused_parameters, unused_rules
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -166,6 +168,7 @@ class Session:
             with self._guarded.engaged():
                 world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
         world.use_clocks(clocks_of(job), self.start_ns)
+        world.core.met = Met() if has_rules(job) else None
         self._guarded.begin(world.core, self._replay)
         with self._guarded.engaged():
             loop.stop_conditions = tuple(
@@ -241,6 +244,13 @@ class Session:
             core.error = error if isinstance(error, RunError) else RunError(str(error))
             self.stop = Stop(str(error).splitlines()[0], core.error.exit_code)
 
+    def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
+        """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
+        core = self.world.core
+        lasted_ns = self.loop.now_ns - self.start_ns if lasted else None
+        rules = () if core.met is None else unused_rules(self.job, core.met, lasted_ns)
+        return (*rules, *unused_parameters(self.job, parameters_of(core)))
+
     def finish(self) -> RunResult:
         """Destroy the nodes, close the trace, and say how it went.
 
@@ -249,6 +259,7 @@ class Session:
         loop, core = self.loop, self.world.core
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
+        unused = self.unused(lasted=True) if self.world.error is None else ()
         with self._guarded.engaged():
             self.world.destroy()
         error = self.world.error
@@ -275,6 +286,6 @@ class Session:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
-            notes=(*self._notes, *core.notes),
+            notes=(*self._notes, *core.notes, *unused),
             guarded=self._guarded.counts,
         )

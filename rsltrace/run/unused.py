@@ -1,0 +1,161 @@
+"""Rules of a job that had nothing to do: they name a topic, service or node that never was.
+
+ROS ignores what fits nothing, and so does a run; whoever wrote the rule wants to know. Names that
+nodes create later than a run lasts are not seen, so these are notes, no errors.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Iterator
+from fnmatch import fnmatchcase
+
+from rsltrace.chance.network import QUIET_TOPICS
+from rsltrace.job import Job, locate
+from rsltrace.job.problems import Loc
+from rsltrace.model.stamp import format_duration
+from rsltrace.ros.met import Met, Parameters
+from rsltrace.ros.overview import NODE_SERVICES
+
+
+def has_rules(job: Job) -> bool:
+    """Say whether a job has rules that might fit nothing."""
+    parts = (job.delay, job.execution, job.executors, job.policy, job.stop.topic)
+    return bool(any(part is not None for part in parts) or job.clocks)
+
+
+def unused_rules(job: Job, met: Met, lasted_ns: int | None = None) -> Iterator[str]:
+    """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
+    topics = [*met.topics, *QUIET_TOPICS]
+    nodes = list(met.nodes)
+    for place, glob, names, what in _single(job, topics, list(met.services), nodes):
+        if not _fits(glob, names):
+            yield _note(job, place, what, glob, names)
+    yield from _links(job, met)
+    yield from _entities(job, met)
+    yield from _hidden(job, nodes)
+    if job.delay is not None and lasted_ns is not None:
+        for index, outage in enumerate(job.delay.outages):
+            if outage.from_ns > lasted_ns:
+                yield (
+                    f"{locate(job, ('delay', 'outages', index, 'from'))}: this outage begins "
+                    f"{format_duration(outage.from_ns)} after the start, the run lasted "
+                    f"{format_duration(lasted_ns)}"
+                )
+
+
+def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
+    """Yield the parameters in ``parameters:`` of nodes that none of these has declared."""
+    for index, spec in enumerate(job.nodes):
+        for name in spec.parameters:
+            given = {node: found for node, found in nodes.items() if name in found.unused}
+            if not given or any(name in found.declared for found in nodes.values()):
+                continue
+            declared = [other for found in given.values() for other in found.declared]
+            where = spec.origin or locate(job, ("nodes", index, "parameters", name))
+            near = _near(name, declared)
+            yield (
+                f"{where}: {', '.join(given)} has not declared the parameter {name!r}, so it has no "
+                f"effect{near}"
+            )
+
+
+def _single(
+    job: Job, topics: list[str], services: list[str], nodes: list[str]
+) -> Iterator[tuple[Loc, str, list[str], str]]:
+    """Yield (place, glob, what it may fit, what that is) of the rules with one name."""
+    if job.delay is not None:
+        for glob in job.delay.topics:
+            yield ("delay", "topics", glob), glob, topics, "topic"
+        for glob in job.delay.services:
+            yield ("delay", "services", glob), glob, services, "service"
+        for index, outage in enumerate(job.delay.outages):
+            kind, glob = outage.what
+            names = {"topic": topics, "service": services, "node": nodes}[kind]
+            yield ("delay", "outages", index, kind), glob, names, kind
+    if job.execution is not None:
+        for glob in job.execution.nodes:
+            yield ("execution", "nodes", glob), glob, nodes, "node"
+    for index, executor in enumerate(job.executors or ()):
+        for number, glob in enumerate(executor.nodes):
+            yield ("executors", index, "nodes", number), glob, nodes, "node"
+    for index, clock in enumerate(job.clocks):
+        yield ("clocks", index, "node"), clock.node, nodes, "node"
+    if job.stop.topic is not None:
+        yield ("stop", "topic", "name"), job.stop.topic.name, topics, "topic"
+
+
+def _links(job: Job, met: Met) -> Iterator[str]:
+    for index, link in enumerate(job.delay.links if job.delay is not None else ()):
+        place: Loc = ("delay", "links", index)
+        if not _fits(link.topic, met.topics):
+            yield _note(job, (*place, "topic"), "topic", link.topic, list(met.topics))
+            continue
+        for key, glob, ends, what in (
+            ("from", link.sender, met.publishers, "publishes"),
+            ("to", link.receiver, met.subscriptions, "subscribes"),
+        ):
+            there = [node for node, topic in ends if fnmatchcase(topic, link.topic)]
+            if not _fits(glob, there):
+                near = _near(glob, there) or _there(there)
+                yield (
+                    f"{locate(job, (*place, key))}: no node that fits {glob!r} {what} "
+                    f"{link.topic!r}{near}"
+                )
+
+
+def _entities(job: Job, met: Met) -> Iterator[str]:
+    """Yield the rules for entities of nodes, in ``execution`` and ``policy``."""
+    rules: list[tuple[Loc, str, str, str | None]] = []
+    if job.execution is not None:
+        for index, spec in enumerate(job.execution.entities):
+            rules.append((("execution", "entities", index), spec.node, "entity", spec.entity))
+    priority = job.policy.priority if job.policy is not None else None
+    for index, rule in enumerate(priority or ()):
+        key = "group_of" if rule.group_of is not None else "entity"
+        rules.append((("policy", "priority", index), rule.node, key, rule.group_of or rule.entity))
+    for place, node, key, entity in rules:
+        if not _fits(node, met.nodes):
+            yield _note(job, (*place, "node"), "node", node, list(met.nodes))
+        elif entity is not None:
+            names = [name for owner, name in met.entities if fnmatchcase(owner, node)]
+            if not _fits(entity, names):
+                near = _near(entity, names) or _there(names)
+                yield (
+                    f"{locate(job, (*place, key))}: no topic, service or timer's callback of "
+                    f"{node!r} fits {entity!r}{near}"
+                )
+
+
+def _hidden(job: Job, nodes: list[str]) -> Iterator[str]:
+    """Yield the clocks and executors whose nodes all have an earlier entry."""
+    clocks = [(("clocks", i), (spec.node,)) for i, spec in enumerate(job.clocks)]
+    executors = [(("executors", i), spec.nodes) for i, spec in enumerate(job.executors or ())]
+    for entries in (clocks, executors):
+        taken: set[str] = set()
+        for place, globs in entries:
+            fitting = {node for node in nodes if any(fnmatchcase(node, glob) for glob in globs)}
+            if fitting and fitting <= taken:
+                yield f"{locate(job, place)}: every node that it fits has an earlier entry"
+            taken |= fitting
+
+
+def _fits(glob: str, names: Iterable[str]) -> bool:
+    return any(fnmatchcase(name, glob) for name in names)
+
+
+def _note(job: Job, place: Loc, what: str, glob: str, names: list[str]) -> str:
+    near = _near(glob, names) or _there(names)
+    return f"{locate(job, place)}: no {what} fits {glob!r}{near}"
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, list(dict.fromkeys(names)), n=1)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def _there(names: Iterable[str]) -> str:
+    usual = (*QUIET_TOPICS, *NODE_SERVICES)
+    found = sorted({name for name in names if name and not name.endswith(usual)})
+    shown = ", ".join(found[:5]) + (", …" if len(found) > 5 else "")
+    return f" (there are {shown})" if found else ""

@@ -1,0 +1,149 @@
+"""Rules of a job that fit nothing: each is named with its line, and what fits is not named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+NODES = """
+from rclpy.action import ActionClient, ActionServer
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+class Robot(Node):
+    def __init__(self):
+        super().__init__('robot', namespace='/r1')
+        self.declare_parameter('rate', 10.0)
+        self.create_service(Trigger, 'reset', lambda request, response: response)
+        self.client = self.create_client(Trigger, '/r1/reset')
+        self.server = ActionServer(self, Fibonacci, 'count', print)
+        self.action = ActionClient(self, Fibonacci, 'count')
+        options = QoSOverridingOptions.with_default_policies()
+        self.create_publisher(UInt64, 'odom', 10, qos_overriding_options=options)
+        self.create_subscription(UInt64, 'odom', print, 10)
+
+class Free(Node):
+    def __init__(self):
+        super().__init__('free', allow_undeclared_parameters=True)
+
+class Late(Node):
+    def __init__(self):
+        super().__init__('late')
+        self.timer = self.create_timer(0.5, self.tick)
+
+    def tick(self):
+        self.timer.cancel()
+        self.create_publisher(UInt64, 'late_topic', 10)
+        self.create_service(Trigger, 'late_service', print)
+"""
+
+ALL = """\
+nodes:
+  - node: nodes_under_test:Talker
+  - node: nodes_under_test:Listener
+  - node: nodes_under_test:Robot
+    parameters: {rate: 5.0, qos_overrides./r1/odom.publisher.depth: 3}
+  - {node: nodes_under_test:Free, parameters: {anything: 1}}
+  - node: nodes_under_test:Late
+"""
+
+USED = """\
+stop: {duration: 3s, topic: /numbers/never}
+delay:
+  topics: {/numbers: 1ms, '/r1/*': 2ms, /rosout: 1ms, /r1/count/_action/feedback: 1ms}
+  services: {/r1/reset: 1ms, /r1/count/_action/send_goal: 1ms, '*/late_service': 1ms}
+  links:
+    - {topic: /num*, from: /talker, to: /listener, constant: 3ms}
+    - {topic: /r1/odom, to: /r1/robot, constant: 3ms}
+  outages:
+    - {node: /r1/*, from: 0s, to: 1s}
+    - {topic: /late_topic, from: 3s, to: 4s}
+clocks: [{node: /talker, offset: 1s}, {node: '*', drift: 5}]
+execution:
+  nodes: {/r1/*: 1ms}
+  entities: [{node: /talker, entity: Talker.tick, constant: 1ms}]
+executors: [{nodes: [/talker]}, {nodes: [/talker, /listener]}]
+policy: {priority: [{node: /late, priority: 1}, {group_of: /numbers, priority: 2}]}
+"""
+
+
+def test_rules_that_have_something_to_do_are_not_named(record_job: Callable[..., Any]) -> None:
+    yaml = ALL + USED.replace(", topic: /numbers/never", "")
+    result = record_job(yaml, NODES, output=None)
+    assert result.error is None
+    assert result.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("/numbers: 1ms", "/nubmers: 1ms", "no topic fits '/nubmers'; did you mean '/numbers'?"),
+        ("'/r1/*': 2ms", "'/r2/*': 2ms", "no topic fits '/r2/*' (there are /late_topic, /numbers"),
+        ("'*/late_service'", "/late_servce", "no service fits '/late_servce'; did you mean '/l"),
+        ("/r1/reset", "/reset", "no service fits '/reset'; did you mean '/r1/reset'?"),
+        ("topic: /num*", "topic: /nm*", "no topic fits '/nm*'"),
+        (
+            "from: /talker",
+            "from: /a",
+            "no node that fits '/a' publishes '/num*' (there are /talker",
+        ),
+        ("to: /listener", "to: /talker", "no node that fits '/talker' subscribes '/num*'"),
+        ("{node: /r1/*, from", "{node: /r2/*, from", "no node fits '/r2/*'"),
+        ("from: 3s, to: 4s", "from: 1min, to: 2min", "this outage begins 60 s after the start, "),
+        ("node: /talker, offset", "node: /talkr, offset", "no node fits '/talkr'; did you mean"),
+        ("{node: /talker, offset: 1s}", "{node: '*', offset: 1s}", "every node that it fits has"),
+        ("nodes: {/r1/*: 1ms}", "nodes: {/r2/*: 1ms}", "no node fits '/r2/*'"),
+        ("Talker.tick", "Talker.tock", "no topic, service or timer's callback of '/talker' fits"),
+        ("[/talker, /listener]", "[/talker]", "every node that it fits has an earlier entry"),
+        ("group_of: /numbers", "group_of: /number", "no topic, service or timer's callback of"),
+        ("{node: /late, p", "{node: /latest, p", "no node fits '/latest'; did you mean '/late'?"),
+        ("/numbers/never", "/numbers/none", "no topic fits '/numbers/none'; did you mean"),
+        (
+            "{rate: 5.0",
+            "{ratee: 5.0",
+            "/r1/robot has not declared the parameter 'ratee', so it has ",
+        ),
+        ("publisher.depth", "publisher.depht", "/r1/robot has not declared the parameter 'qos_ov"),
+    ],
+)
+def test_a_rule_that_fits_nothing_is_named(
+    record_job: Callable[..., Any], old: str, new: str, message: str
+) -> None:
+    yaml = ALL + USED
+    if old != "/numbers/never":
+        yaml = yaml.replace(", topic: /numbers/never", "")
+    assert yaml.count(old) == 1
+    line = yaml[: yaml.index(old)].count("\n") + 1
+    result = record_job(yaml.replace(old, new), NODES, output=None)
+    assert result.error is None
+    (note,) = result.notes
+    place, _, told = note.partition(": ")
+    assert place.rpartition(":")[0].endswith(f"job.yaml:{line}")
+    assert told.startswith(message)
+
+
+def test_check_names_them_and_a_run_that_failed_does_not(
+    rsltrace: Any, job_file: Callable[..., Path], record_job: Callable[..., Any]
+) -> None:
+    fails = """
+class Failing(Node):
+    def __init__(self):
+        super().__init__('failing')
+        raise ValueError('no')
+"""
+    bad = "nodes: [{node: nodes_under_test:Failing}]\nclocks: [{node: /x, offset: 1s}]\n"
+    assert record_job(bad, fails, output=None).notes == ()
+    yaml = "nodes: [{node: nodes_under_test:Talker}]\nclocks: [{node: /talkr, offset: 1s}]\n"
+    job_file(yaml + "stop: {duration: 1s}\n")
+    done = rsltrace("check", "job.yaml")
+    assert done.returncode == 1
+    assert done.stdout.endswith(
+        "to look at:\n  job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n"
+    )
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    assert done.returncode == 0
+    assert "note: job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n" in done.stderr
