@@ -54,9 +54,9 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
             declared = [other for found in given.values() for other in found.declared]
             where = spec.origin or locate(job, ("nodes", index, "parameters", name))
             near = _near(name, declared)
+            who = ", ".join(given)
             yield (
-                f"{where}: {', '.join(given)} has not declared the parameter {name!r}, so it has no "
-                f"effect{near}"
+                f"{where}: {who} has not declared the parameter {name!r}, so it has no effect{near}"
             )
 
 
