@@ -15,7 +15,7 @@ from typing import NoReturn
 
 from rsltrace.errors import NodeError
 from rsltrace.model.stamp import format_seconds
-from rsltrace.ros.missing import hint_for
+from rsltrace.ros.hints import hint_for
 
 _PACKAGE = str(Path(__file__).resolve().parent.parent)
 

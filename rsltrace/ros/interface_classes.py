@@ -18,7 +18,7 @@ from importlib.util import find_spec
 from typing import Any
 
 from rsltrace.errors import SetupError
-from rsltrace.ros.missing import where_to_get
+from rsltrace.ros.hints import where_to_get
 
 _NAME = re.compile(r"(?P<package>[a-z]\w*)/(?P<kind>msg|srv|action)/(?P<type>[A-Z]\w*)", re.ASCII)
 

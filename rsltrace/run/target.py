@@ -7,7 +7,7 @@ import importlib
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.ros.missing import cannot_import
+from rsltrace.ros.hints import cannot_import
 
 
 def load_target(target: str, *, where: str) -> Any:

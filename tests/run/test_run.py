@@ -242,6 +242,19 @@ def test_an_interface_that_a_callback_imports_in_vain_has_a_next_step(record_job
     assert "apt install ros-jazzy-nobodys-interfaces" in str(result.error)
 
 
+def test_who_divides_by_a_time_that_did_not_pass_is_told_so(record_job: Any) -> None:
+    code = (
+        "class Rated(Talker):\n"
+        "    def tick(self):\n"
+        "        start = self.get_clock().now()\n"
+        "        1 / (self.get_clock().now() - start).nanoseconds\n"
+    )
+    result = record_job("nodes: [{node: nodes_under_test:Rated}]\n", code)
+    assert "raised ZeroDivisionError" in str(result.error)
+    assert "computing takes no simulated time" in str(result.error)
+    assert "execution:" in str(result.error)
+
+
 def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:
     code = (
         "class Echo(Node):\n"

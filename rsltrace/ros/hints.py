@@ -1,4 +1,6 @@
-"""What to do about a package that cannot be imported: which one, who wants it, where to get it.
+"""What to do about an error that has less to do with the node than with where it runs.
+
+Most often a package cannot be imported: which one, who wants it, where to get it.
 
 Interface packages (messages, services, actions) are generated code, so ``pip install <name>`` is
 seldom the answer: a few are on package indexes under other names, the rest come from ROS 2 itself.
@@ -20,6 +22,12 @@ _WHEELS = frozenset(
     """.split()
 )
 """Interface packages of which there are wheels: those of ROS's core and of common_interfaces."""
+
+_STANDS_STILL = (
+    "\n  If that was a difference of two times: computing takes no simulated time, so a ROS clock "
+    "shows the same throughout a callback, as it may under use_sim_time. With 'execution:' in the "
+    "job callbacks take time (docs/policies.md)"
+)
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")
 
@@ -54,6 +62,8 @@ def cannot_import(module: str, error: ModuleNotFoundError) -> str:
 
 def hint_for(error: BaseException) -> str:
     """Return what to add to the text of an exception that user code raised while it ran."""
+    if isinstance(error, ZeroDivisionError):
+        return _STANDS_STILL
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return ""
     package = error.name.partition(".")[0]
