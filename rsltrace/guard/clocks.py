@@ -7,7 +7,6 @@ takes no simulated time, looking at a clock again 1 us.
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import sys
 import time
@@ -18,6 +17,7 @@ from functools import partial
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
+from rsltrace.guard.exchange import put_member
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.finding import Mode, Source
@@ -232,8 +232,8 @@ def _exchange(stack: ExitStack, name: str, make: Callable[[Any], Any]) -> None:
     for bound in _bound_before(name):
         target = ours.__get__(bound.__self__)
         stack.callback(Redirected(bound, target).restore)
-    _set(datetime, name, classmethod(ours))
-    stack.callback(_set, datetime, name, real)
+    put_member(datetime, name, classmethod(ours))
+    stack.callback(put_member, datetime, name, real)
 
 
 def _bound_before(name: str) -> list[BuiltinFunctionType]:
@@ -246,10 +246,3 @@ def _bound_before(name: str) -> list[BuiltinFunctionType]:
         and isinstance(thing.__self__, type)
         and issubclass(thing.__self__, datetime)
     ]
-
-
-def _set(cls: type, name: str, value: object) -> None:
-    """Set an attribute of a built-in type, which Python itself refuses."""
-    (members,) = gc.get_referents(cls.__dict__)
-    members[name] = value
-    ctypes.pythonapi.PyType_Modified(ctypes.py_object(cls))

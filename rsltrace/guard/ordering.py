@@ -14,7 +14,7 @@ import importlib.machinery
 import os
 import sys
 import weakref
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import CodeType, ModuleType
 from typing import Any
@@ -211,9 +211,15 @@ class _Loader(importlib.machinery.SourceFileLoader):
 class _Finder:
     """Finds the modules of user code: in the job's folders, or in the packages of its nodes."""
 
-    def __init__(self, folders: Sequence[str], packages: frozenset[str]) -> None:
+    def __init__(
+        self,
+        folders: Sequence[str],
+        packages: frozenset[str],
+        on_loaded: Mapping[str, Callable[[], None]],
+    ) -> None:
         self._folders = tuple(os.path.join(folder, "") for folder in folders)
         self._packages = packages
+        self._on_loaded = on_loaded
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -224,6 +230,9 @@ class _Finder:
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
             return None
+        if name in self._on_loaded:
+            _tell(spec.loader, self._on_loaded[name])
+            return spec
         origin = spec.origin or ""
         inside = origin.startswith(self._folders) and "site-packages" not in origin
         if not inside and name.partition(".")[0] not in self._packages:
@@ -232,16 +241,34 @@ class _Finder:
         return spec
 
 
+def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
+    """Have a loader say when it has loaded its module."""
+    real = loader.exec_module
+
+    def exec_module(module: ModuleType) -> None:
+        real(module)
+        on_loaded()
+
+    loader.exec_module = exec_module
+
+
 @contextmanager
-def ordered_sets(folders: Sequence[str], packages: frozenset[str]) -> Iterator[None]:
-    """Let user modules that are imported from now on go through sets in order."""
+def ordered_sets(
+    folders: Sequence[str],
+    packages: frozenset[str],
+    on_loaded: Mapping[str, Callable[[], None]],
+) -> Iterator[None]:
+    """Let user modules that are imported from now on go through sets in order.
+
+    ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
+    """
     helpers: dict[str, Callable[..., Any]] = {
         _ORDERED: ordered,
         _SHOWN: shown,
         _POP: pop,
         _NOW: numpy_now,
     }
-    finder = _Finder(folders, packages)
+    finder = _Finder(folders, packages, on_loaded)
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
     sys.meta_path.insert(0, finder)

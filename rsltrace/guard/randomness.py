@@ -202,11 +202,8 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
 
 
 def begin_shared(seed: int) -> None:
-    """Seed what cannot be divided into streams: numpy's shared generator, torch's."""
+    """Seed what cannot be divided into streams: numpy's shared generator."""
     if "numpy" in sys.modules:
         import numpy as np
 
         np.random.mtrand._rand.seed(random.Random(f"numpy {seed}").getrandbits(32))
-    torch = sys.modules.get("torch")
-    if torch is not None:
-        torch.manual_seed(random.Random(f"torch {seed}").getrandbits(63))

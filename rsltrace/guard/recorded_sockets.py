@@ -7,8 +7,6 @@ wire differs each time.
 from __future__ import annotations
 
 import _socket
-import ctypes
-import gc
 import socket
 import ssl
 import sys
@@ -18,6 +16,7 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.exchange import exchange
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded_descriptors import joining, recording
 from rsltrace.guard.redirect import Redirected, copy_of
@@ -221,21 +220,6 @@ def _pending(real: Any) -> property:
     return property(pending)
 
 
-def _exchange(stack: ExitStack, kind: type, name: str, make: Callable[[Any], Any]) -> None:
-    """Exchange a member of a type of an extension module, which Python itself refuses."""
-    real = kind.__dict__.get(name)
-    if real is None:  # of a later version of Python
-        return
-    (members,) = gc.get_referents(kind.__dict__)
-
-    def put(value: object) -> None:
-        members[name] = value
-        ctypes.pythonapi.PyType_Modified(ctypes.py_object(kind))
-
-    put(make(real))
-    stack.callback(put, real)
-
-
 @contextmanager
 def recorded_sockets() -> Iterator[None]:
     """Let sockets answer from the trace in a re-run."""
@@ -258,9 +242,9 @@ def recorded_sockets() -> Iterator[None]:
         tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
         memory = ssl.MemoryBIO
         for name in _TLS:
-            _exchange(stack, tls, name, partial(_of_tls, "TLS", name))
-        _exchange(stack, tls, "read", _reading)
+            exchange(stack, tls, name, partial(_of_tls, "TLS", name))
+        exchange(stack, tls, "read", _reading)
         for name in _BUFFERED:
-            _exchange(stack, memory, name, partial(_of_tls, "MemoryBIO", name))
-        _exchange(stack, memory, "pending", _pending)
+            exchange(stack, memory, name, partial(_of_tls, "MemoryBIO", name))
+        exchange(stack, memory, "pending", _pending)
         yield

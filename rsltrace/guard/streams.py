@@ -11,7 +11,8 @@ class Streams:
     """The generators of one run, by name: made when first used, seeded by the job's seed."""
 
     def __init__(self, seed: int) -> None:
-        self._seed = seed
+        self.seed = seed
+        """The job's."""
         self._random: dict[str, Random] = {}
         self._entropy: dict[str, Random] = {}
         self._numpy: dict[str, Any] = {}
@@ -26,7 +27,7 @@ class Streams:
 
     def _seed_of(self, name: str) -> str:
         entropy = self._begun.get(name)
-        return f"{self._seed} {entropy}" if entropy else str(self._seed)
+        return f"{self.seed} {entropy}" if entropy else str(self.seed)
 
     def random(self, name: str) -> Random:
         """Return the stand-in for the generator behind ``random``'s functions."""

@@ -132,6 +132,8 @@ class Wait:
         """Begin the RESUME event (called on the blocked call's own stack)."""
         core = self.core
         core.current_handle, core.current_entity, core.current_node = self._event
+        if core.on_node is not None:
+            core.on_node(core.current_node)
         core.kind = _RESUME
         core.cause_event, core.cause_output = self._cause
         core.input_hash = self._input_hash
@@ -250,6 +252,8 @@ def set_aside(core: Core) -> Iterator[None]:
         yield
     finally:
         core.current_handle, core.current_entity, core.current_node = handle, entity, node
+        if core.on_node is not None:
+            core.on_node(node)
         core.kind, core.input_hash = _RESUME, 0
         core.cause_event, core.cause_output = core.loop.events - 1, 0
         core.node_arguments, core.on_end = arguments, on_end

@@ -81,6 +81,8 @@ class Core:
 
         # The event under way, and what is done when it is over.
         self.current_node: NodeHandle | None = None
+        self.on_node: Callable[..., None] | None = None
+        """Told which node's code is going to run (or ``is_made``), if somebody has to know."""
         self.current_entity = 0
         self.current_handle: Dispatchable | None = None
         self.kind = 0
@@ -162,6 +164,8 @@ class Core:
         self.current_handle = handle
         self.current_entity = entity
         self.current_node = node
+        if self.on_node is not None:
+            self.on_node(node)
         self.kind = kind
         self.cause_event = cause_event
         self.cause_output = cause_output

@@ -87,6 +87,8 @@ class NodeHandle(EntityHandle):
         self.waitable_count = 0
         core.graph.nodes.append(self)
         core.current_node = self
+        if core.on_node is not None:
+            core.on_node(self, is_made=True)
         self._set_log_levels()
         said = [each.rosout() for each in [*self._outer, self.arguments]]
         if enable_rosout and next((s for s in reversed(said) if s is not None), True):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
@@ -15,6 +16,7 @@ from rsltrace.guard.install import installed
 from rsltrace.guard.ordering import ordered_sets
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.randomness import begin_shared
+from rsltrace.guard.torch_streams import torch_streams
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount
 from rsltrace.trace.format import METADATA_GUARD
@@ -29,8 +31,9 @@ if TYPE_CHECKING:
 class Guarding:
     """The guard of one run; without one (``guard: false``) everything here does nothing."""
 
-    def __init__(self, job: Job) -> None:
+    def __init__(self, job: Job, stack: ExitStack) -> None:
         self._job = job
+        self._stack = stack
         self.guard: Guard | None = None
         self._core: Core | None = None
 
@@ -66,6 +69,22 @@ class Guarding:
                     kept = [one for found in trace.findings.values() for one in found]
                 self.guard.outside.replay(kept, str(replay))
         core.default_policy = policy_of(job.guard)
+        if "torch" in sys.modules:
+            self.torch_loaded()
+
+    def torch_loaded(self) -> None:
+        """Give each node a state of torch's generator from now on."""
+        core, guard = self._core, self.guard
+        if core is None or guard is None or core.on_node is not None:
+            return
+        streams = torch_streams(self._stack, guard)
+        name_of = guard.context.node
+
+        def on_node(node: object, *, is_made: bool = False) -> None:
+            (streams.rename if is_made else streams.enter)(name_of())
+
+        core.on_node = on_node
+        streams.enter(name_of())
 
     @property
     def counts(self) -> tuple[GuardCount, ...]:
@@ -92,13 +111,15 @@ class Guarding:
 
 def guarding(stack: ExitStack, job: Job) -> Guarding:
     """Put the replacements in place until ``stack`` ends."""
+    made = Guarding(job, stack)
     if job.guard.enabled:
         if job.guard.pins:
             stack.enter_context(pinned_place())
         stack.enter_context(installed())
         folders = [str(job.resolve(folder)) for folder in job.search_path]
-        stack.enter_context(ordered_sets(folders, _packages(job.nodes)))
-    return Guarding(job)
+        on_loaded = {"torch": made.torch_loaded}
+        stack.enter_context(ordered_sets(folders, _packages(job.nodes), on_loaded))
+    return made
 
 
 def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
