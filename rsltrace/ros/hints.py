@@ -25,8 +25,8 @@ _WHEELS = frozenset(
 
 _STANDS_STILL = (
     "\n  If that was a difference of two times: computing takes no simulated time, so a ROS clock "
-    "shows the same throughout a callback, as it may under use_sim_time. With 'execution:' in the "
-    "job callbacks take time (docs/policies.md)"
+    "shows the same throughout a callback, as it may under use_sim_time: allow for a difference "
+    "of 0, or measure from one callback to the next"
 )
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")

@@ -252,7 +252,6 @@ def test_who_divides_by_a_time_that_did_not_pass_is_told_so(record_job: Any) -> 
     result = record_job("nodes: [{node: nodes_under_test:Rated}]\n", code)
     assert "raised ZeroDivisionError" in str(result.error)
     assert "computing takes no simulated time" in str(result.error)
-    assert "execution:" in str(result.error)
 
 
 def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:
