@@ -8,8 +8,9 @@ never negative.
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from math import sqrt
 from typing import Protocol
 
@@ -50,9 +51,10 @@ class Uniform:
     max_ns: int
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:
-        values = _whole_numbers(stream, self.min_ns, self.max_ns - self.min_ns + 1)
-        next(values)
-        return values.send  # half the time of a function, and this is the usual jitter
+        values = stream.whole_numbers(self.min_ns, self.max_ns - self.min_ns + 1)
+        # No Python function, since this is the usual jitter. The present time goes where ``next``
+        # takes what to return at the end, and there is none.
+        return partial(next, values)
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,11 +173,3 @@ class Series:
             return value_ns + (next_value_ns - value_ns) * (since_ns - time_ns) // run_ns
 
         return value
-
-
-def _whole_numbers(stream: Stream, low: int, width: int) -> Generator[int, int, None]:
-    """Yield integers from ``low`` to ``low`` + ``width`` - 1; the first one is none of them."""
-    uniform = stream.uniform
-    yield 0
-    while True:
-        yield low + int(uniform() * width)

@@ -14,15 +14,16 @@ what rclpy's executors do.
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
-from typing import Protocol
+from typing import Any, Protocol, TypeVar
 
 from rsltrace.errors import LivelockError
 from rsltrace.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
 from rsltrace.loop.timer import TimerState
-from rsltrace.loop.timer_queue import TimerQueue
+from rsltrace.loop.timer_queue import NEVER_NS, TimerQueue
 from rsltrace.model.stamp import format_seconds
 
 
@@ -40,6 +41,8 @@ class TimerOwner(Dispatchable, Protocol):
     """What a due timer dispatches."""
 
 
+T = TypeVar("T")
+
 NOTHING_LEFT = "nothing left to do"
 END_OF_TIME = "what is due next is beyond 2**63 ns, where ROS's time ends"
 TIME_NS_MAX = 2**63 - 1
@@ -51,7 +54,8 @@ class EventLoop:
     """The state of a simulation in time: clock, ready queue, timers, scheduled releases.
 
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
-    (how many have run), ``activity_ns``.
+    (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases: time, order, place in
+    the order of scheduling, what to call, and with what (None: nothing).
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -77,7 +81,6 @@ class EventLoop:
         self.tasks: deque[Dispatchable] = deque()
         self.idle: list[Callable[[], bool]] = []
         self.timers = timers
-        self.first_timer = timers.first
         self.min_step_ns = 0
         self.stop_conditions = stop_conditions
         self.gate: Callable[[int | None], bool] | None = None
@@ -86,31 +89,37 @@ class EventLoop:
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
         self._pause_events = 0
+        self._until_events = -1
         self._quiet_ns = -1
-        self._scheduled: list[tuple[int, int, int, Callable[[], None]]] = []
-        self._schedule_count = 0
+        self.scheduled: list[tuple[int, int, int, Callable[..., None], Any]] = []
+        self.next_place = itertools.count().__next__
 
     def schedule(
         self, time_ns: int, action: Callable[[], None], *, order: int = ORDER_RELEASE
     ) -> None:
         """Run ``action`` when simulated time reaches ``time_ns`` (at once if that is past)."""
-        self._schedule_count += 1
-        heappush(self._scheduled, (time_ns, order, self._schedule_count, action))
+        heappush(self.scheduled, (time_ns, order, self.next_place(), action, None))
+
+    def schedule_arrival(self, time_ns: int, receive: Callable[[T], None], what: T) -> None:
+        """Call ``receive(what)`` when simulated time reaches ``time_ns``; ``what`` is not None."""
+        heappush(self.scheduled, (time_ns, ORDER_RELEASE, self.next_place(), receive, what))
 
     def stop(self, stop: Stop) -> None:
         """End the run after the present event. The first call wins."""
         if self.stopped is None:
             self.stopped = stop
-        self._interrupt = True
+        self.halt()
 
     def halt(self) -> None:
         """Dispatch nothing more: the run is over, stacks that are left only unwind."""
         self._interrupt = True
+        self._until_events = -1
 
     def stop_after_step(self, stop: Stop) -> None:
         """End the run once the present time step has run fully. The first call wins."""
         if self.stopped is None:
             self.stopped = stop
+        self._until_events = -1
 
     def jump(self, time_ns: int) -> None:
         """Set the clock without running what lies between (from construct time to start)."""
@@ -121,15 +130,14 @@ class EventLoop:
     def run(self) -> Stop:
         """Run until something stops the run, and say what."""
         quiet_ns = self._quiet_ns = quiet_until_ns(self.stop_conditions)
-        scheduled, first = self._scheduled, self.first_timer
         while True:
+            self._until_events = self._pause_events
+            if self._interrupt or self.stopped is not None:  # maybe just now, by a signal
+                self._until_events = -1
             self.run_step()
             if self.stopped is not None:  # by an event, or by a signal at any time
                 return self.stopped
-            timer = first()
-            next_ns = None if timer is None else timer.deadline_ns
-            if scheduled and (next_ns is None or scheduled[0][0] < next_ns):
-                next_ns = scheduled[0][0]
+            next_ns = self.next_ns()
             if self.gate is not None and self.gate(next_ns):
                 continue
             if next_ns is None or next_ns > quiet_ns or self.now_ns >= quiet_ns:
@@ -155,10 +163,14 @@ class EventLoop:
         at_least_ns = self.now_ns + self.min_step_ns
         return max(next_ns, min(at_least_ns, end_ns) if end_ns > next_ns else at_least_ns)
 
+    def next_timer(self) -> TimerState | None:
+        """Return the timer that is due next."""
+        return self.timers.head
+
     def next_ns(self) -> int | None:
         """Return when the next timer or release is due, or None if there is neither."""
-        timer = self.first_timer()
-        scheduled = self._scheduled
+        timer = self.next_timer()
+        scheduled = self.scheduled
         if timer is None:
             return scheduled[0][0] if scheduled else None
         if scheduled and scheduled[0][0] < timer.deadline_ns:
@@ -172,16 +184,39 @@ class EventLoop:
         delays on every link nearly every event is a time step of its own.
         """
         now_ns = self.now_ns
-        scheduled = self._scheduled
+        began = self.events
+        scheduled = self.scheduled
         tasks = self.tasks
         ready = self.ready
-        first = self.first_timer
+        timers = self.timers
+        idle = self.idle
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
         while True:
+            # Time steps in which one thing arrives and nothing else is due.
+            while scheduled and not (ready or tasks or idle):
+                next_ns = scheduled[0][0]
+                if next_ns <= now_ns or next_ns >= timers.next_ns or next_ns >= quiet_ns:
+                    break
+                self.now_ns = now_ns = next_ns
+                began = self.events
+                _, _, _, action, what = heappop(scheduled)
+                if what is None:
+                    action()
+                else:
+                    action(what)
+                if scheduled and scheduled[0][0] <= now_ns:
+                    break
+                if ready:
+                    ready.popleft().dispatch()
+                if self.events >= self._until_events or self.now_ns != now_ns:
+                    break
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
-                heappop(scheduled)[3]()
-            limit = self.events + self._livelock_limit
-            timer = None
+                _, _, _, action, what = heappop(scheduled)
+                if what is None:
+                    action()
+                else:
+                    action(what)
+            limit = began + self._livelock_limit
             while not self._interrupt:
                 if tasks:
                     tasks.popleft().dispatch()
@@ -189,27 +224,26 @@ class EventLoop:
                     ready.popleft().dispatch()
                 else:
                     now_ns = self.now_ns  # a callback may have blocked, and time have passed
-                    timer = first()
-                    if timer is not None and timer.deadline_ns <= now_ns:
-                        owner: TimerOwner = timer.owner  # type: ignore[assignment]
+                    if timers.next_ns <= now_ns:
+                        owner: TimerOwner = timers.head.owner  # type: ignore[union-attr, assignment]
                         owner.dispatch()
-                    elif not self.idle or not self._run_idle():
+                    elif not idle or not self._run_idle():
                         break
                 if self.events >= limit:
                     self._livelock(now_ns)
-            if self.stopped is not None or self.events >= self._pause_events:
+            if self.events >= self._until_events:
                 return
             if self.now_ns != now_ns:  # a callback has waited, and others have gone on meanwhile
                 return
-            if scheduled and (timer is None or scheduled[0][0] < timer.deadline_ns):
+            next_ns = timers.next_ns
+            if scheduled and scheduled[0][0] < next_ns:
                 next_ns = scheduled[0][0]
-            elif timer is not None:
-                next_ns = timer.deadline_ns
-            else:
-                return
-            if next_ns >= quiet_ns or next_ns <= now_ns or self._interrupt:
+                if not idle and now_ns < next_ns < quiet_ns:
+                    continue  # above
+            if next_ns >= quiet_ns or next_ns <= now_ns or next_ns == NEVER_NS:
                 return
             self.now_ns = now_ns = next_ns
+            began = self.events
 
     def _run_idle(self) -> bool:
         """Let those who poll have a look, now that nothing else is ready. True: go on."""
@@ -230,7 +264,7 @@ class EventLoop:
         """Name those who keep each other going: watch who runs for a little longer."""
         seen: dict[str, int] = {}
         for _ in range(1000):
-            timer = self.timers.first()
+            timer = self.timers.head
             if self.tasks:
                 item = self.tasks.popleft()
             elif self.ready:

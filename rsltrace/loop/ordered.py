@@ -94,9 +94,8 @@ class OrderedLoop(EventLoop):
         self._tasks = _Waiting(lambda item: self.place(item), self._runs)
         self.ready = self._ready  # type: ignore[assignment]
         self.tasks = self._tasks  # type: ignore[assignment]
-        self.first_timer = self._next_timer
 
-    def _next_timer(self) -> TimerState | None:
+    def next_timer(self) -> TimerState | None:
         """Return the timer that is due next; those that are overdue wait for a worker."""
         due, after = self.timers.due(self.now_ns)
         if any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
@@ -106,10 +105,11 @@ class OrderedLoop(EventLoop):
     def run_step(self) -> None:
         """Run everything that is due at the present time and finds a worker."""
         now_ns = self.now_ns
-        scheduled = self._scheduled
+        scheduled = self.scheduled
         limit = self.events + self._livelock_limit
         while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
-            heappop(scheduled)[3]()
+            _, _, _, action, what = heappop(scheduled)
+            action() if what is None else action(what)
         while not self._interrupt:
             place = self._next()
             if place is not None:

@@ -12,11 +12,22 @@ from typing import Protocol
 
 from rsltrace.loop.timer import TimerState
 
+NEVER_NS = 1 << 64
+"""Later than any time that a trace can hold."""
+
 _ROOM = 256
 
 
 class TimerQueue(Protocol):
     """The timers that run. A cancelled timer is not in the queue."""
+
+    @property
+    def head(self) -> TimerState | None:
+        """The timer that is due first, or None."""
+
+    @property
+    def next_ns(self) -> int:
+        """The deadline of ``head``, or ``NEVER_NS``."""
 
     def add(self, timer: TimerState) -> None:
         """Put a timer in, or back in after a cancel."""
@@ -28,29 +39,34 @@ class TimerQueue(Protocol):
         """Tell the queue that a timer's deadline has changed other than by having run."""
 
     def ran(self, timer: TimerState) -> None:
-        """Tell the queue that ``timer``, given by ``first``, was called and has a new deadline."""
-
-    def first(self) -> TimerState | None:
-        """Return the timer that is due first, or None."""
+        """Tell the queue that ``timer``, which was ``head``, was called and has a new deadline."""
 
     def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
         """Return the timers that are due, in order, and the one that will be next."""
 
 
 class CreationOrderQueue:
-    """Smallest (deadline, creation order) first. O(log n) for every change."""
+    """Smallest (deadline, creation order) first. O(log n) for every change.
+
+    The loop looks at the first timer far more often than timers change, so that is kept up to date.
+    """
 
     def __init__(self) -> None:
         # An entry is valid while its timer's ticket is that very entry: changes push a new one.
+        # The first entry is always valid.
         self._heap: list[tuple[int, int, TimerState]] = []
         self._room = _ROOM
+        self.head: TimerState | None = None
+        self.next_ns = NEVER_NS
 
     def add(self, timer: TimerState) -> None:
         entry = (timer.deadline_ns, timer.order, timer)
         timer.ticket = entry
-        heappush(self._heap, entry)
-        if len(self._heap) > self._room:
+        heap = self._heap
+        heappush(heap, entry)
+        if len(heap) > self._room:
             self._tidy()
+        self._find_head()
 
     def _tidy(self) -> None:
         """Drop what changes have left behind: a watchdog is reset more often than it is due."""
@@ -68,18 +84,26 @@ class CreationOrderQueue:
             heapreplace(heap, entry)
         else:
             heappush(heap, entry)
+        top = heap[0]
+        if top[2].ticket is top:
+            self.next_ns, _, self.head = top
+        else:
+            self._find_head()
 
     def remove(self, timer: TimerState) -> None:
         timer.ticket = None
+        if timer is self.head:
+            self._find_head()
 
-    def first(self) -> TimerState | None:
+    def _find_head(self) -> None:
         heap = self._heap
         while heap:
             entry = heap[0]
             if entry[2].ticket is entry:
-                return entry[2]
+                self.next_ns, _, self.head = entry
+                return
             heappop(heap)
-        return None
+        self.next_ns, self.head = NEVER_NS, None
 
     def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
         heap = self._heap
@@ -138,8 +162,13 @@ class HeapOrderQueue:
         if len(heap) > 1:
             self._sift_down(0, len(heap), timer)
 
-    def first(self) -> TimerState | None:
+    @property
+    def head(self) -> TimerState | None:
         return self._heap[0] if self._heap else None
+
+    @property
+    def next_ns(self) -> int:
+        return self._heap[0].deadline_ns if self._heap else NEVER_NS
 
     def due(self, now_ns: int) -> tuple[list[TimerState], TimerState | None]:
         in_order = sorted(self._heap, key=lambda timer: (timer.deadline_ns, timer.order))

@@ -6,8 +6,6 @@ A graph without models has no links, and its publications go straight into the q
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
@@ -16,13 +14,13 @@ from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.ros.qos import INFINITE_NS, Reliability
 from rsltrace.ros.qos_status import MESSAGE_LOST
 from rsltrace.ros.qos_time import RequestedLease, finite
+from rsltrace.ros.quick_link import Send, expects, quick_send
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.pubsub import Delivery, PublisherHandle, SubscriptionHandle
     from rsltrace.ros.services import ClientHandle, Exchange, ServiceHandle
 
-_DELAY = encode_draw(Draw.DELAY)
 _LOST = {
     LOST_DROP: encode_draw(Draw.DROP),
     LOST_BURST: encode_draw(Draw.BURST),
@@ -38,7 +36,8 @@ class Network:
         self._plan = plan
         self._counts: dict[tuple[str, str, str], int] = {}
         self._ends: dict[int, tuple[str, int]] = {}
-        self._exchanges: dict[tuple[int, int, bool], Exchanges] = {}
+        self._requests: dict[tuple[int, int], Exchanges] = {}
+        self._responses: dict[tuple[int, int], Exchanges] = {}
 
     def link(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> Link:
         """Return the link of two endpoints that have just been connected."""
@@ -52,27 +51,31 @@ class Network:
 
     def request(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
         """Bring a request to the server."""
-        self._bring(client, server, True, exchange)
+        key = (client.entity_id, server.entity_id)
+        way = self._requests.get(key)
+        if way is None:
+            channel = self._service_channel(client, server, "request")
+            way = self._requests[key] = Exchanges(self._core, server, channel)
+        way.send(exchange)
 
     def response(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
         """Bring a response to the client."""
-        self._bring(client, server, False, exchange)
-
-    def _bring(
-        self, client: ClientHandle, server: ServiceHandle, ask: bool, exchange: Exchange
-    ) -> None:
-        key = (client.entity_id, server.entity_id, ask)
-        way = self._exchanges.get(key)
+        key = (client.entity_id, server.entity_id)
+        way = self._responses.get(key)
         if way is None:
-            channel = self._plan.service_channel(
-                client.service,
-                self._end("client", client.service, client),
-                self._end("service", client.service, server),
-                "request" if ask else "response",
-            )
-            way = Exchanges(self._core, server if ask else client, channel)
-            self._exchanges[key] = way
+            channel = self._service_channel(client, server, "response")
+            way = self._responses[key] = Exchanges(self._core, client, channel)
         way.send(exchange)
+
+    def _service_channel(
+        self, client: ClientHandle, server: ServiceHandle, what: str
+    ) -> Channel | None:
+        return self._plan.service_channel(
+            client.service,
+            self._end("client", client.service, client),
+            self._end("service", client.service, server),
+            what,
+        )
 
     def _end(self, kind: str, name: str, endpoint: Any) -> tuple[str, int]:
         """Return (node, how many such endpoints it has made before this one)."""
@@ -98,45 +101,27 @@ class Exchanges:
     def __init__(self, core: Core, receiver: Any, channel: Channel | None) -> None:
         self._core = core
         self._receiver = receiver
+        self._entity = receiver.entity_id
         self._channel = channel
-        self._plain = channel.plain if channel is not None and channel.keep_order else None
-        self._last_ns = 0
-        self._under_way: deque[Exchange] = deque()
-        self._arrive_next = self._next_arrives
 
     def send(self, exchange: Exchange) -> None:
         """Send a request or response on its way."""
         core = self._core
-        now_ns = core.loop.now_ns
+        loop = core.loop
+        now_ns = loop.now_ns
         arrival_ns = now_ns + core.busy_ns
-        plain = self._plain
-        if plain is not None:
-            delay_ns = plain(arrival_ns)
-            if arrival_ns + delay_ns < self._last_ns:
-                delay_ns = self._last_ns - arrival_ns
-            self._last_ns = arrival_ns = arrival_ns + delay_ns
-            note(core, self._receiver.entity_id, _DELAY | delay_ns)
-            self._under_way.append(exchange)
-            if arrival_ns == now_ns:
-                self._next_arrives()
-            else:
-                core.loop.schedule(arrival_ns, self._arrive_next)
-            return
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
-            note(core, self._receiver.entity_id, draw)
+            note(core, self._entity, draw)
             if delay_ns < 0:
                 return
             arrival_ns += delay_ns
         if arrival_ns == now_ns:
             self._arrive(exchange)
         else:
-            core.loop.schedule(arrival_ns, partial(self._arrive, exchange))
-
-    def _next_arrives(self) -> None:
-        self._arrive(self._under_way.popleft())
+            loop.schedule_arrival(arrival_ns, self._arrive, exchange)
 
     def _arrive(self, exchange: Exchange) -> None:
         if not self._receiver._destroyed:
@@ -147,7 +132,8 @@ class Link:
     """From one publisher to one subscription; ``channel`` is None if messages arrive at once.
 
     What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
-    messages as its history: later ones push the oldest out, as in DDS.
+    messages as its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last
+    message in order arrives, ``expected_ns`` is the last arrival that was left to the loop.
     """
 
     def __init__(
@@ -163,10 +149,8 @@ class Link:
         self._channel = channel
         self._held: deque[tuple[Delivery, list[int]]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
-        self._under_way: deque[Delivery] = deque()
-        self._plain = channel.plain if channel is not None and channel.keep_order else None
-        self._last_ns = 0
-        self._arrive_next = self._next_arrives
+        self.last_ns = 0
+        self.expected_ns = -1
         self._receiver = subscription.entity_id
         self._lifespan_ns = min(
             limit if finite(limit) else INFINITE_NS
@@ -180,6 +164,9 @@ class Link:
             self._lease = RequestedLease(core.loop, lease_ns, subscription.qos.liveliness, events)
             for outage in channel.outages if channel is not None else ():
                 self._lease.cut_off(outage.from_ns, outage.to_ns)
+        self.send: Send = self._send
+        if channel is not None and channel.plain and channel.keep_order and not self._timed:
+            self.send = quick_send(core, self, channel.plain)
 
     @classmethod
     def between(
@@ -190,33 +177,19 @@ class Link:
             return cls(core, publisher, subscription, None)
         return core.network.link(publisher, subscription)
 
-    def send(self, delivery: Delivery) -> None:
-        """Send a message on its way."""
+    def _send(
+        self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
+    ) -> None:
         core = self._core
         loop = core.loop
         now_ns = loop.now_ns
         arrival_ns = now_ns + core.busy_ns
-        plain = self._plain
-        if plain is not None:
-            # The usual case: delays only, in order, so that the next to arrive is the next sent.
-            delay_ns = plain(arrival_ns)
-            if arrival_ns + delay_ns < self._last_ns:
-                delay_ns = self._last_ns - arrival_ns
-            self._last_ns = arrival_ns = arrival_ns + delay_ns
-            recorder = core.recorder
-            if recorder is not None:
-                recorder.draw(self._receiver, _DELAY | delay_ns)
-            self._under_way.append(delivery)
-            if arrival_ns == now_ns:
-                self._next_arrives()
-            else:
-                loop.schedule(arrival_ns, self._arrive_next)
-            return
+        delivery = (data, event, position, digest, stamp_ns, count, now_ns)
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             if delay_ns < 0:
-                note(core, self.subscription.entity_id, _LOST[delay_ns])
+                note(core, self._receiver, _LOST[delay_ns])
                 self._lost += 1
                 return
             note(core, self._receiver, encode_draw(Draw.DELAY, delay_ns))
@@ -225,7 +198,7 @@ class Link:
                 copy_ns = arrival_ns + channel.duplicate_ns
                 note(core, self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
                 arrivals_ns.append(copy_ns)
-            self._last_ns = max(self._last_ns, *arrivals_ns)
+            self.last_ns = max(self.last_ns, *arrivals_ns)
             if channel.held_until_ns >= 0:
                 self._hold(delivery, arrivals_ns, channel.held_until_ns)
                 return
@@ -236,24 +209,12 @@ class Link:
 
     def _bring(self, delivery: Delivery, arrival_ns: int) -> None:
         loop = self._core.loop
-        if arrival_ns <= loop.now_ns:
+        now_ns = loop.now_ns
+        if arrival_ns <= now_ns and (self.expected_ns != now_ns or not expects(loop, self._arrive)):
             self._arrive(delivery)
         else:
-            loop.schedule(arrival_ns, partial(self._arrive, delivery))
-
-    def _next_arrives(self) -> None:
-        subscription = self.subscription
-        data, event, position, digest, sent_ns, count, _ = self._under_way.popleft()
-        if self._timed:
-            self._arrive((data, event, position, digest, sent_ns, count, 0))
-        elif not subscription._destroyed:
-            loop = self._core.loop
-            delivery = (data, event, position, digest, sent_ns, count, loop.now_ns)
-            if subscription.wrapper is not None:
-                subscription.queue.append(delivery)
-                loop.ready.append(subscription)
-            else:
-                subscription.deliver(delivery)
+            self.expected_ns = arrival_ns
+            loop.schedule_arrival(arrival_ns, self._arrive, delivery)
 
     def _arrive(self, delivery: Delivery) -> None:
         subscription = self.subscription
@@ -273,7 +234,7 @@ class Link:
                 stale_ns = delivery[4] + self._lifespan_ns
                 if stale_ns <= loop.now_ns:
                     return
-                loop.schedule(stale_ns, partial(self._expire, arrived))
+                loop.schedule_arrival(stale_ns, self._expire, arrived)
         subscription.deliver(arrived)
 
     def _expire(self, delivery: Delivery) -> None:
@@ -293,7 +254,7 @@ class Link:
         """Return when all that was sent so far has arrived, where that is acknowledged."""
         if self.subscription.qos.reliability is not Reliability.RELIABLE:
             return 0
-        return self._last_ns
+        return self.last_ns
 
     def close(self) -> None:
         """Forget the publisher, or the subscription: one of them goes."""
@@ -311,8 +272,7 @@ class Link:
         """Let go of what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
-        now_ns = self._core.loop.now_ns
+        loop = self._core.loop
         for delivery, arrivals_ns in held:
             for arrival_ns in arrivals_ns:
-                action: Callable[[], None] = partial(self._arrive, delivery)
-                self._core.loop.schedule(max(arrival_ns, now_ns), action)
+                loop.schedule_arrival(max(arrival_ns, loop.now_ns), self._arrive, delivery)

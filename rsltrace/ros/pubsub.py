@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import UnsupportedError
@@ -98,12 +97,13 @@ class PublisherHandle(EntityHandle):
             position = recorder.message(
                 self.output_kind, self.entity_id, channel, now_ns, data, digest
             )
-        delivery = (data, loop.events, position, digest, now_ns, self._count, now_ns)
+        event, count = loop.events, self._count
         loop.activity_ns = now_ns
         if self.links is not None:
             for link in self.links:
-                link.send(delivery)
+                link.send(data, event, position, digest, now_ns, count)
         else:
+            delivery = (data, event, position, digest, now_ns, count, now_ns)
             ready = loop.ready
             for subscription in self.subscriptions:
                 subscription.queue.append(delivery)
@@ -112,7 +112,7 @@ class PublisherHandle(EntityHandle):
                 else:
                     subscription.find_wrapper()
         if self._history is not None:
-            self._history.append(delivery)
+            self._history.append((data, event, position, digest, now_ns, count, now_ns))
         if self._offers is not None:
             self._offers.sent()
         if self._watcher is not None:
@@ -127,11 +127,14 @@ class PublisherHandle(EntityHandle):
         ):
             return
         kept = list(self._history)
-        give: Callable[[Delivery], None] = subscription.deliver
-        if self.links is not None:
-            give = next(link for link in self.links if link.subscription is subscription).send
-        for delivery in kept[-subscription.qos.keep :] if subscription.qos.keep else kept:
-            give(delivery)
+        wanted = kept[-subscription.qos.keep :] if subscription.qos.keep else kept
+        if self.links is None:
+            for delivery in wanted:
+                subscription.deliver(delivery)
+            return
+        link = next(link for link in self.links if link.subscription is subscription)
+        for data, event, position, digest, stamp_ns, count, _ in wanted:
+            link.send(data, event, position, digest, stamp_ns, count)
 
     def connect(self, subscription: SubscriptionHandle) -> None:
         """Send to this subscription, too; fan-out is in the creation order of subscriptions."""

@@ -9,7 +9,7 @@ a file that reads up to its last whole segment.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 
@@ -62,7 +62,9 @@ class TraceWriter:
     """Writes one trace.
 
     An event's outputs are added before the event itself; entities and payloads at any time before
-    the event that refers to them. ``close`` ends the file; used as a context manager, leaving the
+    the event that refers to them. ``add_output`` takes an output of the event that is added next,
+    packed by ``format.OUTPUT``; it is the list's own method, since a run calls it for every
+    message. ``close`` ends the file; used as a context manager, leaving the
     block without ``close`` gives the file up as an interrupted run would (``abort``).
 
     Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no room,
@@ -78,13 +80,13 @@ class TraceWriter:
         self._rests: list[bytes] = []
         self._chain_hashes = array("Q")
         self._outputs: list[bytes] = []
+        self.add_output: Callable[[bytes], None] = self._outputs.append
         self._payloads: list[chunks.Payload] = []
         self._payload_bytes = 0
         self._entities: list[chunks.Payload] = []
         self._entity_bytes = 0
         self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
-        self._segment_end = EVENTS_PER_SEGMENT
         self._segments: list[bytes] = []
         self._events_written = 0
         self._outputs_written = 0
@@ -192,17 +194,11 @@ class TraceWriter:
             self._write_payloads()
         return sequence
 
-    def add_output(self, packed: bytes) -> None:
-        """Take an output of the event that is added next, packed by ``format.OUTPUT``."""
-        self._outputs.append(packed)
-        if len(self._outputs) >= OUTPUTS_PER_SEGMENT:
-            self._segment_end = 0  # the event they belong to ends the segment
-
     def add_event(self, rest: bytes, chain_hash: int) -> None:
         """Take the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
         self._rests.append(rest)
         self._chain_hashes.append(chain_hash)
-        if len(self._rests) >= self._segment_end:
+        if len(self._rests) >= EVENTS_PER_SEGMENT or len(self._outputs) >= OUTPUTS_PER_SEGMENT:
             self._write_segment()
 
     def add_entity(self, entity: Entity) -> int:
@@ -319,7 +315,6 @@ class TraceWriter:
         self._rests.clear()
         self._outputs.clear()
         del self._chain_hashes[:]
-        self._segment_end = EVENTS_PER_SEGMENT
 
     def _check(self, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]) -> None:
         """A recorder that miscounts would write a trace that misleads: stop at once instead."""

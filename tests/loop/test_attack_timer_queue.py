@@ -17,7 +17,7 @@ def test_a_watchdog_leaves_nothing_behind() -> None:
     for now_ns in range(100_000):
         watchdog.reset(now_ns)
         queue.add(watchdog)
-        assert queue.first() is others[0]
+        assert queue.head is others[0]
     assert len(queue._heap) < 1000
 
 
@@ -35,7 +35,7 @@ def test_tidying_keeps_the_order() -> None:
         queue.remove(timer)
     left = [timer for i, timer in enumerate(timers) if i % 7]
     met = []
-    while (timer := queue.first()) is not None:
+    while (timer := queue.head) is not None:
         met.append((timer.deadline_ns, timer.order))
         queue.remove(timer)
     assert met == sorted((timer.deadline_ns, timer.order) for timer in left)

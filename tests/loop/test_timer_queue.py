@@ -60,7 +60,7 @@ def test_an_unknown_rule_is_refused() -> None:
 def run(queue: CreationOrderQueue | HeapOrderQueue, steps: int) -> list[tuple[int, int]]:
     fired = []
     for _ in range(steps):
-        first = queue.first()
+        first = queue.head
         assert first is not None
         fired.append((first.deadline_ns, first.order))
         first.call(first.deadline_ns)
@@ -138,7 +138,7 @@ def test_first_is_always_a_timer_with_the_smallest_deadline(
             state.deadline_ns += value
             queue.moved(state)
         elif operation in "rR":
-            first = queue.first()
+            first = queue.head
             if first is not None:
                 first.call(first.deadline_ns)
                 if operation == "R":  # its callback starts another timer, which is due before it
@@ -146,7 +146,7 @@ def test_first_is_always_a_timer_with_the_smallest_deadline(
                     queue.add(state)
                     inside.add(index)
                 queue.ran(first)
-        first = queue.first()
+        first = queue.head
         if not inside:
             assert first is None
         else:

@@ -288,8 +288,9 @@ def test_messages_under_way_survive_their_publisher_but_not_their_subscription(r
     assert run.heard == []
 
 
+@pytest.mark.parametrize("loss", [0.0, 1e-9])  # a link that may lose messages has more to do
 def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
-    run: Run, simulate: Callable[..., Any], tmp_path: Any
+    run: Run, simulate: Callable[..., Any], tmp_path: Any, loss: float
 ) -> None:
     """A bag's message comes before everything else that is due, so it could overtake."""
     run(Talker, delay=None, duration=0.25).path.rename(tmp_path / "bag.mcap")
@@ -300,7 +301,7 @@ def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
         ears.append(Listener())
         return ears[-1]
 
-    delay = {"topics": {"/numbers": {"series": series}}}
+    delay = {"topics": {"/numbers": {"series": series, "drop": loss}}}
     simulate(
         listener,
         duration=0.3,
