@@ -7,6 +7,7 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsltrace.diff.align import Past
 from rsltrace.diff.match import NO_CAUSE, UNKNOWN, Strand, match
 
 # (stamp, input, cause, nth)
@@ -130,3 +131,16 @@ def test_long_sequences_of_others_take_no_square_of_time() -> None:
     a = [(n * 10, n, NO_CAUSE, 0) for n in range(5000)]
     b = [(n * 10 + 1, n + 10_000, NO_CAUSE, 0) for n in range(4990)]
     assert len(pairs(a, b)) == 4990
+
+
+@given(
+    st.integers(0, 5),
+    st.dictionaries(st.integers(5, 9), st.integers(5, 9), max_size=4),
+    st.tuples(st.integers(10, 13), st.integers(10, 13), st.integers(0, 4)),
+)
+def test_an_earlier_event_has_a_partner_exactly_if_it_is_somebodys(
+    same_before: int, recent: dict[int, int], equal_run: tuple[int, int, int]
+) -> None:
+    past = Past(same_before, recent, equal_run)
+    partners = {past.in_a(index_b) for index_b in range(20)} - {UNKNOWN}
+    assert {index_a for index_a in range(20) if past.has_partner(index_a)} == partners
