@@ -22,6 +22,7 @@ from rsltrace.model.finding import Finding, GuardCount
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
 from rsltrace.trace.reader import Trace
+from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
@@ -36,20 +37,17 @@ class Guarding:
         self._stack = stack
         self.guard: Guard | None = None
         self._core: Core | None = None
+        self._early: list[Finding] = []
 
     def begin(self, core: Core, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
         from rsltrace.ros.guarded import GuardContext
 
         def on_finding(finding: Finding) -> None:
-            if core.recorder is None:
-                early.append(finding)  # of an import, before there is a trace
-                return
-            for one in [*early, finding]:
-                core.recorder.finding(one, core.loop.now_ns)
-            early.clear()
-
-        early: list[Finding] = []
+            if core.recorder is not None:
+                core.recorder.finding(finding, core.loop.now_ns)
+            elif not core.loop.events:
+                self._early.append(finding)  # of an import, before there is a trace
 
         self._core = core
         if replay is not None and not self._job.guard.enabled:
@@ -85,6 +83,12 @@ class Guarding:
 
         core.on_node = on_node
         streams.enter(name_of())
+
+    def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
+        """Write down what was found before there was a trace: when modules were imported."""
+        for finding in self._early:
+            recorder.finding(finding, now_ns)
+        self._early.clear()
 
     @property
     def counts(self) -> tuple[GuardCount, ...]:

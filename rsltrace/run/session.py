@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +34,7 @@ from rsltrace.run.bags import (
 from rsltrace.run.clocks import clocks_of
 from rsltrace.run.entries import hook_entries, node_entries
 from rsltrace.run.executables import why_not
-from rsltrace.run.guarding import guarding
+from rsltrace.run.guarding import Guarding, guarding
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
@@ -111,6 +111,8 @@ class Session:
         self._stack = ExitStack()
         self._writer: TraceWriter | None = None
         self._bags: list[BagInput]
+        self._notes: tuple[str, ...]
+        self._guarded: Guarding
         self._entries: list[Entry]
 
     def __enter__(self) -> Session:
@@ -133,34 +135,53 @@ class Session:
 
     def _open(self, stack: ExitStack) -> None:
         from rsltrace.ros.installing import check_free
-        from rsltrace.ros.world import World
 
         check_free()
         expanded = expand(self.job, why_not=why_not)
         self.job = expanded.job
-        job, observer = self.job, self._observer
+        self._open_bags(stack, expanded.notes)
+        stack.enter_context(search_path(self.job))
+        self._guarded = guarding(stack, self.job)
+        self._make_world(stack)
+        self._guarded.begin(self.world.core, self._replay)
+        with self._guarded.engaged():
+            self._import_what_is_named()
+        check_bag_types(self._bags)
+        if self._output is not None:
+            self._open_trace(stack, self._output)
+        if self._observer.interrupt is not None:
+            self._observer.interrupt(self.loop.stop)
+        stack.enter_context(quiet_gc())
+
+    def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
+        """Open the bags, from which the run may have its start and its end."""
+        job = self.job
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
-        self._notes = (*expanded.notes, *notes_of(job, self._bags))
-        if observer.note is not None:
+        self._notes = (*notes, *notes_of(job, self._bags))
+        if self._observer.note is not None:
             for note in self._notes:
-                observer.note(note)
+                self._observer.note(note)
         self.start_ns = start_ns_of(job, self._bags)
         self.end_ns = end_ns_of(job, self.start_ns)
-        stack.enter_context(search_path(job))
-        self._guarded = guarding(stack, job)
+
+    def _make_world(self, stack: ExitStack) -> None:
+        """Make the loop and the world that the job describes, still without nodes."""
+        from rsltrace.ros.world import World
+
+        job = self.job
         kind = OrderedLoop if is_ordered(job) else EventLoop
         self.loop = loop = kind(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
-            between_steps=housekeeping(lambda: self.world.core, observer, self.end_ns),
+            between_steps=housekeeping(lambda: self.world.core, self._observer, self.end_ns),
         )
+        loop.min_step_ns = job.min_time_step_ns
         self.world = world = stack.enter_context(
             World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
-        loop.min_step_ns = job.min_time_step_ns
         plan = network_plan(job, self.start_ns)
         if plan is not None:
             world.use_network(plan)
@@ -169,31 +190,32 @@ class Session:
                 world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
         world.use_clocks(clocks_of(job), self.start_ns)
         world.core.met = Met() if has_rules(job) else None
-        self._guarded.begin(world.core, self._replay)
-        with self._guarded.engaged():
-            loop.stop_conditions = tuple(
-                stop_conditions(job, self.start_ns, world.core.outside_events)
-            )
-            with world.importing():
-                self._entries = [
-                    *hook_entries(job, "before", job.hooks.before, lambda: job),
-                    *node_entries(job),
-                    *hook_entries(job, "after", job.hooks.after, world.all_nodes),
-                ]
-        check_bag_types(self._bags)
-        if self._output is not None:
-            self._writer = writer = stack.enter_context(
-                TraceWriter(self._output, force=self._force)
-            )
-            world.core.recorder = Recorder(writer, keep_payload=payload_filter(job))
-            write_job(writer, job)
-            writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
-            writer.add_metadata(METADATA_SOURCES, sources(job))
-            if job.stop.size is not None:
-                loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
-        if observer.interrupt is not None:
-            observer.interrupt(loop.stop)
-        stack.enter_context(quiet_gc())
+
+    def _import_what_is_named(self) -> None:
+        """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
+        job, world = self.job, self.world
+        self.loop.stop_conditions = tuple(
+            stop_conditions(job, self.start_ns, world.core.outside_events)
+        )
+        with world.importing():
+            self._entries = [
+                *hook_entries(job, "before", job.hooks.before, lambda: job),
+                *node_entries(job),
+                *hook_entries(job, "after", job.hooks.after, world.all_nodes),
+            ]
+
+    def _open_trace(self, stack: ExitStack, path: Path) -> None:
+        """Create the file, and write down what is known before the run."""
+        job = self.job
+        self._writer = writer = stack.enter_context(TraceWriter(path, force=self._force))
+        recorder = Recorder(writer, keep_payload=payload_filter(job))
+        self.world.core.recorder = recorder
+        write_job(writer, job)
+        writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
+        writer.add_metadata(METADATA_SOURCES, sources(job))
+        self._guarded.trace_begins(recorder, self.loop.now_ns)
+        if job.stop.size is not None:
+            self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
     @property
     def ended(self) -> bool:

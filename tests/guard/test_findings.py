@@ -108,8 +108,13 @@ def test_imports_are_watched_and_libraries_are_not(recorded: Callable[..., Any])
         "logging.getLogger('x').debug('y'); copy.deepcopy({1: [2]}); json.dumps({1: 2})",
         imports="import copy, json, logging, os, wave, sqlite3\nX = os.environ.get('SHIFT')",
     )
-    counted = [(met.call, met.node, met.count) for met in recorded(code).guarded if met.is_finding]
+    result = recorded(code)
+    counted = [(met.call, met.node, met.count) for met in result.guarded if met.is_finding]
     assert counted == [("os.environ['SHIFT']", "", 1)]
+    with Trace.open(result.path) as trace:
+        assert {event: [f.call for f in found] for event, found in trace.findings.items()} == {
+            0: ["os.environ['SHIFT']"]
+        }
 
 
 def test_a_million_calls_in_an_event_are_not_a_million_records(
