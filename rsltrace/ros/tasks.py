@@ -10,7 +10,9 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable
 from functools import partial
+from types import FunctionType, MethodType
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.ros import groups
@@ -23,11 +25,25 @@ if TYPE_CHECKING:
     from rsltrace.ros.mailbox import Mailbox
     from rsltrace.ros.node import NodeHandle
 
-is_coroutine_function = inspect.iscoroutinefunction
-
 _TASK = int(EventKind.TASK)
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
+
+
+_is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
+
+
+def is_coroutine_function(callback: object) -> bool:
+    """Return whether calling ``callback`` gives a coroutine; about a method, look only once.
+
+    Looking costs a microsecond, and more where an audit hook is told of each look at code.
+    """
+    if type(callback) is not MethodType or type(callback.__func__) is not FunctionType:
+        return inspect.iscoroutinefunction(callback)
+    known = _is_coroutine.get(callback.__func__)
+    if known is None:
+        known = _is_coroutine[callback.__func__] = inspect.iscoroutinefunction(callback)
+    return known
 
 
 class TaskRun:
