@@ -11,8 +11,7 @@ import os
 import sys
 import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from fnmatch import fnmatchcase
 from types import FrameType
 from typing import Any, Protocol
@@ -235,21 +234,27 @@ def engaged() -> Guard | None:
     return None
 
 
-@contextmanager
-def engage(guard: Guard | None) -> Iterator[None]:
-    """Put ``guard`` in charge of what this thread does now (None: nobody)."""
-    if guard is None:
-        saved, _engaged[:] = list(_engaged), []
-        try:
-            yield
-        finally:
-            _engaged[:] = saved
-        return
-    _engaged.append(guard)
-    try:
-        yield
-    finally:
-        _engaged.remove(guard)
+class engage:  # noqa: N801  (used like a function)
+    """Put ``guard`` in charge of what this thread does within (None: nobody)."""
+
+    __slots__ = ("_before", "_guard")
+
+    def __init__(self, guard: Guard | None) -> None:
+        self._guard = guard
+        self._before: list[Guard] = []
+
+    def __enter__(self) -> None:
+        if self._guard is None:
+            self._before = _engaged[:]
+            _engaged.clear()
+        else:
+            _engaged.append(self._guard)
+
+    def __exit__(self, *error: object) -> None:
+        if self._guard is None:
+            _engaged[:] = self._before
+        else:
+            _engaged.remove(self._guard)
 
 
 def caller(depth: int = 2) -> FrameType:

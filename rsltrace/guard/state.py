@@ -2,9 +2,9 @@
 
 What a node keeps is written as canonical bytes and hashed with XXH3-64. Values count, not objects:
 two equal lists hash alike, shared or not. -0.0 is 0.0, every NaN is the same, sets have no order
-(dicts have one that programs see, so it counts). An array's data is hashed where it is, at some 20
-microseconds a megabyte. What has no value to speak of (locks,
-generators, handles of the middleware) is left out and listed.
+(dicts have one that programs see, so it counts). An array's data is hashed where it is, at the speed
+of memory. What has no value to speak of (locks, generators, handles of the middleware) is left out
+and listed.
 """
 
 from __future__ import annotations
@@ -34,6 +34,8 @@ _hash64: Callable[[Any], int] = xxhash.xxh3_64_intdigest
 _pack_double = struct.Struct("<d").pack
 _pack_count = struct.Struct("<Q").pack
 _NAN = b"fN"
+_identity: Callable[[object], int] = object.__hash__
+"""What tells objects apart, like ``id``, but no audit hook is told of it."""
 
 _SKIPPED_MODULES = frozenset(
     "_thread threading _io io socket ssl _socket select selectors asyncio multiprocessing "
@@ -49,11 +51,14 @@ class StateHasher:
         self.skipped: dict[str, str] = {}
         self.place = ""
         self._open: dict[int, int] = {}
-        self._seen: dict[tuple[str, int], int] = {}
+        self._seen: dict[str, dict[int, int]] = {}
         self._out: list[bytes] = []
 
     def digest(self, value: object, place: str) -> int:
         """Return the hash of a value, never 0; ``place`` names it where something is left out."""
+        write = _PLAIN.get(type(value))
+        if write is not None:
+            return _hash64(write(value)) or 1
         self.place = place
         out: list[bytes] = []
         self._out = out
@@ -67,18 +72,19 @@ class StateHasher:
         if write is not None:
             self._out.append(write(value))
             return
-        if id(value) in self._open:
-            self._out.append(b"^%d;" % self._open[id(value)])
+        opened, key = self._open, _identity(value)
+        if key in opened:
+            self._out.append(b"^%d;" % opened[key])
             return
-        if len(self._open) >= DEPTH_MAX:
+        if len(opened) >= DEPTH_MAX:
             self._skip(value)
             return
-        self._open[id(value)] = len(self._open)
+        opened[key] = len(opened)
         try:
             handler = _HANDLERS.get(kind) or _handler_of(kind)
             handler(self, value)
         finally:
-            del self._open[id(value)]
+            del opened[key]
 
     def _skip(self, value: object) -> None:
         kind = type(value)
@@ -116,11 +122,12 @@ class StateHasher:
         return b"".join(own)
 
     def _array(self, value: Any) -> None:
-        self._out.append(b"a" + f"{value.dtype.str}{value.shape}".encode())
-        if value.dtype.hasobject:
+        dtype = value.dtype
+        self._out.append(f"a{dtype.str}{value.shape}".encode())
+        if dtype.hasobject:
             self._sequence(value.ravel().tolist())
-        elif value.dtype.names is not None:
-            for name in value.dtype.names:
+        elif dtype.names is not None:
+            for name in dtype.names:
                 self._array(value[name])
         else:
             self._out.append(_pack_count(array_hash(value, self._seen)))
@@ -163,7 +170,7 @@ class StateHasher:
 
     def _bound(self, value: Any) -> None:
         self._out.append(f"m{value.__func__.__qualname__};".encode())
-        if id(value.__self__) not in self._open:
+        if _identity(value.__self__) not in self._open:
             self._add(value.__self__)
 
     def _partial(self, value: Any) -> None:
@@ -219,56 +226,71 @@ def _is_left_out(kind: type) -> bool:
     return issubclass(kind, _SKIPPED_TYPES) or not _SKIPPED_MODULES.isdisjoint(modules)
 
 
-def array_hash(value: Any, seen: dict[tuple[str, int], int]) -> int:
+def array_hash(value: Any, seen: dict[str, dict[int, int]]) -> int:
     """Return the hash of an array's data, in which equal numbers count as equal.
 
-    It is done in blocks, and ``seen`` remembers the canonical hash of a block by its plain one:
-    what has not changed is read only once.
+    It is done in blocks, and ``seen`` remembers, by type, the canonical hash of a block by its
+    plain one: what has not changed is read only once.
     """
     data = np.ascontiguousarray(value)
     dtype = data.dtype
     if dtype.kind not in "fc" or not data.size:
         return _hash64(data.view(np.uint8) if dtype.kind in "UMm" and data.size else data)
-    parts = data.reshape(-1).view(data.real.dtype)
-    if parts.itemsize > 8:  # long doubles have padding, which is never set
-        high = parts.astype(np.float64)
-        low = np.where(np.isfinite(high), parts - high, 0).astype(np.float64)
+    parts = data.reshape(-1)
+    if dtype.kind == "c":
+        parts = parts.view(data.real.dtype)
+    size = parts.itemsize
+    if size > 8:  # long doubles have padding, which is never set
+        with np.errstate(all="ignore"):
+            high = parts.astype(np.float64)
+            low = np.where(np.isfinite(high), parts - high, 0).astype(np.float64)
         return _hash64(struct.pack("<2Q", array_hash(high, seen), array_hash(low, seen)))
-    if len(seen) > _SEEN_MAX:
-        seen.clear()
-    count = _BLOCK_BYTES // parts.itemsize
+    kind = parts.dtype.str
+    known = seen.get(kind)
+    if known is None or len(known) > _SEEN_MAX:
+        known = seen[kind] = {}
+    count = _BLOCK_BYTES // size
     digests = []
     for start in range(0, len(parts), count):
         block = parts[start : start + count]
-        key = dtype.str, _hash64(block)
-        digest = seen.get(key)
+        plain = _hash64(block)
+        digest = known.get(plain)
         if digest is None:
             # As it is, a block nearly always is in its canonical form.
-            digest = key[1]
-            if _has_several_forms(block):
-                digest = _canonical_hash(block)
-            seen[key] = digest
+            digest = _canonical_hash(block) if _has_several_forms(block, kind) else plain
+            known[plain] = digest
         digests.append(digest)
     return digests[0] if len(digests) == 1 else _hash64(struct.pack(f"<{len(digests)}Q", *digests))
 
 
 def _canonical_hash(block: Any) -> int:
-    block = block + 0.0  # -0.0 + 0.0 is 0.0
-    block[np.isnan(block)] = np.nan
-    return _hash64(block)
+    canonical = block.copy()
+    canonical[canonical == 0.0] = 0.0
+    canonical[np.isnan(canonical)] = np.nan
+    return _hash64(canonical)
 
 
-def _has_several_forms(parts: Any) -> bool:
+def _has_several_forms(parts: Any, kind: str) -> bool:
     """Return whether there is a -0.0 or a NaN among floats: two quick looks, rarely true."""
-    lowest = _LOWEST[parts.dtype.itemsize]
-    smallest = parts.min()
-    return bool(smallest != smallest or parts.view(lowest.dtype).min() == lowest)
+    smallest = float(_smallest(parts))
+    if smallest > 0.0:
+        return False
+    if smallest != smallest:
+        return True
+    integers, lowest = _INTEGERS[kind]
+    return int(_smallest(parts.view(integers))) == lowest
 
 
+_INTEGERS = {
+    f"{order}f{size}": (np.dtype(f"{order}i{size}"), -(1 << (8 * size - 1)))
+    for order in "<>"
+    for size in (2, 4, 8)
+}
+"""Integers as wide as floats, and the smallest of them: it has the bit pattern of -0.0."""
+
+_smallest: Any = np.minimum.reduce
 _BLOCK_BYTES = 256 << 10
-_SEEN_MAX = 100_000
-_LOWEST = {size: np.array(-(2 ** (8 * size - 1)), dtype=f"<i{size}") for size in (2, 4, 8)}
-"""-0.0 has this bit pattern, the smallest integer of its size."""
+_SEEN_MAX = 1 << 14
 
 
 def _float(value: float) -> bytes:
@@ -317,6 +339,9 @@ _PLAIN: dict[type, Callable[[Any], bytes]] = {
     datetime.timedelta: lambda value: b"t" + repr(value).encode(),
     uuid.UUID: lambda value: b"u" + value.bytes,
 }
+
+UNCHANGING = frozenset(_PLAIN) - {bytearray, memoryview, type, types.FunctionType}
+"""Types whose values stay as they are, and so does their hash."""
 
 _Handler = Callable[[StateHasher, Any], None]
 _HANDLERS: dict[type, _Handler] = {

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.guard.guard import engage
 from rsltrace.guard.snapshot import Snapshots
-from rsltrace.guard.state import StateHasher
+from rsltrace.guard.state import UNCHANGING, StateHasher
 from rsltrace.trace.chain import hash64
 
 if TYPE_CHECKING:
@@ -27,6 +27,9 @@ class NodeState:
         self._handle = handle
         self._hasher = StateHasher()
         self._snapshots = Snapshots() if keeps else None
+        self._names: list[str | None] = []
+        self._shown: dict[str, tuple[str, bool]] = {}
+        self._last: dict[str, tuple[object, int, str]] = {}
 
     @property
     def left_out(self) -> dict[str, str]:
@@ -40,27 +43,48 @@ class NodeState:
             return 0
         with engage(None):  # what a hash looks at is no finding
             attributes = self._attributes(node)
-            digest = self._hasher.digest
-            hashes = {name: digest(value, name) for name, value in attributes.items()}
+            hashes, text = self._hashes(attributes)
             recorder = self._core.recorder
             if self._snapshots is not None and recorder is not None:
                 changes = self._snapshots.changes(attributes, hashes)
                 if changes:
-                    text = json.dumps(changes, separators=(",", ":"), sort_keys=True)
-                    recorder.state(self._handle.entity_id, self._core.loop.now_ns, text)
-        parts = "".join(f"{name}={value:x};" for name, value in hashes.items())
-        return hash64(parts.encode("utf-8", "surrogatepass")) or 1
+                    changed = json.dumps(changes, separators=(",", ":"), sort_keys=True)
+                    recorder.state(self._handle.entity_id, self._core.loop.now_ns, changed)
+        return hash64(text.encode("utf-8", "surrogatepass")) or 1
+
+    def _hashes(self, attributes: dict[str, Any]) -> tuple[dict[str, int], str]:
+        """Return the hash of each attribute, and all of them as a text."""
+        last, hashes, parts = self._last, {}, []
+        for name, value in attributes.items():
+            before = last.get(name)
+            if before is not None and before[0] is value:  # it never changes, and has not been set
+                _, digest, part = before
+            else:
+                digest = self._hasher.digest(value, name)
+                part = f"{name}={digest:x};"
+                if type(value) in UNCHANGING:
+                    last[name] = value, digest, part
+            hashes[name] = digest
+            parts.append(part)
+        return hashes, "".join(parts)
 
     def _attributes(self, node: Any) -> dict[str, Any]:
         hook = getattr(node, "rsltrace_state", None)
         if callable(hook):
             state = hook()
             return dict(state) if isinstance(state, dict) else {"rsltrace_state()": state}
-        own = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
-        attributes = {name: value for name, value in vars(node).items() if name not in own}
-        for name, parameter in node._parameters.items():
-            attributes[f"parameter {name}"] = parameter.value
-        return dict(sorted(attributes.items()))
+        own, parameters = vars(node), node._parameters
+        names = [*own, None, *parameters]
+        if names != self._names:
+            rclpys = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
+            self._names = names
+            shown = {name: (name, False) for name in own if name not in rclpys}
+            shown.update({f"parameter {name}": (name, True) for name in parameters})
+            self._shown = dict(sorted(shown.items()))
+        return {
+            as_shown: parameters[name].value if is_parameter else own[name]
+            for as_shown, (name, is_parameter) in self._shown.items()
+        }
 
 
 @lru_cache(maxsize=256)

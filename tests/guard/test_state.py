@@ -7,6 +7,7 @@ import collections
 import copy
 import dataclasses
 import enum
+import math
 import os
 import random
 import threading
@@ -16,10 +17,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.guard.state import StateHasher
+
+GOLDEN = {
+    "plain": "8b37d7770a17ec3c",
+    "object": "304ec163611d6c9e",
+    "array": "038ece37059066d2",
+    "bytes": "74f273b3904d399f",
+}
 
 
 def digest(value: object) -> int:
@@ -167,6 +175,64 @@ def test_one_element_of_a_large_array_is_seen_wherever_it_is() -> None:
     assert digest(data) == digest(np.stack([data, data], axis=1)[:, 0])
 
 
+FLOATS = ["<f2", "<f4", "<f8", ">f2", ">f4", ">f8", "<c8", ">c16", "g"]
+
+
+def in_one_form(data: Any) -> Any:
+    """Write an array with plain numbers: slowly, and beyond doubt."""
+    plain = np.empty_like(data)
+    for place, value in np.ndenumerate(data):
+        parts = [value.real, value.imag] if data.dtype.kind == "c" else [value]
+        parts = [math.nan if part != part else 0.0 if part == 0 else part for part in parts]
+        plain[place] = complex(*parts) if data.dtype.kind == "c" else parts[0]
+    return plain
+
+
+@pytest.mark.parametrize("dtype", FLOATS)
+@settings(max_examples=12)
+@given(data=st.data())
+def test_an_array_hashes_as_the_numbers_in_it(dtype: str, data: st.DataObject) -> None:
+    odd = st.sampled_from([-0.0, 0.0, math.nan, -math.nan, math.inf, 1.0, -1.0])
+    values = data.draw(st.lists(odd, min_size=1, max_size=8))
+    length = data.draw(st.sampled_from([1, 20_000]))
+    array = np.ones(length * len(values), dtype)
+    at = data.draw(st.integers(0, len(array) - len(values)))
+    array[at : at + len(values)] = values
+    plain = array.copy()
+    plain[at : at + len(values)] = in_one_form(array[at : at + len(values)])
+    hasher = StateHasher()
+    assert hasher.digest(array, "x") == hasher.digest(plain, "x") == digest(array)
+    strided = np.zeros((len(array), 2), dtype)
+    strided[:, 1] = array
+    assert digest(strided[:, 1]) == digest(array)
+    array[at] = 2.0
+    assert hasher.digest(array, "x") == digest(array) != digest(plain)
+
+
+def test_every_bit_pattern_of_nan_is_the_same_and_none_warns() -> None:
+    with np.errstate(all="raise"):
+        for kind, pattern in (("<f8", 0x7FF0000000000001), ("<f4", 0x7F800001), (">f2", 0x7C01)):
+            bits = np.zeros(10, kind.replace("f", "u"))
+            bits[3] = pattern  # a signalling one
+            quiet = np.zeros(10, kind)
+            quiet[3] = math.nan
+            assert digest(bits.view(kind)) == digest(quiet)
+        assert digest(np.array([math.inf, math.nan], "g"))
+
+
+def test_hashes_stay_what_they_are() -> None:
+    # Traces keep them, and are compared with those of later versions.
+    data = np.arange(100_000.0)
+    data[7] = -0.0
+    values: dict[str, Any] = {
+        "plain": [1, 2.5, "a", b"b", None, True, {"k": (1j, {"s"})}],
+        "object": random.Random(1),
+        "array": data,
+        "bytes": np.arange(5, dtype=np.uint8),
+    }
+    assert {name: f"{digest(value):016x}" for name, value in values.items()} == GOLDEN
+
+
 def test_cycles_and_depth_end() -> None:
     one: list[Any] = [1]
     one.append(one)
@@ -224,6 +290,7 @@ CHANGES: list[tuple[str, Callable[[Any], Any]]] = [
     ("big[100000]", lambda node: node.big.__setitem__(100_000, -1.0)),
     ("names", lambda node: node.names.add("more")),
     ("message.pose.position.x", lambda node: setattr(node.message.pose.position, "x", 0.25)),
+    ("path[1]", lambda node: node.path.__setitem__(1, 9)),
     ("hidden", lambda node: setattr(node, "_hidden", None)),
     ("extra", lambda node: setattr(node, "extra", 1)),
 ]
@@ -248,6 +315,7 @@ def planted_node() -> Any:
             self.big = np.zeros(131_072)
             self.names = {"one", "two"}
             self.message = PoseStamped()
+            self.path = [1, 2]
             self._hidden = 1
             self.lock = threading.Lock()
             self.count = 0
@@ -334,6 +402,44 @@ def test_state_hashes_are_off_by_default_and_listed_in_info(tmp_path: Path) -> N
         )
     shown = CliRunner().invoke(info, [str(on)]).output
     assert 'state hashes leave out: {"/planted": {"lock": "rsltrace.ros.locks.SimLock"}}' in shown
+
+
+STEPS: list[Callable[[Any], object]] = [
+    lambda node: setattr(node, "text", "a" * 1000),
+    lambda node: None,
+    lambda node: setattr(node, "text", "b"),
+    lambda node: setattr(node, "text", "a" * 1000),
+    lambda node: setattr(node, "more", True),
+    lambda node: delattr(node, "more"),
+    lambda node: setattr(node, "more", 1),
+    lambda node: setattr(node, "more", 1.0),
+]
+
+
+@pytest.mark.ros
+def test_an_attribute_that_is_set_again_removed_and_added_is_seen(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    from rclpy.node import Node
+
+    from rsltrace.model.event import EventKind
+    from rsltrace.trace.reader import Trace
+
+    class Changing(Node):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__("changing")
+            PLANTED["steps"] = iter(STEPS)  # not in the node: it would be state
+            self.create_timer(0.1, self.tick)
+
+        def tick(self) -> None:
+            next(PLANTED["steps"], lambda node: None)(self)
+
+    path = recorded(tmp_path / "run.mcap", Changing, True, 0, lambda node: None)
+    with Trace.open(path) as trace:
+        events = np.concatenate(list(trace.events()))
+    hashes = events["state_hash"][events["kind"] == EventKind.TIMER].tolist()
+    first, same, other, back, more, less, one, real = hashes[: len(STEPS)]
+    assert first == same == back == less
+    assert len({first, other, more, one, real}) == 5
 
 
 @pytest.mark.ros
