@@ -2,9 +2,9 @@
 
 What a node keeps is written as canonical bytes and hashed with XXH3-64. Values count, not objects:
 two equal lists hash alike, shared or not. -0.0 is 0.0, every NaN is the same, sets have no order
-(dicts have one that programs see, so it counts). An array's data is hashed where it is, at the speed
-of memory. What has no value to speak of (locks, generators, handles of the middleware) is left out
-and listed.
+(dicts have one that programs see, so it counts). An array's data is hashed where it is, at the
+speed of memory. What has no value to speak of (locks, generators, handles of the middleware) is
+left out and listed.
 """
 
 from __future__ import annotations
