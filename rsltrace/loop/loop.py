@@ -230,7 +230,10 @@ class EventLoop:
                     elif not idle or not self._run_idle():
                         break
                 if self.events >= limit:
-                    self._livelock(now_ns)
+                    if self.now_ns == now_ns:
+                        self._livelock(now_ns)
+                    now_ns = self.now_ns  # a callback has waited, and time has passed meanwhile
+                    limit = self.events + self._livelock_limit
             if self.events >= self._until_events:
                 return
             if self.now_ns != now_ns:  # a callback has waited, and others have gone on meanwhile

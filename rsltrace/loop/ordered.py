@@ -117,7 +117,10 @@ class OrderedLoop(EventLoop):
             elif not self.idle or not self._run_idle():
                 break
             if self.events >= limit:
-                self._livelock(now_ns)
+                if self.now_ns == now_ns:
+                    self._livelock(now_ns)
+                now_ns = self.now_ns  # a callback has waited, and time has passed meanwhile
+                limit = self.events + self._livelock_limit
 
     def _next(self) -> Place | None:
         """Take out what runs next: tasks first, as rclpy has it, then what the policy chooses."""

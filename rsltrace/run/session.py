@@ -41,6 +41,7 @@ from rsltrace.run.provenance import environment, payload_filter, sources, write_
 from rsltrace.run.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.unused import has_rules, unused_parameters, unused_rules
+from rsltrace.run.watchdog import Watchdog
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -152,6 +153,8 @@ class Session:
         if self._observer.interrupt is not None:
             self._observer.interrupt(self.loop.stop)
         stack.enter_context(quiet_gc())
+        self._watchdog = Watchdog(self.world.core)
+        stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
         """Open the bags, from which the run may have its start and its end."""
@@ -240,7 +243,7 @@ class Session:
             from rsltrace.ros.watch import watch_exit_code
 
             core.watch(self.job.stop.topic.name, watch_exit_code(core, self.job.stop.topic))
-        with self._failures(), self._guarded.engaged():
+        with self._failures(), self._engaged():
             self.world.plan(self._entries)
             core.fed = bool(self._bags)
             for entry in self._entries:
@@ -253,8 +256,13 @@ class Session:
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
-        with self._failures(), self._guarded.engaged():
+        with self._failures(), self._engaged():
             self.world.go_on()
+
+    @contextmanager
+    def _engaged(self) -> Iterator[None]:
+        with self._watchdog.watching(), self._guarded.engaged():
+            yield
 
     @contextmanager
     def _failures(self) -> Iterator[None]:
@@ -282,7 +290,7 @@ class Session:
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
         unused = self.unused(lasted=True) if self.world.error is None else ()
-        with self._guarded.engaged():
+        with self._engaged():
             self.world.destroy()
         error = self.world.error
         exit_code = error.exit_code if error else stop.exit_code or self.world.exit_code

@@ -299,3 +299,21 @@ def test_sleep_is_real_again_after_a_run(simulate: Any) -> None:
     real = time.sleep
     simulate(Server, duration=1)
     assert time.sleep is real
+
+
+@pytest.mark.parametrize("policy", [{}, {"policy": {"order": "permutation"}}])
+def test_a_callback_that_polls_a_clock_for_long_is_no_livelock(simulate: Any, policy: Any) -> None:
+    class Poller(Node):
+        def __init__(self) -> None:
+            super().__init__("poller")
+            self.create_timer(1.0, self.tick)
+
+        def tick(self) -> None:
+            until = time.monotonic() + 0.05
+            while time.monotonic() < until:
+                pass
+            self.get_logger().info(f"{seconds(self):.3f}")
+
+    recorded = simulate(Poller, duration=2.5, job={"livelock_limit": 300, **policy})
+    assert len(recorded.events()) > 600
+    assert recorded.logs() == ["1.050", "2.050"]

@@ -335,7 +335,9 @@ def test_real_rclpy_works_after_a_simulation(record_job: Any) -> None:
     context.shutdown()
 
 
-def test_no_thread_socket_or_participant_is_started(rsltrace: Any, job_file: Any) -> None:
+def test_no_socket_or_participant_is_started_and_no_thread_but_the_watchdog(
+    rsltrace: Any, job_file: Any
+) -> None:
     # Loading rclpy's extension starts the two listeners of LTTng-UST, before any node exists.
     code = """
 import os
@@ -363,7 +365,7 @@ class Look(Node):
 """
     job_file("nodes: [{node: nodes_under_test:Look}]\nstop: {duration: 1s}\n", code)
     done = rsltrace("record", "job.yaml")
-    assert "SOCKETS 0 THREADS 0" in done.stderr, done.stderr
+    assert "SOCKETS 0 THREADS 1" in done.stderr, done.stderr
 
 
 def test_a_failing_stop_function_is_an_error_of_the_run(record_job: Any) -> None:

@@ -1,0 +1,131 @@
+"""A word about a callback that does not come back: which one, and at which line it is.
+
+Simulated time stands still while a callback runs, so one that loops for ever would hang a run in
+silence. A thread looks every two seconds of real time whether anything has happened.
+
+It must leave no mark. So it takes no part in the run, touches nothing but numbers as long as all
+is well, and keeps no object of the run alive from one look to the next: where the memory of an
+object lies decides the order of some sets. It counts its looks instead of asking a clock, so a
+process that was stopped, or a machine that slept, raises no alarm.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from _thread import allocate_lock, start_new_thread
+from array import array
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import TYPE_CHECKING
+
+from rsltrace.guard.callers import is_user_file
+from rsltrace.model.stamp import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
+
+LOOK_EVERY_S = 2.0
+_LOOKS_BEFORE_NOTE = 5
+_LOOKS_BETWEEN_NOTES = 30
+_LOOKS_MAX = 250
+"""Longer is not counted. (Python keeps one object of each number up to this for ever.)"""
+
+_JOIN_S = 1.0
+_CORE = os.path.join("rsltrace", "ros", "core.py")
+_DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", "/debugpy/")
+
+
+class Watchdog:
+    """Looks after one run, from a thread of its own between ``start`` and ``stop``."""
+
+    def __init__(self, core: Core) -> None:
+        self._core = core
+        self._process = os.getpid()
+        self._running = False
+        self._stopping = allocate_lock()
+        self._ended = allocate_lock()
+
+    @contextmanager
+    def on_duty(self) -> Iterator[None]:
+        """Have the thread within the ``with`` block."""
+        ready = allocate_lock()
+        for lock in (self._stopping, self._ended, ready):
+            lock.acquire()
+        start_new_thread(self._look, (ready,))
+        ready.acquire()
+        try:
+            yield
+        finally:
+            self._stopping.release()
+            if os.getpid() == self._process:
+                self._ended.acquire(timeout=_JOIN_S)  # it may be stuck in printing
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Expect something to happen within the ``with`` block: the run is going on."""
+        self._running = True
+        try:
+            yield
+        finally:
+            self._running = False
+
+    def _look(self, ready: object) -> None:
+        seen = array("q", (-1, -1))
+        still, since_note = 0, _LOOKS_BETWEEN_NOTES
+        ready.release()  # type: ignore[attr-defined]
+        del ready
+        while not self._stopping.acquire(timeout=LOOK_EVERY_S):
+            loop = self._core.loop
+            if self._running and loop.events == seen[0] and loop.now_ns == seen[1]:
+                still = min(still + 1, _LOOKS_MAX)
+            else:
+                seen[0], seen[1] = loop.events, loop.now_ns
+                still = 0
+            del loop
+            since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
+            if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
+                with suppress(Exception):
+                    since_note = 0 if self._tell(int(still * LOOK_EVERY_S)) else since_note
+        self._ended.release()
+
+    def _tell(self, for_s: int) -> bool:
+        """Say where the run is; return whether there was anything to say."""
+        core = self._core
+        frames = list(_frames(sys._current_frames().get(core.thread)))
+        if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
+            return False  # somebody is looking at a standstill that they have made themselves
+        in_event = any(_is_execute(frame) for frame in frames)
+        handle = core.current_handle if in_event else None
+        who = "the run, outside of any callback," if handle is None else handle.describe()
+        place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
+        place = place or next(iter(frames), None)
+        where = f", {_place(place)}" if place is not None else ""
+        _say(
+            f"{who} has not come back for {for_s} s of real time; simulated time stands still at "
+            f"{format_seconds(core.loop.now_ns)} s{where}. Ctrl-C ends the run"
+        )
+        return True
+
+
+def _say(text: str) -> None:
+    """Print a note as the command does."""
+    if sys.stderr is not None:
+        print(f"rsltrace: note: {text}", file=sys.stderr, flush=True)
+
+
+def _frames(frame: FrameType | None) -> Iterator[FrameType]:
+    """Yield the frames of a stack, innermost first."""
+    while frame is not None:
+        yield frame
+        frame = frame.f_back
+
+
+def _is_execute(frame: FrameType) -> bool:
+    code = frame.f_code
+    return code.co_name == "execute" and code.co_filename.endswith(_CORE)
+
+
+def _place(frame: FrameType) -> str:
+    return f"now at {frame.f_code.co_filename}:{frame.f_lineno} in {frame.f_code.co_name}"

@@ -1,0 +1,206 @@
+"""A callback that does not come back is named; whoever stands still on purpose is left alone."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from _thread import allocate_lock
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+from rclpy.node import Node
+
+import rsltrace
+from rsltrace.run import watchdog
+
+pytestmark = pytest.mark.ros
+
+TURNS_MAX = 300_000_000
+"""A busy loop that the watchdog does not end fails after so many turns instead of hanging."""
+
+
+class Looks:
+    """Stands in for the lock that the watchdog waits for: it looks when it is told to."""
+
+    def __init__(self) -> None:
+        self._turn = allocate_lock()
+        self._turn.acquire()
+        self._over = False
+        self._arrivals = 0
+
+    def acquire(self, timeout: float | None = None) -> bool:
+        if timeout is not None:
+            self._arrivals += 1
+            self._turn.acquire()
+        return self._over
+
+    def release(self) -> None:
+        self._over = True
+        self._turn.release()
+
+    def __call__(self, count: int) -> None:
+        """Keep the calling code busy until the watchdog has looked ``count`` times."""
+        for _ in range(count):
+            arrivals = self._arrivals
+            self._turn.release()
+            for _ in range(TURNS_MAX):
+                if self._arrivals != arrivals:
+                    break
+            else:
+                raise AssertionError("the watchdog does not look")
+
+
+@pytest.fixture
+def busy(monkeypatch: pytest.MonkeyPatch) -> Looks:
+    """Keeps whoever calls it busy for so many looks of the watchdog."""
+    looks = Looks()
+    real = watchdog.Watchdog.__init__
+
+    def init(self: Any, core: Any) -> None:
+        real(self, core)
+        self._stopping = looks
+
+    monkeypatch.setattr(watchdog.Watchdog, "__init__", init)
+    return looks
+
+
+def record(callback: Callable[[int], None], path: Path, **options: Any) -> rsltrace.RunResult:
+    """Record a node whose timer calls ``callback(1)``, ``callback(2)``, … every second."""
+
+    class Busy(Node):
+        def __init__(self) -> None:
+            super().__init__("busy")
+            self.create_timer(1.0, self.tick)
+            self.count = 0
+
+        def tick(self) -> None:
+            self.count += 1
+            callback(self.count)
+
+    stop = rsltrace.StopSpec(duration="20s")
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Busy)], stop=stop, **options)
+    return rsltrace.record(job, path, force=True)
+
+
+@pytest.mark.parametrize("guard", [True, False])
+def test_a_busy_loop_is_named_with_its_line(
+    busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str], guard: bool
+) -> None:
+    def spin_wheels(count: int) -> None:
+        busy(9 if count == 2 else 4)  # four looks in every other event are no reason for a note
+
+    record(spin_wheels, tmp_path / "a.mcap", guard=guard)
+    said = capsys.readouterr().err
+    assert said.count("rsltrace: note:") == 1, said
+    assert "/busy: timer" in said
+    assert "Busy.tick has not come back for 10 s of real time" in said
+    assert "stands still at 2.000000000 s" in said
+    lines = Path(__file__).read_text().splitlines()
+    first = next(n for n, line in enumerate(lines, 1) if "def __call__" in line)
+    places = [f"{__file__}:{n} in __call__" for n in range(first, first + 11)]
+    assert any(place in said for place in places), said
+
+
+def test_there_is_at_most_one_note_in_a_minute(
+    busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record(lambda count: busy(68 if count == 1 else 6), tmp_path / "a.mcap")
+    said = capsys.readouterr().err
+    assert re.findall(r"back for (\d+) s .* at (\d+)", said) == [
+        ("10", "1"),
+        ("70", "1"),
+        ("130", "1"),
+        ("10", "6"),
+        ("10", "11"),
+        ("10", "16"),
+    ]
+
+
+def test_the_trace_is_that_of_a_run_without_a_busy_loop(busy: Looks, tmp_path: Path) -> None:
+    slow = record(lambda count: busy(6), tmp_path / "a.mcap")
+    busy._over = False
+    assert record(lambda count: None, tmp_path / "b.mcap").digest == slow.digest
+    assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
+
+
+def test_a_simulation_that_its_driver_leaves_standing_is_no_alarm(
+    busy: Looks, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Quiet(Node):
+        def __init__(self) -> None:
+            super().__init__("quiet")
+            self.create_timer(1.0, lambda: busy(6))
+
+    stop = rsltrace.StopSpec(duration="3s")
+    with rsltrace.Simulation(rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Quiet)], stop=stop)) as sim:
+        sim.run_for(0.5)
+        busy(20)
+        assert capsys.readouterr().err == ""
+        sim.run_for(1.0)
+        assert "/quiet: timer" in capsys.readouterr().err, "within the run it is one"
+
+
+def test_a_debugger_is_no_alarm(
+    busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names: dict[str, Any] = {"busy": busy}
+    exec(compile("def interaction(): busy(20)", "/usr/lib/python3/pdb.py", "exec"), names)
+    record(lambda count: names["interaction"](), tmp_path / "a.mcap")
+    assert capsys.readouterr().err == ""
+
+
+def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
+    def threads() -> int:
+        return len(os.listdir("/proc/self/task"))
+
+    seen: list[int] = []
+
+    class Look(Node):
+        def __init__(self) -> None:
+            super().__init__("look")
+            seen.append(threads())
+
+    stop = rsltrace.StopSpec(duration="1s")
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Look)], stop=stop)
+    rsltrace.record(job, tmp_path / "a.mcap")  # loads what starts threads of its own
+    before = threads()
+    rsltrace.record(job, tmp_path / "a.mcap", force=True)
+    assert seen[-1] == before + 1
+    assert threads() == before
+
+
+def test_ctrl_c_twice_ends_a_busy_loop_with_a_whole_trace(tmp_path: Path) -> None:
+    (tmp_path / "busy_node.py").write_text(
+        "from rclpy.node import Node\n"
+        "class Busy(Node):\n"
+        "    def __init__(self):\n"
+        "        super().__init__('busy')\n"
+        "        self.create_timer(1.0, self.tick)\n"
+        "    def tick(self):\n"
+        "        open('reached', 'w').close()\n"
+        "        while True:\n"
+        "            pass\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'busy_node:Busy'}]\nstop: {duration: 3s}\n")
+    command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "run.mcap"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) as process:
+        while process.poll() is None and not (tmp_path / "reached").exists():
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.stderr is not None
+        for line in process.stderr:
+            if "once more to force" in line:
+                process.send_signal(signal.SIGINT)
+    assert process.returncode == 130
+    with rsltrace.Trace.open(tmp_path / "run.mcap") as trace:
+        assert trace.complete
+        assert trace.event(1).flags.name == "RAISED"
