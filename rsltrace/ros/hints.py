@@ -60,15 +60,43 @@ def cannot_import(module: str, error: ModuleNotFoundError) -> str:
     )
 
 
+def import_raised(module: str, error: BaseException, said: str) -> str:
+    """Say what a user's module raised (``said``: its text) when it was imported, and where."""
+    if isinstance(error, SyntaxError) and error.filename:
+        place, line = f"{error.filename}:{error.lineno}", error.text or ""
+        said = error.msg
+    else:
+        place, line = _last_line(error.__traceback__)
+    said = f"{type(error).__qualname__}: {said}".removesuffix(": ")
+    hint = ""
+    if isinstance(error, SystemExit):
+        hint = (
+            "; what a module does when it is imported should be definitions: put the rest into a "
+            "function (and name that with 'main:')"
+        )
+    shown = f" ({place})\n    {line.strip()}" if place else ""
+    return f"module {module!r} cannot be imported: it raised {said}{hint}{shown}"
+
+
 def hint_for(error: BaseException) -> str:
     """Return what to add to the text of an exception that user code raised while it ran."""
     if isinstance(error, ZeroDivisionError):
         return _STANDS_STILL
+    if type(error).__name__ == "InvalidParameterTypeException":
+        return _as_double(str(error))
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return ""
     package = error.name.partition(".")[0]
     _, line = _last_line(error.__traceback__)
     return f"\n  {where_to_get(package)}" if _is_interface(package, line) else ""
+
+
+def _as_double(said: str) -> str:
+    """Say how to write the commonest parameter of a wrong type."""
+    found = re.search(r"to '(-?[0-9]+)' of type 'INTEGER', expecting type 'DOUBLE'", said)
+    if found is None:
+        return ""
+    return f"\n  write {found[1]}.0: ROS takes no integer for a parameter with a decimal point"
 
 
 def _is_interface(package: str, line: str) -> bool:

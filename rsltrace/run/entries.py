@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from functools import partial
+from inspect import Parameter
 from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate, policy_of, showing_line
 from rsltrace.job.node import Target, target_text
+from rsltrace.job.problems import Loc, nearest
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.entry import Entry, ros_arguments
 from rsltrace.run.executables import Mains
 from rsltrace.run.guarding import entry_key
 from rsltrace.run.target import load_target
+
+_BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
 
 def node_entries(job: Job) -> list[Entry]:
@@ -27,6 +32,7 @@ def node_entries(job: Job) -> list[Entry]:
         argv = None
         make: Any
         with showing_line(job, loc):
+            _check_parameter_files(job, index)
             arguments = ros_arguments(
                 name=spec.name,
                 namespace=spec.namespace,
@@ -42,6 +48,7 @@ def node_entries(job: Job) -> list[Entry]:
             else:
                 target = spec.node
                 found = load_target(target, where=where) if isinstance(target, str) else target
+                _check_arguments(job, index, found)
                 make = partial(found, **spec.arguments)
         entries.append(
             Entry(
@@ -55,6 +62,52 @@ def node_entries(job: Job) -> list[Entry]:
             )
         )
     return entries
+
+
+def _check_parameter_files(job: Job, index: int) -> None:
+    """Raise ``JobError`` at the line of a parameter file that rcl cannot read."""
+    spec = job.nodes[index]
+    for number, path in enumerate(spec.parameter_files):
+        try:
+            RosArguments(["--ros-args", "--params-file", str(job.resolve(path))])
+        except InvalidArgumentsError as error:
+            loc = ("nodes", index, "parameter_files", number)
+            where = spec.origin or locate(job, loc)
+            said = str(error).partition("Error: ")[2].strip() or str(error)
+            with showing_line(job, loc):
+                raise JobError(f"{path} is no ROS parameter file: {said}", where=where) from error
+
+
+def _check_arguments(job: Job, index: int, target: Any) -> None:
+    """Raise ``JobError`` if a class or function does not take the ``arguments`` of its entry."""
+    spec = job.nodes[index]
+    assert isinstance(spec.arguments, dict)
+    try:
+        signature = inspect.signature(target, follow_wrapped=False)
+    except (TypeError, ValueError):
+        return  # nobody knows
+    names = [name for name, one in signature.parameters.items() if one.kind in _BY_NAME]
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
+    for name in spec.arguments:
+        if name not in names and not takes_any:
+            near = nearest(name, names)
+            takes = f"it takes {', '.join(names)}" if names else "it takes none"
+            hint = f"did you mean {near!r}?" if near else takes
+            wrong = f"{spec.target} takes no argument {name!r}: {hint}"
+            raise _shown(job, ("nodes", index, "arguments", name), wrong)
+    try:
+        signature.bind(**spec.arguments)
+    except TypeError as error:
+        where = locate(job, ("nodes", index, "node"))
+        raise JobError(f"{spec.target}: {error}; give it in 'arguments:'", where=where) from error
+
+
+def _shown(job: Job, loc: Loc, message: str) -> JobError:
+    try:
+        with showing_line(job, loc):
+            raise JobError(message, where=locate(job, loc))
+    except JobError as error:
+        return error
 
 
 def hook_entries(

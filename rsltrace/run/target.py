@@ -6,8 +6,9 @@ import difflib
 import importlib
 from typing import Any
 
-from rsltrace.errors import JobError
-from rsltrace.ros.hints import cannot_import
+from rsltrace.errors import JobError, RsltraceError
+from rsltrace.ros.failure import text_of
+from rsltrace.ros.hints import cannot_import, import_raised
 
 
 def load_target(target: str, *, where: str) -> Any:
@@ -26,6 +27,10 @@ def load_target(target: str, *, where: str) -> Any:
                 where=where,
             ) from error
         raise JobError(cannot_import(module_name, error), where=where) from error
+    except RsltraceError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise JobError(import_raised(module_name, error, text_of(error)), where=where) from error
     for part in attribute.split("."):
         try:
             value = getattr(value, part)
