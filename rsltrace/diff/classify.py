@@ -175,6 +175,8 @@ def _one_sided(case: Case) -> Judgement:
         root_sentence = f"whoever drove the simulation did this only in {has}"
     else:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
+        if because := _because_of_settings(case.settings):
+            root_sentence = f"nothing before it differs, but {because}"
     return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
 
 

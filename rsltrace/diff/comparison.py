@@ -5,12 +5,12 @@ from __future__ import annotations
 from itertools import islice
 
 from rsltrace.diff.cause import Cone, Found, different_outputs
-from rsltrace.diff.ended import judge_ended, who_ended
+from rsltrace.diff.ended import failures, judge_ended, who_ended
 from rsltrace.diff.engine import interruptions, side
 from rsltrace.diff.explain import Explainer
 from rsltrace.diff.identity import Identity, identify
 from rsltrace.diff.job_settings import job_settings
-from rsltrace.diff.model import Diff, Divergence, Setting
+from rsltrace.diff.model import Diff, Divergence, Setting, Verdict
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.rows import Run
 from rsltrace.diff.settings import entity_settings, environment_settings
@@ -26,6 +26,7 @@ EVERY_DIVERGENCE_MAX = 1000
 """Told even then; each takes some milliseconds and some lines."""
 
 _EVENTS_PER_STRETCH = 4096
+_TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 
 
 def compare(a: Trace, b: Trace, start: int, options: DiffOptions) -> Diff:
@@ -55,6 +56,8 @@ class _Comparison:
         over = who_ended(self._a, self._b, self._start)
         divergences = [self._ended(over)] if over is not None else self._aligned()
         first = divergences[0]
+        if first.verdict not in _TELL_THE_END:
+            self._notes += failures(self._a, self._b)
         return Diff(
             a=side(self._a),
             b=side(self._b),

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 from rsltrace.diff.classify import Judgement
 from rsltrace.diff.engine import stop_reason
-from rsltrace.diff.model import EventView, Root, Setting, Verdict
+from rsltrace.diff.model import ENDED_BY_EXCEPTION, EventView, Root, Setting, Verdict
 from rsltrace.diff.views import at
-from rsltrace.model.event import EventKind
+from rsltrace.model.event import Event, EventFlag, EventKind
 from rsltrace.trace.reader import Trace
+
+_LOOKED_AT_MAX = 100
 
 
 def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
@@ -26,6 +28,30 @@ def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
     if over_a and over_b:
         return None if a.end_ns == b.end_ns else a if a.end_ns < b.end_ns else b
     return a if over_a else b if over_b else None
+
+
+def failures(a: Trace, b: Trace) -> list[str]:
+    """Return a note for each run that an exception ended, if that did not happen in both."""
+    if stop_reason(a) == stop_reason(b):
+        return []
+    return [
+        f"{name} {ENDED_BY_EXCEPTION}: {stop_reason(trace)}, event {event.index}, "
+        f"{at(event.stamp_ns)[3:]}"
+        for name, trace in (("a", a), ("b", b))
+        if (event := _failed(trace)) is not None
+    ]
+
+
+def _failed(trace: Trace) -> Event | None:
+    """Return the event whose exception ended a run: what follows it are the ends of its nodes."""
+    if not trace.complete or trace.result.get("exit_code", "0") == "0":
+        return None
+    last = trace.ended_after or trace.event_count
+    for index in range(last - 1, max(last - _LOOKED_AT_MAX, 0) - 1, -1):
+        event = trace.event(index)
+        if EventFlag.RAISED in event.flags:
+            return event
+    return None
 
 
 def _is_over(trace: Trace, start: int) -> bool:

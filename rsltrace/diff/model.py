@@ -101,6 +101,9 @@ class EventView:
     summary: str = ""
 
 
+ENDED_BY_EXCEPTION = "ended by an exception"
+"""In the note of a run that ended so, after its letter."""
+
 ULP_TOLD_MAX = 1_000_000
 """Reports tell smaller distances in units in the last place: larger ones are no rounding."""
 

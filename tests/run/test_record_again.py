@@ -110,3 +110,23 @@ def _drawing_node() -> Any:
             self.sender.publish(Float64(data=random.random()))
 
     return Drawing()
+
+
+def test_which_run_an_exception_ended_is_told(rsltrace: Any, job_file: Any) -> None:
+    """Where runs part by something else, that is what one wants to know of a run that failed."""
+    code = """
+class Fragile(Listener):
+    def got(self, message):
+        super().got(message)
+        assert message.data < 3, 'too much'
+"""
+    job_file(JOB.replace("Listener", "Fragile").replace("3s", "5s"), code)
+    assert rsltrace("record", "job.yaml", "-o", "b.mcap").returncode == 3
+    late = ("--set", "delay.default.constant=10ms", "--until", "2")
+    assert rsltrace("record", "job.yaml", "-o", "a.mcap", *late).returncode == 0
+    note = "ended by an exception: /listener: subscription /numbers raised AssertionError, event "
+    assert f"\nnote: b {note}" in rsltrace("diff", "a.mcap", "b.mcap").stdout
+    assert f"\nnote: a {note}" in rsltrace("diff", "b.mcap", "a.mcap").stdout
+    several = rsltrace("diff", "a.mcap", "a.mcap", "b.mcap").stdout
+    assert f"\nb.mcap {note}" in several
+    assert note not in rsltrace("diff", "b.mcap", "b.mcap").stdout

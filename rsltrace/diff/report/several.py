@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Sequence
 
 from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import Diff
+from rsltrace.diff.model import ENDED_BY_EXCEPTION, Diff
 from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
 from rsltrace.diff.report.words import event_text
 from rsltrace.model.printable import printable
@@ -57,8 +57,16 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
     lines = [line((sentence, BAD if parted else GOOD)), line()]
     lines += in_columns(rows, indent="", widest=60)
+    if failed := [text for diff in diffs if (text := _failure(diff))]:
+        lines += [line(), *(line((text, BAD)) for text in failed)]
     first = next((diff for diff in diffs if diff.parted), None)
     if first is not None:
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
         lines += [line(), line(("next: ", TITLE), printable(command))]
     return lines
+
+
+def _failure(diff: Diff | BagDiff) -> str:
+    """Return which exception ended a run that the golden one did not end with."""
+    note = next((note for note in diff.notes if note.startswith(f"b {ENDED_BY_EXCEPTION}")), "")
+    return f"{printable(diff.b.path)}{printable(note[1:])}" if note else ""

@@ -1,0 +1,67 @@
+"""What the documents point at is there: files, headings, commands and their options."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+
+from rsltrace.cli.main import cli
+
+ROOT = Path(__file__).parent.parent
+DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/*/README.md")])
+_LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(#[^)\s]*)?\)")
+_FILE = re.compile(r"`((?:docs|examples|benchmarks|sample_traces|tests)/[\w./-]*[\w/])`")
+_FENCE = re.compile(r"^```.*?^```", re.M | re.S)
+_OPTION = re.compile(r"(?<=\s)--?[a-zA-Z][\w-]*")
+
+documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
+
+
+def anchors(text: str) -> set[str]:
+    """Return the anchors of a document's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", _FENCE.sub("", text), re.M)
+    return {
+        "#" + re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+        for heading in headings
+    }
+
+
+@documents
+def test_links_lead_somewhere(path: Path) -> None:
+    text = path.read_text("utf-8")
+    for file, anchor in _LINK.findall(_FENCE.sub("", text)):
+        target = path.parent / file if file else path
+        assert target.exists(), f"{path}: {file}"
+        if anchor and target.suffix == ".md":
+            assert anchor in anchors(target.read_text("utf-8")), f"{path}: {file}{anchor}"
+    for file in _FILE.findall(text):
+        assert (ROOT / file).exists(), f"{path}: {file}"
+
+
+def commands(text: str) -> Iterator[tuple[str, list[str]]]:
+    """Yield every ``rsltrace COMMAND …`` of the document with its options."""
+    for match in re.finditer(r"\brsltrace ([a-z]+)((?:[ \t]+[^\n`]*)?)", text):
+        words = re.split(r"\s#\s|;|\||\s--ros-args\b|\s{4,}", match[2])[0]
+        yield match[1], _OPTION.findall(re.sub(r"'[^']*'|\"[^\"]*\"", "''", words))
+
+
+@documents
+def test_commands_have_the_options_that_are_shown(path: Path) -> None:
+    context = click.Context(cli)
+    for name, options in commands(path.read_text("utf-8")):
+        command = cli.get_command(context, name)
+        if command is None:  # "rsltrace does …"
+            assert not options, f"{path}: rsltrace {name} {options}"
+            continue
+        known = {opt for parameter in command.params for opt in parameter.opts}
+        known |= {"--help", "-h", "--ros-args"}
+        assert not set(options) - known, f"{path}: rsltrace {name}: {set(options) - known}"
+
+
+def test_the_options_of_commands_are_looked_at() -> None:
+    text = "`rsltrace record job.yaml -o x --frobnicate` and rsltrace diff a b --abs 'x=--y' # --no"
+    assert list(commands(text)) == [("record", ["-o", "--frobnicate"]), ("diff", ["--abs"])]
