@@ -93,6 +93,7 @@ class Guard:
         self._in_event = 0
         self._reads = 0
         self._reads_event = -1
+        self._passes = 0
         self._shown: dict[str, tuple[int, int]] = {}
 
     def in_charge(self) -> bool:
@@ -190,10 +191,11 @@ class Guard:
         """
         event = self.context.place()[0]
         if event != self._reads_event:
-            self._reads_event, self._reads = event, 0
+            self._reads_event, self._reads, self._passes = event, 0, 0
         self._reads += 1
         if self._reads > _READS_PER_EVENT:
-            self.context.pass_time(_BUSY_NS)
+            self._passes += 1  # the longer the wait, the longer the steps: about a thousandth
+            self.context.pass_time(_BUSY_NS * (1 + self._passes // 100))
             self._reads_event = self.context.place()[0]
         now_ns = self.context.now_ns()
         if is_of_python(frame):

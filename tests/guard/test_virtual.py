@@ -323,7 +323,24 @@ def test_a_clock_that_is_looked_at_for_ever_makes_time_pass(said: Callable[..., 
     for n, (rate, waited, now_ns) in enumerate(said(code), 1):
         assert rate == pytest.approx(1e6, rel=1e-3)
         assert 0.003 <= waited < 0.0031
-        assert 3_000_000 <= now_ns - n * 500_000_000 <= 3_020_000
+        assert 3_000_000 <= now_ns - n * 500_000_000 <= 3_100_000
+
+
+def test_a_long_busy_wait_takes_few_events_and_ends_in_time() -> None:
+    class Waiting(Standing):
+        passes = 0
+
+        def pass_time(self, for_ns: int) -> None:
+            self.time_ns += for_ns
+            self.passes += 1
+
+    context = Waiting()
+    guard = Guard(context, policy=Policy())
+    frame = sys._getframe()
+    while guard.clock_ns(frame) < 10**9:
+        pass
+    assert 10**9 <= context.time_ns < 1.001 * 10**9
+    assert context.passes < 5_000
 
 
 def test_a_clock_that_jumps_backwards_is_followed() -> None:
