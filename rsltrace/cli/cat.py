@@ -103,7 +103,8 @@ def cat(
 
     Columns: index, simulated time in seconds, node, kind, entity, hash of the input, hash of the
     outputs, the outputs (/topic, call /service, reply /service, log LEVEL text, …), [flags].
-    Lines that begin with "!" are what the guard found in the event above them.
+    Lines that begin with "!" are what the guard found in the event above them. What rclpy makes
+    for every node is counted; --json lists it.
 
     Options of different names must all hold; of several values of one option, any. Globs are
     shell patterns that match whole names: --topic '/robot1/*'.

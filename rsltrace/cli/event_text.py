@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import groupby
 from typing import Any
 
 from rsltrace.errors import TraceError
+from rsltrace.model.built_in import is_built_in
 from rsltrace.model.draw import draw_text
-from rsltrace.model.entity import Entity
-from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, EventFlag, Output, OutputKind
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    Event,
+    EventFlag,
+    EventKind,
+    Output,
+    OutputKind,
+)
 from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
@@ -40,6 +51,8 @@ class EventText:
     def line(self, event: Event, outputs: list[Output]) -> str:
         """Return the line of an event, without a line end."""
         node = self._nodes.get(event.entity, "-")
+        if event.kind is EventKind.CONSTRUCT and node == "-":
+            node = self._constructed(outputs)
         name = self._names.get(event.entity, f"#{event.entity}")
         columns = (
             f"{event.index:>{self._index_width}}  "
@@ -47,7 +60,7 @@ class EventText:
             f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}  "
             f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
         )
-        what = ", ".join(self._output(output) for output in outputs)
+        what = ", ".join(self._outputs(outputs))
         flags = "".join(f"  [{name}]" for name in _flag_names(event.flags))
         found = self._trace.findings.get(event.index, ())
         lines = [f"{columns}  {what}{flags}".rstrip(), *map(self._finding, found)]
@@ -60,6 +73,30 @@ class EventText:
             f"{printable(finding.call)} -> "
             f"{shortened(printable(finding.value), _VALUE_MAX)}  at {where}"
         )
+
+    def _constructed(self, outputs: list[Output]) -> str:
+        """Return the node that a constructor made: the event itself belongs to the run."""
+        for output in outputs:
+            entity = self._trace.entities.get(output.entity)
+            if output.kind is OutputKind.ENTITY and entity and entity.kind is EntityKind.NODE:
+                return self._names[entity.id]
+        return "-"
+
+    def _outputs(self, outputs: list[Output]) -> Iterator[str]:
+        """Yield the outputs; repeated ones, and what every node has, are counted."""
+        every = 0
+        listed = []
+        for output in outputs:
+            entity = self._trace.entities.get(output.entity)
+            if output.kind is OutputKind.ENTITY and entity is not None and is_built_in(entity):
+                every += 1
+            else:
+                listed.append(self._output(output))
+        for text, same in groupby(listed):
+            count = len(list(same))
+            yield text if count == 1 else f"{text} ×{count}"
+        if every:
+            yield f"{every} that every node has"
 
     def _output(self, output: Output) -> str:
         name = self._names.get(output.entity, f"#{output.entity}")

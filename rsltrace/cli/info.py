@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from rsltrace.cli.text import table
+from rsltrace.model.built_in import is_built_in
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
@@ -202,11 +203,7 @@ def _idle_built_in(entity: Entity, counts: Counts) -> bool:
     """Whether rclpy made ``entity`` for every node and nobody used it: eight of ten of them."""
     if _count(counts.events, entity.id) or _count(counts.outputs, entity.id):
         return False
-    if entity.kind is EntityKind.PUBLISHER:
-        return entity.name in _BUILT_IN_TOPICS
-    return (
-        entity.kind is EntityKind.SERVICE and entity.name.rpartition("/")[2] in _BUILT_IN_SERVICES
-    )
+    return is_built_in(entity)
 
 
 def _owner(trace: Trace, entity: Entity) -> str:
@@ -236,17 +233,5 @@ def _output_kind(number: int) -> str:
 
 
 _VALUE_MAX = 100
-_BUILT_IN_TOPICS = frozenset(("/rosout", "/parameter_events"))
-_BUILT_IN_SERVICES = frozenset(
-    (
-        "describe_parameters",
-        "get_parameter_types",
-        "get_parameters",
-        "get_type_description",
-        "list_parameters",
-        "set_parameters",
-        "set_parameters_atomically",
-    )
-)
 _EVENT_KINDS = frozenset(map(int, EventKind))
 _OUTPUT_KINDS = frozenset(map(int, OutputKind))

@@ -244,10 +244,10 @@ def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
 
 def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDifference]) -> Judgement:
     first = draws[0]
-    was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("", "")
+    was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("?", "?")
     sentence = (
         f"{phrase(a)} {at(a.stamp_ns)} did the same in both runs, but chance decided otherwise: "
-        f"{first.topic}: {was_a or 'nothing'} in a, {was_b or 'nothing'} in b"
+        f"{first.topic}: {was_a} in a, {was_b} in b"
     )
     if len(draws) > 1:
         sentence += f" (and {len(draws) - 1} more)"

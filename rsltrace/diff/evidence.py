@@ -115,7 +115,7 @@ class _Evidence:
         if reason or kind == OutputKind.ENTITY:
             return base
         if kind == OutputKind.DRAW:
-            text_a, text_b = (draw_text(output[2]) if output else "" for output in (a, b))
+            text_a, text_b = (draw_text(output[2]) if output else "none" for output in (a, b))
             return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
         values: list[object] = []
         for run, output in ((self._run_a, a), (self._run_b, b)):

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
 from rsltrace.ros.action_client import ActionClientHandle
 from rsltrace.ros.entity_handle import callback_name
 from rsltrace.ros.interfaces import type_name as name_of_type
@@ -16,16 +17,6 @@ if TYPE_CHECKING:
     from rsltrace.ros.node import NodeHandle
 
 _ACTION = "/_action/"
-NODE_SERVICES = (
-    "describe_parameters",
-    "get_parameter_types",
-    "get_parameters",
-    "get_type_description",
-    "list_parameters",
-    "set_parameters",
-    "set_parameters_atomically",
-)
-_SYSTEM_TOPICS = ("/rosout", "/parameter_events")
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +148,7 @@ def _is_everywhere(link: Link) -> bool:
     if _ACTION in link.name:
         return True
     if link.kind == "topic":
-        return link.name in _SYSTEM_TOPICS and not link.receivers
+        return link.name in NODE_TOPICS and not link.receivers
     return link.kind == "service" and (
         link.name.rpartition("/")[2] in NODE_SERVICES and not link.senders
     )
@@ -171,7 +162,7 @@ def _problems(link: Link) -> Iterator[str]:
         )
     if link.receivers and not link.senders and link.kind == "topic":
         names = ", ".join(dict.fromkeys(end.node for end in link.receivers))
-        if link.name not in _SYSTEM_TOPICS:
+        if link.name not in NODE_TOPICS:
             yield f"topic {link.name}: {names} subscribes, and nobody publishes"
     if link.senders and not link.receivers and link.kind != "topic":
         names = ", ".join(dict.fromkeys(end.node for end in link.senders))

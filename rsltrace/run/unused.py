@@ -13,9 +13,9 @@ from fnmatch import fnmatchcase
 from rsltrace.chance.network import QUIET_TOPICS
 from rsltrace.job import Job, locate
 from rsltrace.job.problems import Loc
+from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
 from rsltrace.ros.met import Met, Parameters
-from rsltrace.ros.overview import NODE_SERVICES
 
 
 def has_rules(job: Job) -> bool:
