@@ -29,7 +29,7 @@ pytestmark = [
     ),
 ]
 
-RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "100")), 6)
+RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "100")), 20)
 
 
 @pytest.fixture(scope="module")
