@@ -16,7 +16,7 @@ from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.counts import Counts, count
-from rsltrace.trace.format import FORMAT_VERSION, METADATA_GUARD
+from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
 
 
@@ -49,6 +49,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
         (
             ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
             ("state", _state(trace)),
+            *(() if trace.complete else (("next", _CUT_OFF),)),
             ("digest", trace.digest),
             ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})"),
             ("events", _by_kind(trace.event_count, counts.event_kinds, _event_kind)),
@@ -70,9 +71,15 @@ def _short(value: str) -> str:
     return text if len(text) <= _VALUE_MAX else f"{len(text)} characters (see --json)"
 
 
+_CUT_OFF = (
+    f"its last events, fewer than {EVENTS_PER_SEGMENT}, are missing; record the job again: if it "
+    "crashes, it prints at which line"
+)
+
+
 def _state(trace: Trace) -> str:
     if not trace.complete:
-        return "interrupted: the file has no end (the run was killed, or is still going on)"
+        return "cut off: the file has no end (the run was killed or crashed, or is still going on)"
     reason = printable(trace.result.get("stop_reason", "no reason given"))
     return f"complete: {reason}, exit code {printable(trace.result.get('exit_code', 'unknown'))}"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import json
 import os
 import signal
@@ -108,6 +109,9 @@ def record(
         told.append(note)
         _note(note)
 
+    if sys.__stderr__ is not None and not faulthandler.is_enabled():
+        with suppress(OSError, ValueError):  # a stderr that is no file
+            faulthandler.enable(sys.__stderr__)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
         result = run(
             loaded,

@@ -266,13 +266,18 @@ def _refuse(core: Core) -> NoReturn:
     raise RunEnded
 
 
+def abandon(stack: greenlet) -> None:
+    """Leave a stack where it is, for ever: nothing is raised in it, nothing in it is collected."""
+    _abandoned.append(stack)
+
+
 def lose_patience(core: Core) -> None:
     """Count that somebody goes on although the run is over; in the end, leave it where it is."""
     core.refused += 1
     if core.refused > _PATIENCE and getcurrent() is not core.main:
         core.refused = 0
         core.end_event()
-        _abandoned.append(getcurrent())
+        abandon(getcurrent())
         core.host.enter()
         assert core.main is not None
         core.main.switch()

@@ -84,7 +84,7 @@ class SimThread:
     def dispatch(self) -> None:
         """Run the thread until it ends or blocks for the first time, as one event."""
         if self.ended or self.program.ended:
-            self._end()
+            self.end()
             return
         core = self.core
         core.runners.append(getcurrent())
@@ -125,9 +125,10 @@ class SimThread:
             if not self.core.closing:
                 raise
         finally:
-            self._end()
+            self.end()
 
-    def _end(self) -> None:
+    def end(self) -> None:
+        """Take note that the thread has ended: whoever joins it goes on."""
         self.ended = True
         self._body = None
         self.core.threads.pop(self, None)

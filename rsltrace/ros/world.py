@@ -31,6 +31,7 @@ from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
 from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
+from rsltrace.ros.process_exit import own_process_ends
 from rsltrace.ros.program import Program
 from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
 from rsltrace.ros.simulated_waiting import simulated_waiting
@@ -72,6 +73,7 @@ class World:
             stack.enter_context(cooperative_threads(self.core))
             stack.enter_context(simulated_event_loops(self.core))
             stack.enter_context(own_exit_handlers(self.core))
+            stack.enter_context(own_process_ends(self.core))
             rclpy.init(args=[])
             self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
