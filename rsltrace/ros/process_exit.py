@@ -44,7 +44,8 @@ def own_process_ends(core: Core) -> Iterator[None]:
     }
     before = dict(_real)
     with ExitStack() as stack:
-        stack.callback(lambda: (_real.clear(), _real.update(before)))
+        stack.callback(_real.update, before)
+        stack.callback(_real.clear)
         for name, target in targets.items():
             redirected = Redirected(getattr(os, name), target)
             stack.callback(redirected.restore)
