@@ -35,6 +35,7 @@ from rsltrace.run.clocks import clocks_of
 from rsltrace.run.entries import hook_entries, node_entries
 from rsltrace.run.executables import why_not
 from rsltrace.run.guarding import Guarding, guarding
+from rsltrace.run.inputs import check_output
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
@@ -210,6 +211,7 @@ class Session:
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
         """Create the file, and write down what is known before the run."""
         job = self.job
+        check_output(job, path, self._replay)
         self._writer = writer = stack.enter_context(TraceWriter(path, force=self._force))
         recorder = Recorder(writer, keep_payload=payload_filter(job))
         self.world.core.recorder = recorder

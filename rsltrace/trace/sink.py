@@ -11,13 +11,14 @@ import zlib
 from pathlib import Path
 
 from rsltrace.errors import OutputError
+from rsltrace.trace.format import MCAP_MAGIC
 
 
 class Sink:
     """An append-only file. ``offset`` is the bytes written, ``crc`` their CRC-32."""
 
     def __init__(self, path: Path, *, force: bool) -> None:
-        """Create ``path``; with ``force``, empty what is there.
+        """Create ``path``; with ``force``, empty the trace (or other MCAP file) that is there.
 
         A killed run must leave a readable file under the name asked for, so the file is written in
         place and not renamed at the end. Raises OutputError when it cannot be created.
@@ -25,6 +26,11 @@ class Sink:
         self.path = path
         self.offset = 0
         self.crc = 0
+        if force and not _may_be_replaced(path):
+            raise OutputError(
+                f"cannot write the trace {path}: what is there is no trace (it is not MCAP); "
+                "remove it yourself, or choose another place with -o"
+            )
         flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if force else os.O_EXCL)
         flags |= getattr(os, "O_BINARY", 0)  # Windows alone has it, and needs it
         try:
@@ -52,6 +58,18 @@ class Sink:
         fd, self._fd = self._fd, -1
         if fd >= 0:
             os.close(fd)
+
+
+def _may_be_replaced(path: Path) -> bool:
+    """Say whether nothing but a trace would be lost: ``-o job.yaml`` is a slip of the pen."""
+    try:
+        if not path.is_file():
+            return True
+        with path.open("rb") as file:
+            begin = file.read(len(MCAP_MAGIC))
+    except OSError:
+        return True  # opening it to write says what is wrong
+    return MCAP_MAGIC.startswith(begin)
 
 
 def _why_not_created(path: Path, error: OSError) -> str:

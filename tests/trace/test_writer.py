@@ -46,11 +46,28 @@ def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
 
 def test_force_replaces_a_longer_file(tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
-    path.write_bytes(bytes(10_000_000))
+    path.write_bytes(b"\x89MCAP0\r\n" + bytes(10_000_000))
     feeder = write_run(path, 10, force=True)
     assert path.stat().st_size < 100_000
     with Trace.open(path) as trace:
         assert trace.digest == feeder.digest
+
+
+@pytest.mark.parametrize("content", [b"nodes: []\n", b"\x89PNG\r\n", b"\x89MCAB", bytes(9)])
+def test_force_replaces_nothing_but_traces(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "job.yaml"
+    path.write_bytes(content)
+    with pytest.raises(OutputError, match=r"job\.yaml: what is there is no trace \(it is not MCAP"):
+        TraceWriter(path, force=True)
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCA"])
+def test_force_replaces_what_was_cut_off(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "run.mcap"
+    path.write_bytes(content)
+    write_run(path, 10, force=True)
+    assert path.stat().st_size > 100
 
 
 def test_a_missing_folder_is_named_and_not_made(tmp_path: Path) -> None:

@@ -1,0 +1,39 @@
+"""The files that a job is made of and reads: ``--force`` must not empty one of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from rsltrace.errors import OutputError
+from rsltrace.job import Job
+
+
+def check_output(job: Job, output: Path, replay: Path | None) -> None:
+    """Raise ``OutputError`` if the trace would be written over something the run reads."""
+    if not output.exists():
+        return
+    for what, path in _inputs(job, replay):
+        inside = path.is_dir() and path.resolve() in output.resolve().parents
+        if inside or (path.exists() and output.samefile(path)):
+            raise OutputError(
+                f"cannot write the trace {output}: the run reads it ({what}); choose another place "
+                "with -o"
+            )
+
+
+def _inputs(job: Job, replay: Path | None) -> Iterator[tuple[str, Path]]:
+    """Yield (what it is, path) of all that is read while a run lasts, or made of."""
+    yield "it is the job", job.resolve(Path(job.source_name).name)
+    if job.composed is not None:
+        for other in job.composed.others:
+            yield "base or include of the job", job.resolve(other)
+    for bag in job.bags:
+        yield "a bag of the job", job.resolve(bag.path)
+    for place, file in job.model_files():
+        yield ".".join(map(str, place)), job.resolve(file)
+    for node in job.nodes:
+        for file in node.parameter_files:
+            yield "a parameter file of the job", job.resolve(file)
+    if replay is not None:
+        yield "the trace whose recorded answers are given again", replay
