@@ -41,7 +41,9 @@ if TYPE_CHECKING:
     metavar="FOLDER",
     help="Write the messages as a plain rosbag2 bag, too.",
 )
-@click.option("--force", is_flag=True, help="Overwrite an existing trace, and bag; never what the run reads.")
+@click.option(
+    "--force", is_flag=True, help="Overwrite an existing trace (never one it reads), and bag."
+)
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
 @click.option(
