@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.align import Pairs, Past, align
+from rsltrace.diff.in_order import most_in_order
 from rsltrace.diff.rows import CONSTRUCT, SHUTDOWN, Rows, Run, load_rows
 
 NOTHING = -1
@@ -245,27 +246,16 @@ def _spine(
 ) -> frozenset[int]:
     """Return the places in b of as many pairs as can be that are in the same order in both runs,
     have the same input and happened at the same time: what the rest is ordered by."""
-    tails: list[int] = []  # of the best chain of each length, the partner it ends with
-    ends: list[int] = []
-    before: dict[int, int] = {}
-    for place, partner in enumerate(pairs.b):
-        if (
-            partner >= 0
+    return most_in_order(
+        [
+            partner
+            if partner >= 0
             and times_a[partner] == times_b[place]
             and a.input[partner] == b.input[place]
-        ):
-            length = bisect_left(tails, partner)
-            if length == len(tails):
-                tails.append(partner)
-                ends.append(place)
-            tails[length], ends[length] = partner, place
-            before[place] = ends[length - 1] if length else -1
-    spine = set()
-    place = ends[-1] if ends else -1
-    while place >= 0:
-        spine.add(place)
-        place = before[place]
-    return frozenset(spine)
+            else NOTHING
+            for place, partner in enumerate(pairs.b)
+        ]
+    )
 
 
 def _pair(a: Rows, b: Rows, place_a: int, place_b: int) -> Item:
