@@ -84,6 +84,18 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     return None
 
 
+def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
+    """Return whether a library is being imported, rather than user code run or imported."""
+    while frame is not None:
+        kind = _kind_of(frame.f_code.co_filename)
+        if kind in (_USER, _OURS) or (packages and is_in(frame, packages)):
+            return False
+        if kind == _IMPORT:
+            return True
+        frame = frame.f_back
+    return False
+
+
 def is_in(frame: FrameType, packages: frozenset[str]) -> bool:
     """Return whether a frame's module is in one of the packages."""
     return module_of(frame).partition(".")[0] in packages

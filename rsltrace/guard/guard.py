@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
-from rsltrace.guard.callers import is_of_python, module_of, stack_of, user_frame
+from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
 from rsltrace.guard.descriptors import Descriptors
 from rsltrace.guard.outside import Outside, answered, decoded, numbered
 from rsltrace.guard.pace import Pace
@@ -112,9 +112,13 @@ class Guard:
         return policy.modes.get(source, DEFAULT_MODES[source])
 
     def stream(self, frame: FrameType) -> str:
-        """Return the name of the random stream of whoever runs: the node's, or its module's."""
+        """Return the name of the random stream of whoever runs: the node's, or its module's.
+
+        A library that is imported has a stream of its own, even if a node imports it: it may be
+        loaded already.
+        """
         node = self.context.node()
-        if node:
+        if node and not in_import(frame, self.packages):
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 

@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 
 from rsltrace.guard.clocks import clocks
 from rsltrace.guard.folders import folders
+from rsltrace.guard.memories import memories
 from rsltrace.guard.randomness import randomness
 from rsltrace.guard.recorded_descriptors import recorded_descriptors
 from rsltrace.guard.recorded_files import recorded_files
@@ -16,6 +17,7 @@ from rsltrace.guard.recorded_sockets import recorded_sockets
 from rsltrace.guard.watch import watching
 
 _REPLACEMENTS = (
+    memories,
     clocks,
     randomness,
     folders,

@@ -17,6 +17,7 @@ class Streams:
         self._entropy: dict[str, Random] = {}
         self._numpy: dict[str, Any] = {}
         self.last_uuid: dict[str, int | None] = {}
+        self.file_names: dict[str, Any] = {}
         self._begun: dict[str, str] = {}
 
     def begin(self, name: str, entropy: Callable[[], str]) -> None:

@@ -31,6 +31,7 @@ _INSTALLED = (
     os.path.join(sys.base_prefix, ""),
     "/usr/share/zoneinfo/",
     "/usr/lib/",
+    "/etc/mime.types",
     "/dev/null",
     "/dev/tty",
 )
@@ -109,12 +110,20 @@ def _opened(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     name = os.fsdecode(path)
     if name in ("/dev/urandom", "/dev/random"):
         return Source.RANDOM, f"open({name!r})", ""
-    if os.path.abspath(name).startswith(_INSTALLED):
+    if _is_installed(name):
         return None
     writing = any(c in mode for c in "wax+") if isinstance(mode, str) else flags & _WRITING
     if writing:
         return Source.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
     return Source.FILE, f"open({name!r})", _content(name)
+
+
+def _is_installed(path: object) -> bool:
+    """Return whether a file is part of what is installed, whose versions a trace knows."""
+    if not isinstance(path, (str, bytes, os.PathLike)):
+        return False
+    with engage(None):  # the working directory that is asked for is no finding
+        return os.path.abspath(os.fsdecode(path)).startswith(_INSTALLED)
 
 
 def _content(name: str) -> str:
@@ -182,7 +191,11 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         frame = sys._getframe(1)
         if source is not Source.THREAD and frame.f_globals.get("__name__") in _NOT_NEWS:
             return real(*arguments, **options)
-        shown = ", ".join(map(repr, arguments))[:100] if source is Source.FILE else ""
+        shown = ""
+        if source is Source.FILE:
+            if _is_installed(arguments[0] if arguments else options.get("path")):
+                return real(*arguments, **options)
+            shown = ", ".join(map(repr, arguments))[:100]
         value = real(*arguments, **options)
         text = (
             f"{value.st_size} bytes, changed {value.st_mtime_ns}"

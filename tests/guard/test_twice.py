@@ -1,0 +1,160 @@
+"""Runs in one process are alike, byte by byte, whatever is loaded or remembered already."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.ros
+
+NODE = """
+import mimetypes, os, platform, random, secrets, tempfile, zoneinfo
+from rclpy.node import Node
+
+class Cold(Node):
+    def __init__(self, imports=True):
+        super().__init__("cold")
+        self.imports = imports
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        if self.imports:
+            import draws_when_imported
+        said = [
+            tempfile.mktemp(), secrets.token_hex(4), random.Random().random(), platform.node(),
+            mimetypes.guess_type("a.png")[0], str(zoneinfo.ZoneInfo("Europe/Berlin")),
+        ]
+        self.get_logger().info(repr(said))
+
+class Other(Node):
+    def __init__(self):
+        super().__init__("other")
+        self.create_timer(0.05, lambda: self.get_logger().info(tempfile.mktemp()))
+"""
+
+LIBRARY = """
+import os, random, secrets, time
+DRAWN = (os.urandom(8), random.random(), random.Random().random(), secrets.token_hex(), time.time())
+"""
+
+RUNS = """
+import hashlib, json, sys
+from pathlib import Path
+from rsltrace import Trace, load_job, record
+
+def said(trace, name):
+    records = [trace.decode("/rosout", data) for *_, data in trace.messages("/rosout")]
+    return [one.msg for one in records if one.name == name]
+
+found = []
+for number, job in enumerate(sys.argv[1:]):
+    path = Path(job).with_suffix(f".{number}.mcap")
+    record(load_job(job), path)
+    with Trace.open(path) as trace:
+        calls = [[met.node, met.call, met.count] for met in trace.guarded]
+        found.append({
+            "bytes": hashlib.sha256(path.read_bytes()).hexdigest(),
+            "calls": calls,
+            "said": said(trace, "cold"),
+        })
+print(json.dumps(found))
+"""
+
+COLD = {"node": "cold:Cold"}
+JOBS: dict[str, list[dict[str, Any]]] = {
+    "cold": [COLD],
+    "loaded": [{**COLD, "arguments": {"imports": False}}],
+    "beside": [{"node": "cold:Other"}, COLD],
+}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[str, Any]]]:
+    """What came of each job, recorded in one fresh process: bytes, calls, what the node said."""
+    pytest.importorskip("rclpy")
+    folder = tmp_path_factory.mktemp("twice")
+    installed = folder / "lib" / "site-packages"  # what lies in such a folder is a library
+    installed.mkdir(parents=True)
+    (installed / "draws_when_imported.py").write_text(LIBRARY)
+    (folder / "cold.py").write_text(NODE)
+    for name, nodes in JOBS.items():
+        job = {"nodes": nodes, "stop": {"duration": "0.35s"}, "guard": {"pin": False}}
+        (folder / f"{name}.json").write_text(json.dumps(job))
+    order = ["cold", "cold", "loaded", "beside", "cold"]
+    done = subprocess.run(
+        [sys.executable, "-c", RUNS, *(str(folder / f"{name}.json") for name in order)],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": str(installed)},
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    found: dict[str, list[dict[str, Any]]] = {}
+    for name, result in zip(order, json.loads(done.stdout.splitlines()[-1]), strict=True):
+        found.setdefault(name, []).append(result)
+    return found
+
+
+def test_the_first_run_of_a_process_and_later_ones_are_the_same(recorded: Any) -> None:
+    first, second, third = recorded["cold"]
+    assert len(set(first["said"])) == 3
+    assert first["said"] == second["said"] == third["said"]
+    assert first["calls"] == second["calls"] == third["calls"]
+    assert ["/cold", "os.uname()", 3] in first["calls"], "the name of the machine, in every run"
+    assert first["bytes"] == second["bytes"] == third["bytes"]
+
+
+def test_what_a_library_draws_when_it_is_imported_is_not_the_nodes(recorded: Any) -> None:
+    (loaded,) = recorded["loaded"]
+    assert loaded["said"] == recorded["cold"][0]["said"]
+
+
+def test_names_of_temporary_files_are_each_nodes_own(recorded: Any) -> None:
+    (beside,) = recorded["beside"]
+    assert beside["said"] == recorded["cold"][0]["said"]
+
+
+def test_what_the_standard_library_remembers_is_put_back() -> None:
+    import platform
+    import tempfile
+
+    from rsltrace.guard.install import installed
+
+    names: Any = tempfile
+    remembered: Any = platform
+    platform.uname()
+    before = tempfile.gettempdir(), names._get_candidate_names(), remembered._uname_cache
+    finder = names._get_default_tempdir
+    with installed():
+        assert tempfile.tempdir is None
+        assert remembered._uname_cache is None
+        assert names._get_candidate_names() is not before[1]
+        assert tempfile.gettempdir() == before[0]
+        with installed():
+            pass
+        platform.uname()
+    now = tempfile.tempdir, names._get_candidate_names(), remembered._uname_cache
+    assert now[0] == before[0]
+    assert now[1] is before[1]
+    assert now[2] is before[2]
+    assert names._get_default_tempdir is finder
+
+
+def test_a_folder_for_temporary_files_that_somebody_chose_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import tempfile
+
+    from rsltrace.guard.install import installed
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with installed():
+        assert tempfile.gettempdir() == str(tmp_path)
+    assert tempfile.tempdir == str(tmp_path)
