@@ -84,6 +84,11 @@ class Wait:
         return self._event[1]
 
     @property
+    def group(self) -> object:
+        """The callback group that the wait keeps busy, or None."""
+        return self._group
+
+    @property
     def waiting(self) -> bool:
         """Whether nothing has let the call return yet."""
         return not self._woken

@@ -49,6 +49,9 @@ if TYPE_CHECKING:
     from rsltrace.ros.tasks import TaskRun
     from rsltrace.ros.threads import SimThread
 
+# What waits for its callback group: the handle, since when (ns), and what to do when it is free.
+Parked = tuple[Dispatchable, int, Callable[[], None]]
+
 _pack_value = struct.Struct("<Bq").pack
 
 
@@ -113,7 +116,7 @@ class Core:
         self.runners: list[greenlet] = []
         self.runner_maker: greenlet | None = None
         self.runner_error: BaseException | None = None
-        self._parked: dict[object, list[Callable[[], None]]] = {}
+        self.parked: dict[object, list[Parked]] = {}
         self.arrivals = 0
 
         # Suspended coroutines, and those that are looked at when nothing else is ready.
@@ -368,20 +371,20 @@ class Core:
 
     # -- callback groups -----------------------------------------------------------------------
 
-    def park(self, group: object, retry: Callable[[], None]) -> None:
+    def park(self, group: object, handle: Dispatchable, retry: Callable[[], None]) -> None:
         """Keep an event whose callback group is busy; ``retry`` runs when the group is free."""
-        self._parked.setdefault(group, []).append(retry)
+        self.parked.setdefault(group, []).append((handle, self.loop.now_ns, retry))
 
     def group_freed(self, group: object) -> None:
         """Let the events run that waited for ``group``, before anything else that is ready."""
-        waiting = self._parked.pop(group, None)
+        waiting = self.parked.pop(group, None)
         if waiting:
-            for retry in reversed(waiting):
+            for _, _, retry in reversed(waiting):
                 retry()
 
     def waiting_for_group(self, group: object) -> int:
         """Return how many events wait until ``group`` is free."""
-        return len(self._parked.get(group, ()))
+        return len(self.parked.get(group, ()))
 
     # -- who runs ------------------------------------------------------------------------------
 

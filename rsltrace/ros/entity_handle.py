@@ -137,7 +137,7 @@ class Receiver(EntityHandle):
             return False
         group = wrapper.callback_group
         if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-            self.core.park(group, lambda: self.core.loop.ready.appendleft(self))
+            self.core.park(group, self, lambda: self.core.loop.ready.appendleft(self))
             return False
         return True
 

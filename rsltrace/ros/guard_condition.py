@@ -65,7 +65,7 @@ class GuardConditionHandle(EntityHandle):
         core = self.core
         group = wrapper.callback_group
         if is_busy(group, wrapper):
-            core.park(group, lambda: core.loop.ready.appendleft(self))
+            core.park(group, self, lambda: core.loop.ready.appendleft(self))
             return
         self._triggered = False
         callback = wrapper.callback

@@ -150,7 +150,7 @@ class Pump:
             if mailbox.pump is not None:
                 mailbox.pump.wake()
 
-        self.core.park(group, retry)
+        self.core.park(group, item, retry)
         return True
 
     def _handler(self, node: Any, mailbox: Mailbox, item: Any) -> tuple[Any, Any, Any]:

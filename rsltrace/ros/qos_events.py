@@ -103,7 +103,7 @@ class EventHandle(EntityHandle):
         core = self.core
         group = wrapper.callback_group
         if is_busy(group, wrapper):
-            core.park(group, lambda: core.loop.ready.appendleft(self))
+            core.park(group, self, lambda: core.loop.ready.appendleft(self))
             return
         self._queued = False
         if not self.has_news():

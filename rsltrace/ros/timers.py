@@ -77,7 +77,7 @@ class TimerHandle(EntityHandle):
         group = wrapper.callback_group
         if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             core.loop.timers.remove(state)
-            core.park(group, self.activate)
+            core.park(group, self, self.activate)
             return
         callback = wrapper.callback
         if callback is not self._callback:

@@ -77,7 +77,7 @@ class UserWaitable:
             return
         core, group = self.core, self.wrapper.callback_group
         if is_busy(group, self.wrapper):
-            core.park(group, lambda: core.loop.ready.appendleft(self))
+            core.park(group, self, lambda: core.loop.ready.appendleft(self))
             return
         self._queued = False
         ready = self._set.ready_now()

@@ -26,6 +26,7 @@ from rsltrace.ros.entry import Entry
 from rsltrace.ros.event_loops import simulated_event_loops
 from rsltrace.ros.exit_handlers import own_exit_handlers
 from rsltrace.ros.graph import Graph
+from rsltrace.ros.held_back import held_back
 from rsltrace.ros.installing import installed
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
@@ -210,6 +211,8 @@ class World:
         if core.loop.stopped is None and core.runner_error is None:
             return  # paused
         core.note_end()
+        if core.error is None and not core.stuck:
+            core.notes += held_back(core)
         end_programs(core)
         end_blocked(core)
         if core.runner_error is not None:
