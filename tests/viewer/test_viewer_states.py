@@ -12,6 +12,7 @@ from rsltrace_viewer.model.lines import Openness
 from rsltrace_viewer.model.run import Run
 
 import rsltrace
+from rsltrace.errors import NodeError
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -99,3 +100,27 @@ def test_rerun_tells_them_too(tmp_path: Path) -> None:
     text = document(rsltrace.diff(a, b))
     assert "**State of the node after it**\n\n```\ntotal  1.0  |  2.0\n```" in text
     assert "os.environ['GAIN']  '1'  |  '2'" in text
+
+
+def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
+    """Also where the runs part by something else, and where run a went on."""
+    a = record(tmp_path, "false", "1", "a.mcap")
+    code = NODE + "        if self.total > 12:\n            raise ValueError('too much')\n"
+    (tmp_path / "filtering.py").write_text(code)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GAIN", "2")
+        with pytest.raises(NodeError):
+            rsltrace.record(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / "b.mcap")
+    text = screen(a, tmp_path / "b.mcap", "--size", "108x40", "--export", tmp_path / "screen.txt")
+    assert (
+        "! b ended by an exception: /filter: timer Filter.tick raised ValueError, event 7" in text
+    )
+    (row,) = [row for row in text.splitlines() if row.startswith(" ≠ !     7 ")]
+    assert "b: /x, exception ValueError: too" in row
+
+
+def test_a_trace_that_has_no_segment_yet(tmp_path: Path) -> None:
+    path = record(tmp_path, "false", "1", "whole.mcap")
+    (tmp_path / "begun.mcap").write_bytes(path.read_bytes()[:400])
+    text = screen(tmp_path / "begun.mcap", "--export", tmp_path / "screen.txt")
+    assert "no events yet: a run writes some four thousand at a time" in text

@@ -20,7 +20,6 @@ from rsltrace_viewer.model.times import parse_time
 from rsltrace_viewer.questions import parse_index, question_of
 from rsltrace_viewer.screens.help import HelpScreen
 from rsltrace_viewer.session import Session
-from rsltrace_viewer.shell import NO_EVENTS
 from rsltrace_viewer.stepping import Stepping
 from rsltrace_viewer.widgets.inspector import Inspector
 from rsltrace_viewer.widgets.lanes import LanesView
@@ -95,7 +94,7 @@ class ViewerApp(Stepping):
         rows = self.session.set_filter(text)
         self.workers.cancel_group(self, "filter")
         if rows is None:
-            self.timeline.empty = NO_EVENTS
+            self.timeline.empty = self.session.nothing
             self._say("")
             self._show_rows(centre=True)
             return

@@ -6,6 +6,7 @@ The app changes this object and draws what it says; tests drive it directly.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import TraceError
@@ -115,6 +116,13 @@ class Session:
         """Whether there is no event at all."""
         return self.view.count == 0
 
+    @property
+    def nothing(self) -> str:
+        """What to say where there is no event at all."""
+        if self.a.trace.complete:
+            return "no events in this trace"
+        return "no events yet: a run writes some four thousand at a time"
+
     def current(self) -> tuple[Run, int] | None:
         """Return the run and the index of the selected event; None if there is no event."""
         if self.empty:
@@ -152,6 +160,11 @@ class Session:
         index, index_b = self.view.a(place), self.view.b(place)
         if index is not None:
             event = self._texts["a"].of(index)
+            if index_b is not None and not event.raised:
+                other = self._texts["b"].of(index_b)
+                if other.raised:  # what run a did here is not what one looks for
+                    outputs = f"b: {other.outputs}; a: {event.outputs or 'nothing'}"
+                    event = replace(event, raised=True, outputs=outputs)
         else:
             assert index_b is not None  # a place stands for something
             event = self._texts["b"].of(index_b)

@@ -28,7 +28,6 @@ from rsltrace_viewer.widgets.lanes import LanesView
 from rsltrace_viewer.widgets.prompt import Prompt
 from rsltrace_viewer.widgets.timeline import Row, Timeline
 
-NO_EVENTS = "no events in this trace"
 _WIDE = 110
 _REPORT_S = 0.25
 _EFFECTS_AT_ONCE_S = 0.004
@@ -94,7 +93,7 @@ class Shell(App[None]):
         self.timeline.focus()
         if self._start is not None:
             session.go(self._start, remember=False)
-        self.timeline.empty = NO_EVENTS if session.empty else ""
+        self.timeline.empty = session.nothing if session.empty else ""
         self._show_header()
         self.call_after_refresh(self._after_first)
 

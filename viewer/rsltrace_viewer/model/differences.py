@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from rsltrace.diff.evidence import message_differences
 from rsltrace.diff.model import (
+    ENDED_BY_EXCEPTION,
     ULP_TOLD_MAX,
     Divergence,
     EventView,
@@ -124,6 +125,9 @@ def _why(comparison: Comparison) -> Iterator[Line]:
         divergence = comparison.diff.divergences[0]
         sentence = divergence.root_sentence or divergence.sentence
         yield Line(1, "why", printable(sentence), Role.NOTE, "why")
+        failed = [note for note in comparison.diff.notes if ENDED_BY_EXCEPTION in note]
+        for place, note in enumerate(failed):
+            yield Line(1, "!", printable(note), Role.ERROR, f"why.{place}")
 
 
 def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line]:
