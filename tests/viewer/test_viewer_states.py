@@ -116,7 +116,7 @@ def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
         "! b ended by an exception: /filter: timer Filter.tick raised ValueError, event 7" in text
     )
     (row,) = [row for row in text.splitlines() if row.startswith(" ≠ !     7 ")]
-    assert "b: /x, exception ValueError: too" in row
+    assert "b: /x, exception ValueError" in row
 
 
 def test_a_trace_that_has_no_segment_yet(tmp_path: Path) -> None:
