@@ -163,4 +163,4 @@ class Recorded:
 
 def has_work(item: Any) -> bool:
     """Whether something would happen: not if a full queue has dropped the message it stood for."""
-    return bool(getattr(item, "queue", True)) and not getattr(item, "_destroyed", False)
+    return bool(getattr(item, "queue", True)) and not getattr(item, "destroyed", False)

@@ -197,7 +197,7 @@ class _Expiry:
 
     def wake(self) -> None:
         """Expire goals now."""
-        if not self._server._destroyed:
+        if not self._server.destroyed:
             self._server.core.loop.ready.append(self)
 
     def dispatch(self) -> None:

@@ -25,10 +25,11 @@ class Destroyable:
     """A handle that can be used in ``with`` until it is destroyed."""
 
     def __init__(self) -> None:
-        self._destroyed = False
+        self.destroyed = False
+        """Whether it may be used no more; nothing but ``destroy_when_not_in_use`` sets it."""
 
     def __enter__(self) -> Self:
-        if self._destroyed:
+        if self.destroyed:
             raise _invalid_handle("cannot use Destroyable because destruction was requested")
         return self
 
@@ -37,8 +38,8 @@ class Destroyable:
 
     def destroy_when_not_in_use(self) -> None:
         """Destroy the handle, unless that has been done."""
-        if not self._destroyed:
-            self._destroyed = True
+        if not self.destroyed:
+            self.destroyed = True
             self._destroy()
 
     @property

@@ -122,10 +122,8 @@ def _vanish(program: Program) -> None:
         if node.mailbox is not None:
             node.mailbox.close()
         for endpoint in program.core.graph.endpoints_of(node):
-            if not endpoint._destroyed:
-                endpoint.destroy_when_not_in_use()
-        if not node._destroyed:
-            node.destroy_when_not_in_use()
+            endpoint.destroy_when_not_in_use()
+        node.destroy_when_not_in_use()
 
 
 def end_programs(core: Core) -> None:

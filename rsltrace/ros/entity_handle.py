@@ -133,7 +133,7 @@ class Receiver(EntityHandle):
         if mailbox is not None and mailbox.keeps(self):
             return False
         wrapper = self.wrapper
-        if not self.queue or wrapper is None or self._destroyed:
+        if not self.queue or wrapper is None or self.destroyed:
             return False
         group = wrapper.callback_group
         if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):

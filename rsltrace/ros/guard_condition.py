@@ -60,7 +60,7 @@ class GuardConditionHandle(EntityHandle):
         if mailbox is not None and mailbox.keeps(self):
             return
         wrapper = self.wrapper
-        if not self._triggered or wrapper is None or self._destroyed:
+        if not self._triggered or wrapper is None or self.destroyed:
             return
         core = self.core
         group = wrapper.callback_group

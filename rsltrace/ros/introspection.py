@@ -57,7 +57,7 @@ class ServiceEvents:
 
     def close(self) -> None:
         """Stop publishing."""
-        if not self.publisher._destroyed:
+        if not self.publisher.destroyed:
             self.publisher.destroy_when_not_in_use()
 
 

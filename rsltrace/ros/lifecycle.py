@@ -192,5 +192,5 @@ class StateMachineHandle(Destroyable):
 
     def _destroy(self) -> None:
         for handle in [*self._services.values(), self._events]:
-            if handle is not None and not handle._destroyed:
+            if handle is not None and not handle.destroyed:
                 handle.destroy_when_not_in_use()

@@ -124,7 +124,7 @@ class Exchanges:
             loop.schedule_arrival(arrival_ns, self._arrive, exchange)
 
     def _arrive(self, exchange: Exchange) -> None:
-        if not self._receiver._destroyed:
+        if not self._receiver.destroyed:
             self._receiver.deliver(exchange)
 
 
@@ -218,7 +218,7 @@ class Link:
 
     def _arrive(self, delivery: Delivery) -> None:
         subscription = self.subscription
-        if subscription._destroyed:
+        if subscription.destroyed:
             return
         if self._lost:
             lost, self._lost = self._lost, 0

@@ -65,6 +65,7 @@ class SimLock:
         if wait(core, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
             self._owner = getcurrent()  # whoever released it has left it taken, for us
             return True
+        self._waits = deque(blocked for blocked in self._waits if blocked.waiting)
         return False
 
     def release(self) -> None:

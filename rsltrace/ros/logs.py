@@ -82,7 +82,7 @@ class Logs:
         if self._echo:
             self._print(severity, now_ns, name, message)
         node = self._nodes.get(name) or self._core.current_node
-        if node is None or node.rosout is None or node.rosout._destroyed:
+        if node is None or node.rosout is None or node.rosout.destroyed:
             return
         sec, nanosec = divmod(now_ns, NS_PER_S)
         record: Any = Log(

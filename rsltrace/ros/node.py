@@ -219,7 +219,7 @@ class NodeHandle(EntityHandle):
     def _destroy(self) -> None:
         self.core.graph.nodes.remove(self)
         self.core.logs.detach(self)
-        if self.rosout is not None and not self.rosout._destroyed:
+        if self.rosout is not None:
             self.rosout.destroy_when_not_in_use()
 
 

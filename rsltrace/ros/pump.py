@@ -196,7 +196,7 @@ class _Awaited:
 
 def _is_stale(item: Any) -> bool:
     """Say whether there is nothing to do any more: destroyed, or dropped from a full queue."""
-    return getattr(item, "_destroyed", False) or not getattr(item, "queue", True)
+    return getattr(item, "destroyed", False) or not getattr(item, "queue", True)
 
 
 def _is_always(condition: Callable[[], bool]) -> bool:

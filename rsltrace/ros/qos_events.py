@@ -98,7 +98,7 @@ class EventHandle(EntityHandle):
         if mailbox is not None and mailbox.keeps(self):
             return
         wrapper = self.wrapper
-        if wrapper is None or self._destroyed:
+        if wrapper is None or self.destroyed:
             return
         core = self.core
         group = wrapper.callback_group

@@ -38,7 +38,7 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     ready, scheduled, next_place = loop.ready, loop.scheduled, loop.next_place
 
     def arrive(delivery: Delivery) -> None:
-        if subscription._destroyed:
+        if subscription.destroyed:
             return
         subscription.queue.append(delivery)
         if subscription.wrapper is not None:

@@ -191,7 +191,7 @@ class ServiceHandle(_End):
             _RESPONSE, PREFIX_RESPONSE, self._response, self.srv_type.Response, data
         )
         client = request_id.client
-        if not client._destroyed:
+        if not client.destroyed:
             info = ServiceInfo(request_id, self.core.loop.now_ns)
             exchange = (data, self.core.loop.events, position, digest, info)
             if self.core.network is None:
@@ -315,5 +315,4 @@ class TypeDescriptionServiceHandle:
 
     def destroy_when_not_in_use(self) -> None:
         """Destroy the service, unless the node has done so already."""
-        if not self.impl._destroyed:
-            self.impl.destroy_when_not_in_use()
+        self.impl.destroy_when_not_in_use()

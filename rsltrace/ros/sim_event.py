@@ -42,6 +42,7 @@ class SimEvent:
         """Do ``wait`` with a timeout in nanoseconds."""
         if not self._set:
             wait(self._core, self._what, until=self._waits.append, for_ns=timeout_ns)
+            self._waits = [blocked for blocked in self._waits if blocked.waiting]
         return self._set
 
 

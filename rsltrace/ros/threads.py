@@ -161,6 +161,7 @@ class SimThread:
                 for_ns=for_ns,
                 patient=self.is_patient,
             )
+            self._joining = [blocked for blocked in self._joining if blocked.waiting]
 
     def is_patient(self) -> bool:
         """Return whether the thread waits for what may never come, so that a join may, too."""

@@ -54,7 +54,7 @@ class TimerHandle(EntityHandle):
         self._info: str | None = None
 
     def activate(self) -> None:
-        if self.wrapper is not None and not self.state.canceled and not self._destroyed:
+        if self.wrapper is not None and not self.state.canceled and not self.destroyed:
             self.core.loop.timers.add(self.state)
 
     def deactivate(self) -> None:

@@ -119,13 +119,13 @@ class WaitSetHandle(Destroyable):
             (kind, handle)
             for kind, entities in self._entities.items()
             for handle in entities
-            if not handle._destroyed and _IS_READY[kind](handle)
+            if not handle.destroyed and _IS_READY[kind](handle)
         ]
 
     def _look(self) -> bool:
         """See what is ready; return whether anything is."""
         self._found = {
-            kind: [not handle._destroyed and _IS_READY[kind](handle) for handle in entities]
+            kind: [not handle.destroyed and _IS_READY[kind](handle) for handle in entities]
             for kind, entities in self._entities.items()
         }
         return any(any(found) for found in self._found.values())

@@ -73,7 +73,7 @@ class UserWaitable:
         mailbox = self.node.mailbox
         if mailbox is not None and mailbox.keeps(self):
             return
-        if self._closed or self.node._destroyed:
+        if self._closed or self.node.destroyed:
             return
         core, group = self.core, self.wrapper.callback_group
         if is_busy(group, self.wrapper):

@@ -233,7 +233,7 @@ class World:
         for node in self.nodes:
             core.shutdown_ns = 0
             handle = node.handle
-            if handle._destroyed or core.error is not None:
+            if handle.destroyed or core.error is not None:
                 continue
             core.run_outside(
                 handle.describe, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node

@@ -227,7 +227,7 @@ def test_a_node_may_be_destroyed_twice(simulate: Callable[..., Any]) -> None:
         gone = Node("gone")
         gone.destroy_node()
         gone.destroy_node()
-        assert gone.handle._destroyed
+        assert gone.handle.destroyed
         return Node("here")
 
     simulate(node, duration=0.1)

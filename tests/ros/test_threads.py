@@ -180,6 +180,35 @@ def test_locks_exclude_threads_that_are_suspended_and_idents_tell_them_apart(
     ]
 
 
+def test_who_gives_up_waiting_is_forgotten(simulate: Any) -> None:
+    """However often somebody looks whether a thread has ended, or whether a lock is free."""
+    left: list[int] = []
+
+    class Patient(Node):
+        def __init__(self) -> None:
+            super().__init__("patient")
+            self.lock = threading.Lock()
+            self.create_timer(1.0, self.begin)
+
+        def begin(self) -> None:
+            thread = threading.Thread(target=self.work)
+            thread.start()
+            for _ in range(100):
+                thread.join(0.01)
+                assert not self.lock.acquire(timeout=0.01)
+            assert thread.is_alive()
+            left.extend((len(thread._rsltrace._joining), len(self.lock._waits)))
+            thread.join()
+            raise SystemExit
+
+        def work(self) -> None:
+            with self.lock:
+                time.sleep(5.0)
+
+    simulate(Patient)
+    assert left == [0, 0]
+
+
 def test_thread_pools_timers_and_raw_threads(simulate: Any) -> None:
     log: list[Any] = []
 
