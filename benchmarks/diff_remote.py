@@ -10,17 +10,17 @@ segments end elsewhere, so that each step of the search has to fetch a segment.
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 from synthetic import Shape, write_trace
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+from tests.range_server import RangeServer
 
 PLACES = (0.10, 0.50, 0.99)
 KINDS = {
@@ -31,53 +31,10 @@ KINDS = {
 _VERSION = 2
 
 
-class Server:
-    """Serves the ranges of a folder's files and counts."""
-
-    def __init__(self, folder: Path) -> None:
-        self.requests = 0
-        self.sent = 0
-        outer = self
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def log_message(self, *args: object) -> None:
-                pass
-
-            def do_HEAD(self) -> None:  # the base class asks for the name
-                self._answer(send=False)
-
-            def do_GET(self) -> None:
-                self._answer(send=True)
-
-            def _answer(self, *, send: bool) -> None:
-                path = folder / self.path.lstrip("/")
-                first, end, status = 0, path.stat().st_size, 200
-                if wanted := re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", "")):
-                    first, end, status = int(wanted[1]), min(int(wanted[2]) + 1, end), 206
-                outer.requests += 1
-                self.send_response(status)
-                self.send_header("Content-Length", str(end - first))
-                self.end_headers()
-                if send:
-                    with path.open("rb") as file:
-                        file.seek(first)
-                        outer.sent += self.wfile.write(file.read(end - first))
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        threading.Thread(target=self._server.serve_forever, daemon=True).start()
-        self.address = f"http://127.0.0.1:{self._server.server_port}"
-
-    def close(self) -> None:
-        """Stop serving."""
-        self._server.shutdown()
-        self._server.server_close()
-
-
-def measure(server: Server, kind: str, place: str, a: Path, b: Path) -> None:
+def measure(server: RangeServer, kind: str, place: str, a: Path, b: Path) -> None:
     """Diff two served traces and print a row."""
-    server.requests = server.sent = 0
+    server.requests.clear()
+    server.sent = 0
     addresses = [f"{server.address}/{path.name}" for path in (a, b)]
     start = time.perf_counter()
     command = [sys.executable, "-m", "rsltrace", "diff", *addresses]
@@ -86,15 +43,15 @@ def measure(server: Server, kind: str, place: str, a: Path, b: Path) -> None:
     if done.returncode != (0 if place == "same" else 1):
         raise SystemExit(f"{' '.join(command)} failed")
     whole = (a.stat().st_size + b.stat().st_size) / 1e6
-    row = f"{kind:>6}  {place:>7}  {whole:>8.0f}  {server.requests:>8}  {server.sent / 1e6:>7.2f}"
-    print(f"{row}  {taken:>6.2f}", flush=True)
+    row = f"{kind:>6}  {place:>7}  {whole:>8.0f}  {len(server.requests):>8}"
+    print(f"{row}  {server.sent / 1e6:>7.2f}  {taken:>6.2f}", flush=True)
 
 
 def main() -> None:
     """Measure and print."""
     folder = Path(tempfile.gettempdir()) / f"rsltrace-benchmark-diff-remote-{_VERSION}"
     folder.mkdir(exist_ok=True)
-    server = Server(folder)
+    server = RangeServer(folder)
     print("  kind  part at  MB whole  requests  MB sent       s")
     for kind, (shape, segment) in KINDS.items():
         a = folder / f"{kind}-a.mcap"

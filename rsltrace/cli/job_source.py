@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.job.ros_words import split_ros_arguments
+
 if TYPE_CHECKING:
     from rsltrace.job import Job
 
@@ -23,24 +25,6 @@ class RosArgsCommand(click.Command):
         """Set the ROS arguments aside before click sees them."""
         own, ctx.meta[_META] = split_ros_arguments(args)
         return super().parse_args(ctx, own)
-
-
-def split_ros_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a program's own words, and those between each ``--ros-args`` and ``--`` (or the end).
-
-    A ``--`` that ends no ROS arguments stays.
-    """
-    own: list[str] = []
-    ros: list[str] = []
-    inside = False
-    for word in words:
-        if word == "--ros-args":
-            inside = True
-        elif word == "--" and inside:
-            inside = False
-        else:
-            (ros if inside else own).append(word)
-    return own, ros
 
 
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.job.ros_words import split_ros_arguments
 from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import flat, parameters_for
 from rsltrace.launch.scope import ParameterFile
@@ -63,7 +64,7 @@ def _why_not(node: LaunchedNode, of_executable: Callable[[str, str], str | None]
 
 
 def _spec(node: LaunchedNode) -> NodeSpec:
-    words, ros_words = _split(node.arguments)
+    words, ros_words = split_ros_arguments(node.arguments)
     given = _RosWords([*node.ros_arguments, *ros_words], node.where)
     name = given.name or node.name
     namespace = given.namespace or node.namespace
@@ -105,21 +106,6 @@ def _in_order(
         else:
             values.update(flat(item))
     return files, values
-
-
-def _split(arguments: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return a program's own words, and those between ``--ros-args`` and ``--``."""
-    own: list[str] = []
-    ros: list[str] = []
-    inside = False
-    for word in arguments:
-        if word == "--ros-args":
-            inside = True
-        elif word == "--" and inside:
-            inside = False
-        else:
-            (ros if inside else own).append(word)
-    return own, ros
 
 
 class _RosWords:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.ros.destroyable import Destroyable
-from rsltrace.ros.groups import is_busy
+from rsltrace.ros.groups import must_wait
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -136,10 +136,9 @@ class Receiver(EntityHandle):
         if not self.queue or wrapper is None or self.destroyed:
             return False
         group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-            self.core.park(group, self, lambda: self.core.loop.ready.appendleft(self))
-            return False
-        return True
+        if getattr(group, "_active_entity", group) is None:  # nearly always
+            return True
+        return not must_wait(self.core, self, wrapper)
 
     def settle(self) -> bool:
         self.find_wrapper()

@@ -20,6 +20,15 @@ def is_busy(group: Any, wrapper: Any) -> bool:
     return active is not group or (group is not None and not group.can_execute(wrapper))
 
 
+def must_wait(core: Core, handle: Any, wrapper: Any) -> bool:
+    """Return whether a callback that is ready must wait for its group; if so it is parked, and is
+    ready again when the group is free."""
+    if not is_busy(wrapper.callback_group, wrapper):
+        return False
+    core.park(wrapper.callback_group, handle, lambda: core.loop.ready.appendleft(handle))
+    return True
+
+
 def begin(group: Any, wrapper: Any) -> None:
     """Mark that a callback is under way that may be suspended."""
     if group is not None:

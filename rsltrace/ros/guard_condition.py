@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.ros.entity_handle import EntityHandle
-from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.groups import begin, must_wait
 from rsltrace.ros.tasks import is_coroutine_function, start_coroutine
 
 if TYPE_CHECKING:
@@ -63,14 +63,12 @@ class GuardConditionHandle(EntityHandle):
         if not self._triggered or wrapper is None or self.destroyed:
             return
         core = self.core
-        group = wrapper.callback_group
-        if is_busy(group, wrapper):
-            core.park(group, self, lambda: core.loop.ready.appendleft(self))
+        if must_wait(core, self, wrapper):
             return
         self._triggered = False
         callback = wrapper.callback
         if is_coroutine_function(callback):
-            begin(group, wrapper)
+            begin(wrapper.callback_group, wrapper)
             start_coroutine(core, self, _GUARD, callback, (), *self._cause, 0)
         else:
             core.execute(self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0)

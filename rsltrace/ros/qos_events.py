@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.ros.entity_handle import EntityHandle, callback_name
-from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.groups import begin, must_wait
 from rsltrace.ros.qos_status import (
     DEADLINE_MISSED,
     INCOMPATIBLE,
@@ -101,9 +101,7 @@ class EventHandle(EntityHandle):
         if wrapper is None or self.destroyed:
             return
         core = self.core
-        group = wrapper.callback_group
-        if is_busy(group, wrapper):
-            core.park(group, self, lambda: core.loop.ready.appendleft(self))
+        if must_wait(core, self, wrapper):
             return
         self._queued = False
         if not self.has_news():
@@ -111,7 +109,7 @@ class EventHandle(EntityHandle):
         status = self.take_event()
         callback = wrapper.callback
         if is_coroutine_function(callback):
-            begin(group, wrapper)
+            begin(wrapper.callback_group, wrapper)
             start_coroutine(core, self, _QOS_EVENT, callback, (status,), *self._cause, 0)
         else:
             core.execute(

@@ -11,7 +11,7 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.event import NO_EVENT, EventKind
-from rsltrace.ros.groups import begin, is_busy
+from rsltrace.ros.groups import begin, must_wait
 from rsltrace.ros.mailbox import executor_of
 from rsltrace.ros.tasks import start_coroutine
 from rsltrace.ros.wait_set import WaitSetHandle
@@ -75,9 +75,8 @@ class UserWaitable:
             return
         if self._closed or self.node.destroyed:
             return
-        core, group = self.core, self.wrapper.callback_group
-        if is_busy(group, self.wrapper):
-            core.park(group, self, lambda: core.loop.ready.appendleft(self))
+        core = self.core
+        if must_wait(core, self, self.wrapper):
             return
         self._queued = False
         ready = self._set.ready_now()
@@ -90,7 +89,7 @@ class UserWaitable:
         if getattr(handle, "queue", None):
             _, event, position, digest, *_ = handle.queue[0]
             cause = (event, position)
-        begin(group, self.wrapper)
+        begin(self.wrapper.callback_group, self.wrapper)
         here: Any = self  # has what start_coroutine needs
         start_coroutine(core, here, int(_KINDS[name]), self._execute, (), *cause, digest)
 

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rsltrace.errors import SetupError, TraceError
+from rsltrace.trace.source import check_within
 
 BLOCK_BYTES = 32 << 10
 """Small: what is fetched around a piece for nothing is half a block on either side."""
@@ -62,12 +63,8 @@ class RemoteSource:
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``. Raises TraceError if they cannot be had."""
+        check_within(self, offset, length)
         end = offset + length
-        if end > self._size:
-            raise TraceError(
-                f"{self._name}: {length} bytes at offset {offset} reach beyond the end of the file "
-                f"({self._size} bytes); the file is damaged"
-            )
         if self._whole is not None:
             return self._whole[offset:end]
         first, last = offset // BLOCK_BYTES, -(-end // BLOCK_BYTES)

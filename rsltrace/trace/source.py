@@ -43,6 +43,15 @@ class ByteSource(Protocol):
         ...
 
 
+def check_within(source: ByteSource, offset: int, length: int) -> None:
+    """Raise TraceError if a range is not in the file: where it says that something is."""
+    if offset + length > source.size:
+        raise TraceError(
+            f"{source.name}: {length} bytes at offset {offset} reach beyond the end of the file "
+            f"({source.size} bytes); the file is damaged"
+        )
+
+
 class FileSource:
     """A file on disk."""
 
@@ -85,11 +94,7 @@ class FileSource:
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``. Raises TraceError if the file ends before."""
-        if offset + length > self._size:
-            raise TraceError(
-                f"{self._path}: {length} bytes at offset {offset} reach beyond the end of the file "
-                f"({self._size} bytes); the file is damaged"
-            )
+        check_within(self, offset, length)
         try:
             data = self._read(offset, length)
         except (OSError, ValueError) as error:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import re
 import sys
-import threading
 from collections.abc import Iterator
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
 import pytest
@@ -19,6 +16,7 @@ from rsltrace.errors import SetupError, TraceError, TraceFormatError
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
 from rsltrace.trace.source import FileSource, open_source
+from tests.range_server import RangeServer
 
 PLAN = Plan(
     (
@@ -30,66 +28,16 @@ PLAN = Plan(
 )
 
 
-class Server:
-    """Serves a folder and counts. ``ranges`` can be switched off, as some servers do."""
-
-    def __init__(self, folder: Path) -> None:
-        self.requests: list[str] = []
-        self.sent = 0
-        self.ranges = True
-        self.broken = False
-        outer = self
-
-        class Handler(BaseHTTPRequestHandler):
-            protocol_version = "HTTP/1.1"
-
-            def log_message(self, *args: object) -> None:
-                pass
-
-            def do_HEAD(self) -> None:  # the base class asks for the name
-                self._answer(send=False)
-
-            def do_GET(self) -> None:
-                self._answer(send=True)
-
-            def _answer(self, *, send: bool) -> None:
-                outer.requests.append(self.headers.get("Range", ""))
-                path = folder / self.path.lstrip("/")
-                data = path.read_bytes() if path.is_file() else b""
-                wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers.get("Range", ""))
-                status = 200 if path.is_file() else 404
-                if wanted and outer.broken:
-                    status, data = 500, b"broken"
-                elif wanted and outer.ranges and status == 200:
-                    status, data = 206, data[int(wanted[1]) : int(wanted[2]) + 1]
-                self.send_response(status)
-                self.send_header("Content-Length", str(len(data)))
-                self.end_headers()
-                if send:
-                    outer.sent += len(data)
-                    self.wfile.write(data)
-
-        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-        self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
-        self._thread.start()
-        self.address = f"http://127.0.0.1:{self._server.server_port}"
-
-    def close(self) -> None:
-        self._server.shutdown()
-        self._server.server_close()
-        self._thread.join()
-
-
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
+def server(tmp_path: Path) -> Iterator[RangeServer]:
     pytest.importorskip("fsspec")
     pytest.importorskip("aiohttp")
-    server = Server(tmp_path)
+    server = RangeServer(tmp_path)
     yield server
     server.close()
 
 
-def test_a_diff_over_http(server: Server, tmp_path: Path) -> None:
+def test_a_diff_over_http(server: RangeServer, tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     fault = Fault("bit", 3 + 3 * 3000 + 1)
     Simulation(PLAN, tmp_path / "b.mcap", (fault,)).run()
@@ -104,14 +52,14 @@ def test_a_diff_over_http(server: Server, tmp_path: Path) -> None:
     assert server.sent < whole * 0.8, "even here, where the files are small"
 
 
-def test_identical_runs_over_http_cost_a_few_requests(server: Server, tmp_path: Path) -> None:
+def test_identical_runs_over_http_cost_a_few_requests(server: RangeServer, tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     assert rsltrace.diff(f"{server.address}/a.mcap", f"{server.address}/a.mcap").identical
     assert len(server.requests) <= 8
     assert server.sent < 10 * BLOCK_BYTES
 
 
-def test_an_interrupted_trace_over_http(server: Server, tmp_path: Path) -> None:
+def test_an_interrupted_trace_over_http(server: RangeServer, tmp_path: Path) -> None:
     """It has no index and is read from front to back, in pieces that grow."""
     Simulation(PLAN, tmp_path / "a.mcap", storage=Storage(100, "")).run()
     data = (tmp_path / "a.mcap").read_bytes()
@@ -122,7 +70,7 @@ def test_an_interrupted_trace_over_http(server: Server, tmp_path: Path) -> None:
     assert len(server.requests) < len(data) // BLOCK_BYTES / 2
 
 
-def test_a_server_without_ranges(server: Server, tmp_path: Path) -> None:
+def test_a_server_without_ranges(server: RangeServer, tmp_path: Path) -> None:
     """It sends the whole file each time it is asked: once is enough."""
     server.ranges = False
     Simulation(PLAN, tmp_path / "a.mcap").run()
@@ -134,7 +82,7 @@ def test_a_server_without_ranges(server: Server, tmp_path: Path) -> None:
     assert len(server.requests) == 2
 
 
-def test_what_is_not_there(server: Server, tmp_path: Path) -> None:
+def test_what_is_not_there(server: RangeServer, tmp_path: Path) -> None:
     with pytest.raises(TraceError, match=rf"{server.address}/none.mcap does not exist"):
         Trace.open(f"{server.address}/none.mcap")
     (tmp_path / "text.mcap").write_bytes(b"hello, this is text")
@@ -148,7 +96,7 @@ def test_what_is_not_there(server: Server, tmp_path: Path) -> None:
         Trace.open("nothing://a/b")
 
 
-def test_a_recording_at_an_address(server: Server, tmp_path: Path) -> None:
+def test_a_recording_at_an_address(server: RangeServer, tmp_path: Path) -> None:
     from click.testing import CliRunner
     from mcap.writer import Writer
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import random
 import subprocess
 import sys
 from collections import defaultdict
@@ -20,6 +19,7 @@ import demo_packages as demos
 import pytest
 
 import rsltrace
+from rsltrace.campaign.perturb import record_in, surroundings
 
 pytestmark = [
     pytest.mark.ros,
@@ -45,17 +45,15 @@ def job_text(prefix: Path, *programs: tuple[str, ...]) -> str:
     return "\n".join([*lines, f"search_path: [{prefix}]", "stop: {duration: 30s}", ""])
 
 
-def record(job: Path, output: Path, **environment: str) -> str:
-    """Record with the command, in a process of its own; return the line with the digest."""
+def record(job: Path, output: Path) -> None:
+    """Record with the command, in a process of its own."""
     done = subprocess.run(
         [sys.executable, "-m", "rsltrace", "record", str(job), "-o", str(output), "--quiet"],
-        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
-    return done.stdout.splitlines()[-1]
 
 
 def logs_of(path: Path) -> dict[str, list[str]]:
@@ -95,17 +93,11 @@ def test_programs_do_what_they_do_over_dds(prefix: Path, tmp_path: Path) -> None
 def test_one_digest_whatever_surrounds_the_run(prefix: Path, tmp_path: Path) -> None:
     job = everybody(prefix, tmp_path)
 
-    def perturbed(index: int) -> str:
-        chance = random.Random(index)
-        return record(
-            job,
-            tmp_path / f"{index}.mcap",
-            PYTHONHASHSEED=str(chance.randrange(2**32)),
-            TZ=chance.choice(["UTC", "Asia/Kathmandu", "Pacific/Apia"]),
-            LC_ALL=chance.choice(["C", "C.UTF-8", "POSIX"]),
-            PADDING="p" * chance.randrange(4000),
-        )
+    def perturbed(number: int) -> tuple[str, int]:
+        recorded = record_in(surroundings(number), [str(job)], tmp_path)
+        assert recorded.digest, recorded.failure
+        return recorded.digest, recorded.events
 
     with ThreadPoolExecutor(max_workers=2) as pool:
-        lines = set(pool.map(perturbed, range(RUNS)))
-    assert len(lines) == 1, lines
+        digests = set(pool.map(perturbed, range(RUNS)))
+    assert len(digests) == 1, digests
