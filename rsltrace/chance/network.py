@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 from rsltrace.chance.channel import NO_MODEL, Channel, Model, Outage
@@ -75,6 +75,8 @@ class NetworkPlan:
         model = _by_name(self.services, service)
         if model is None:
             model = self.default
+        if model is not None and model.duplicate > 0.0:
+            model = replace(model, duplicate=0.0)  # a request is answered once
         outages = self._outages("service", service, (client[0], server[0]))
         name = f"{direction}\0{service}\0{_end(client)}\0{_end(server)}"
         return self._channel(model, outages, name, reliable=True)

@@ -165,3 +165,11 @@ class DelaysSpec(Part):
         description="A delay file of RSLCPP (CSV), with FIXED delays by topic.",
         examples=["delays.csv"],
     )
+
+    @model_validator(mode="after")
+    def _answered_once(self) -> DelaysSpec:
+        for name, model in self.services.items():
+            if model.duplicate:
+                place = ("services", name, "duplicate")
+                raise Problem("requests and responses of services never arrive twice", place)
+        return self

@@ -108,7 +108,8 @@ def named(key: str, rule: Callable[[str], None]) -> BeforeValidator:
             raise Problems(problems)
         return {name: expand(value, key) for name, value in values.items()}
 
-    return BeforeValidator(attach(validate, value_shorthand=key))
+    names = {"pattern": rule.pattern}  # type: ignore[attr-defined]
+    return BeforeValidator(attach(validate, value_shorthand=key, names=names))
 
 
 class UniformSpec(Part):

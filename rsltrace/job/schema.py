@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import types
+from itertools import combinations
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
@@ -114,6 +115,10 @@ class _Maker:
         one_of = getattr(model, "ONE_OF", ())
         if one_of and not self._partial:
             definition["oneOf"] = [{"required": [key]} for key in one_of]
+        alternatives = () if one_of else getattr(model, "ALTERNATIVES", ())
+        if alternatives:
+            pairs = [(a[0], b[0]) for a, b in combinations(alternatives, 2)]
+            definition["not"] = {"anyOf": [{"required": list(pair)} for pair in pairs]}
         if model is Job:
             definition["patternProperties"] = {"^x-": {"description": FREE}}
         if model is Job and not self._partial:
@@ -148,7 +153,14 @@ class _Maker:
         facts: Schema = {}
         for item in metadata:
             function = getattr(item, "func", None)
-            for name in ("schema", "shorthand", "entry_shorthand", "value_shorthand", "words"):
+            for name in (
+                "schema",
+                "shorthand",
+                "entry_shorthand",
+                "value_shorthand",
+                "words",
+                "names",
+            ):
                 value = getattr(function, name, None)
                 if value is not None:
                     facts[name] = value
@@ -173,10 +185,9 @@ class _Maker:
             items = self._short(arguments[0], facts.get("entry_shorthand"))
             return {"type": "array", "items": items}
         if origin is dict:
-            return {
-                "type": "object",
-                "additionalProperties": self._short(arguments[1], facts.get("value_shorthand")),
-            }
+            value = self._short(arguments[1], facts.get("value_shorthand"))
+            names = {"propertyNames": facts["names"]} if "names" in facts else {}
+            return {"type": "object", **names, "additionalProperties": value}
         if inspect.isclass(annotation) and issubclass(annotation, BaseModel):
             return self._short(annotation, facts.get("shorthand"))
         return dict(_SCALARS.get(annotation, {}))

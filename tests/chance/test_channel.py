@@ -187,6 +187,17 @@ def test_adding_removing_or_renaming_a_link_leaves_all_others_as_they_were(
                 assert after[names] == before[names]
 
 
+def test_requests_never_arrive_twice_nor_wait_for_a_copy() -> None:
+    models = [Model(Uniform(0, 50 * MS), duplicate=share) for share in (0.0, 0.9)]
+    links = [
+        NetworkPlan(default=model).service_channel("/s", ("/n", 0), ("/m", 0), "request")
+        for model in models
+    ]
+    plain, twice = ([link.transmit(i * MS) for i in range(100)] for link in links if link)
+    assert twice == plain
+    assert all(link is not None and link.duplicate_ns == -1 for link in links)
+
+
 def test_the_most_precise_rule_counts() -> None:
     plan = NetworkPlan(
         links=(LinkRule("/t", "*", "/slow", Model(Constant(1))),),

@@ -157,6 +157,11 @@ def test_rules_and_outages_of_a_plan() -> None:
             "job.yaml:3:25: delay.default.keep_order: expected true or false, got the number 1",
         ),
         (
+            "services: {/a: {constant: 1ms, duplicate: 0.1}}",
+            "job.yaml:3:45: delay.services./a.duplicate: requests and responses of services never "
+            "arrive twice",
+        ),
+        (
             "outages: [{from: 1s, to: 2s}]",
             "job.yaml:3:13: delay.outages[0]: give one of topic, service or node",
         ),
