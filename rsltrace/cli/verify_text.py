@@ -107,8 +107,8 @@ def _provoked(result: Verified, command: str) -> str:
 
 def _trouble(result: Verified, run: Recorded, command: str) -> str:
     number = run.surroundings.number
-    what = "the job" if number == 0 else f"run {number} of {result.runs}"
-    lines = [f"rsltrace: error: {what} came to no answer: {run.failure}"]
+    what = "the first run" if number == 0 else f"run {number} of {result.runs}"
+    lines = [f"rsltrace: error: {what} cannot be compared: {run.failure}"]
     said = run.errors.strip().splitlines()[-_LINES_MAX:]
     lines += [f"  | {line}" for line in said]
     lines.append(f"with {run.surroundings}; to repeat it:\n  {command}")

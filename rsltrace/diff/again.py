@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from pathlib import Path
 
 from rsltrace.trace.reader import Trace
 
@@ -30,7 +31,7 @@ def record_again(trace: Trace) -> str:
     """Return ``rsltrace record …`` for the job of ``trace``, "" if it came from no file."""
     if not is_of_file(trace):
         return ""
-    words = ["rsltrace", "record", trace.job["name"]]
+    words = ["rsltrace", "record", _job_file(trace)]
     if is_effective(trace):
         for line in trace.job_text.splitlines()[1:]:
             if not line.startswith("#"):
@@ -38,6 +39,13 @@ def record_again(trace: Trace) -> str:
             if line.startswith(_WITH):
                 words = _with(words, line[len(_WITH) :])
     return " ".join(shlex.quote(word) for word in words)
+
+
+def _job_file(trace: Trace) -> str:
+    """Return the job file: a trace knows its name, and often lies beside it."""
+    name = trace.job["name"]
+    beside = Path(trace.name).parent / name
+    return str(beside) if not Path(name).exists() and beside.is_file() else name
 
 
 def _with(words: list[str], override: str) -> list[str]:

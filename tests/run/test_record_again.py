@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -51,11 +52,22 @@ def test_where_the_jobs_differ_both_runs_are_to_be_looked_at(rsltrace: Any, job_
     assert done.stdout.endswith("next: rsltrace view a.mcap b.mcap\n"), done.stdout
 
 
+def test_the_job_is_looked_for_beside_the_trace(rsltrace: Any, tmp_path: Path) -> None:
+    """The first diff that `make demo` shows is of traces elsewhere."""
+    sample = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"
+    here = tmp_path / "samples"
+    shutil.copytree(sample, here)
+    command = rsltrace("diff", "samples/a.mcap", "samples/b.mcap").stdout.splitlines()[-1]
+    assert command.startswith("next: rsltrace record samples/job.yaml --until 2.1")
+    inside = rsltrace("diff", "a.mcap", "b.mcap", cwd=here).stdout.splitlines()[-1]
+    assert inside.startswith("next: rsltrace record job.yaml --until 2.1")
+
+
 class _Job:
     """As much of a trace as the command is made of."""
 
     def __init__(self, name: str, text: str) -> None:
-        self.job, self.job_text = {"name": name}, text
+        self.name, self.job, self.job_text = "run.mcap", {"name": name}, text
 
 
 @pytest.mark.parametrize(
