@@ -151,10 +151,10 @@ class Session:
         check_bag_types(self._bags)
         if self._output is not None:
             self._open_trace(stack, self._output)
-        if self._observer.interrupt is not None:
-            self._observer.interrupt(self.loop.stop)
-        stack.enter_context(quiet_gc())
         self._watchdog = Watchdog(self.world.core)
+        if self._observer.interrupt is not None:
+            self._observer.interrupt(self._interrupt)
+        stack.enter_context(quiet_gc())
         stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
@@ -221,6 +221,15 @@ class Session:
         self._guarded.trace_begins(recorder, self.loop.now_ns)
         if job.stop.size is not None:
             self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
+
+    def _interrupt(self, stop: Stop) -> None:
+        """End the run after the present event, or within it if it does not come back.
+
+        :raises KeyboardInterrupt: in the second case, on the stack of the event.
+        """
+        self.loop.stop(stop)
+        if self._watchdog.has_told:
+            raise KeyboardInterrupt
 
     @property
     def ended(self) -> bool:

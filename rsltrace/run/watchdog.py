@@ -43,6 +43,8 @@ class Watchdog:
     def __init__(self, core: Core) -> None:
         self._core = core
         self._process = os.getpid()
+        self.has_told = False
+        """Whether what is under way now has been told of."""
         self._running = False
         self._stopping = allocate_lock()
         self._ended = allocate_lock()
@@ -82,12 +84,13 @@ class Watchdog:
                 still = min(still + 1, _LOOKS_MAX)
             else:
                 seen[0], seen[1] = loop.events, loop.now_ns
-                still = 0
+                still, self.has_told = 0, False
             del loop
             since_note = min(since_note + 1, _LOOKS_BETWEEN_NOTES)
             if still >= _LOOKS_BEFORE_NOTE and since_note == _LOOKS_BETWEEN_NOTES:
                 with suppress(Exception):
-                    since_note = 0 if self._tell(int(still * LOOK_EVERY_S)) else since_note
+                    if self._tell(int(still * LOOK_EVERY_S)):
+                        since_note, self.has_told = 0, True
         self._ended.release()
 
     def _tell(self, for_s: int) -> bool:

@@ -20,7 +20,8 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 from rclpy.node import Node
 
 import rsltrace
-from rsltrace.run import watchdog
+from rsltrace.loop.stop import Stop
+from rsltrace.run import Observer, run, watchdog
 
 pytestmark = pytest.mark.ros
 
@@ -147,6 +148,33 @@ def test_a_simulation_that_its_driver_leaves_standing_is_no_alarm(
         assert capsys.readouterr().err == ""
         sim.run_for(1.0)
         assert "/quiet: timer" in capsys.readouterr().err, "within the run it is one"
+
+
+@pytest.mark.parametrize(("told_of", "went_on"), [(True, []), (False, [1, 2, 3])])
+def test_one_interrupt_ends_what_was_told_of(
+    busy: Looks, tmp_path: Path, told_of: bool, went_on: list[int]
+) -> None:
+    ends: list[Callable[[Stop], None]] = []
+    seen: list[int] = []
+
+    class Busy(Node):
+        def __init__(self) -> None:
+            super().__init__("busy")
+            self.count = 0
+            self.create_timer(1.0, self.tick)
+
+        def tick(self) -> None:
+            self.count += 1
+            busy(9 if self.count < 3 else 2)  # the first two are told of, the third is not
+            if told_of or self.count == 3:
+                ends[0](Stop("interrupted", 130))  # as the command's signal handler does
+            seen.append(self.count)
+
+    stop = rsltrace.StopSpec(duration="20s")
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Busy)], stop=stop)
+    result = run(job, tmp_path / "a.mcap", observer=Observer(interrupt=ends.append))
+    assert (result.exit_code, result.stop_reason) == (130, "interrupted")
+    assert seen == went_on
 
 
 def test_a_debugger_is_no_alarm(
