@@ -254,7 +254,7 @@ class SubscriptionHandle(Receiver):
         if not self.may_run():
             return
         wrapper = self.wrapper
-        data, event, position, digest, *_ = delivery = self.queue.popleft()
+        data, event, position, digest, _, _, _ = delivery = self.queue.popleft()
         callback = wrapper._callback
         if callback is not self._callback:
             self._learn(wrapper)
