@@ -93,7 +93,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[st
         text=True,
         check=False,
         env={**os.environ, "PYTHONPATH": str(installed)},
-        timeout=120,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     found: dict[str, list[dict[str, Any]]] = {}
