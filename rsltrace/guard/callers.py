@@ -46,6 +46,11 @@ def _kind_of(file: str) -> int:
     return kind
 
 
+def is_own(module: str) -> bool:
+    """Return whether a module is rsltrace's, which may lie in a folder of user code."""
+    return module.partition(".")[0] in ("rsltrace", "rsltrace_viewer")
+
+
 def is_user_file(file: str) -> bool:
     """Return whether a source file is neither Python's nor an installed package's nor ours."""
     return _kind_of(file) == _USER

@@ -220,29 +220,34 @@ def clocks() -> Iterator[None]:
             redirect(name, partial(_broken_down, name))
         redirect("strftime", lambda real: _formatting("strftime", 1, real, localtime))
         redirect("asctime", lambda real: _formatting("asctime", 0, real, localtime))
+        bound_before = _bound_before("now", "utcnow")
         for name, make in (("now", _now), ("utcnow", _utcnow)):
-            _exchange(stack, name, make)
+            _exchange(stack, name, make, bound_before[name])
         yield
 
 
-def _exchange(stack: ExitStack, name: str, make: Callable[[Any], Any]) -> None:
+def _exchange(
+    stack: ExitStack,
+    name: str,
+    make: Callable[[Any], Any],
+    bound_before: list[BuiltinFunctionType],
+) -> None:
     """Exchange a class method of ``datetime``, in the type and where it was bound before."""
     real = datetime.__dict__[name]
     ours = make(real)
-    for bound in _bound_before(name):
+    for bound in bound_before:
         target = ours.__get__(bound.__self__)
         stack.callback(Redirected(bound, target).restore)
     put_member(datetime, name, classmethod(ours))
     stack.callback(put_member, datetime, name, real)
 
 
-def _bound_before(name: str) -> list[BuiltinFunctionType]:
-    """Return the bound class methods that somebody keeps (``now = datetime.now``)."""
-    return [
-        thing
-        for thing in gc.get_objects()
-        if type(thing) is BuiltinFunctionType
-        and thing.__name__ == name
-        and isinstance(thing.__self__, type)
-        and issubclass(thing.__self__, datetime)
-    ]
+def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:
+    """Return the bound class methods that somebody keeps (``now = datetime.now``), by name."""
+    found: dict[str, list[BuiltinFunctionType]] = {name: [] for name in names}
+    for thing in gc.get_objects():
+        if type(thing) is BuiltinFunctionType and thing.__name__ in found:
+            owner = thing.__self__
+            if isinstance(owner, type) and issubclass(owner, datetime):
+                found[thing.__name__].append(thing)
+    return found

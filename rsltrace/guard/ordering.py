@@ -19,6 +19,7 @@ from contextlib import contextmanager
 from types import CodeType, ModuleType
 from typing import Any
 
+from rsltrace.guard.callers import is_own
 from rsltrace.guard.clocks import numpy_now
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.watch import is_by_address
@@ -225,7 +226,7 @@ class _Finder:
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
         """Return the spec of a user module with our loader, or None for any other module."""
-        if name in sys.builtin_module_names:
+        if name in sys.builtin_module_names or is_own(name):
             return None
         spec = importlib.machinery.PathFinder.find_spec(name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsltrace.guard.callers import is_own
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
@@ -72,6 +73,9 @@ def quiet_gc() -> Iterator[None]:
             gc.enable()
 
 
+_INSTALLED = frozenset(("site-packages", "dist-packages"))
+
+
 @contextmanager
 def search_path(job: Job) -> Iterator[None]:
     """Let user modules be imported from the job's search path, and forget them afterwards."""
@@ -89,18 +93,19 @@ def search_path(job: Job) -> Iterator[None]:
 def user_modules(folders: list[str]) -> dict[str, Path]:
     """Return the files of the loaded modules that lie in ``folders``, by module name.
 
-    Installed packages are not the user's, even where a virtual environment lies in the folder.
+    Installed packages are not the user's, even where a virtual environment lies in the folder, nor
+    is rsltrace: which of its modules are loaded depends on what was done before.
     An episode of a ``Simulation`` asks more than once, of some thousand modules: these are texts.
     """
     below = tuple(os.path.join(folder, "") for folder in folders)
     found: dict[str, Path] = {}
     for name, module in sorted(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if not isinstance(file, str) or not os.path.normpath(file).startswith(below):
+        if not isinstance(file, str) or is_own(name):
             continue
-        path = Path(file)
-        if not {"site-packages", "dist-packages"} & set(path.parts):
-            found[name] = path
+        path = os.path.normpath(file)
+        if path.startswith(below) and _INSTALLED.isdisjoint(path.split(os.sep)):
+            found[name] = Path(file)
     return found
 
 

@@ -9,6 +9,7 @@ import os
 import platform
 from collections.abc import Callable
 from fnmatch import fnmatchcase
+from functools import lru_cache
 from pathlib import Path
 
 from rsltrace._version import __version__
@@ -72,6 +73,18 @@ def _module_of(target: Target | None) -> str:
     return named.partition(":")[0]
 
 
+@lru_cache(maxsize=1)
+def _versions() -> tuple[tuple[str, str], ...]:
+    """Return the versions of the packages that matter; they stay for as long as a process lives."""
+    found = []
+    for package in _PACKAGES:
+        try:
+            found.append((package, importlib.metadata.version(package)))
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    return tuple(found)
+
+
 def environment(job: Job | None = None) -> dict[str, str]:
     """Return what a run's result may depend on: versions, never dates, names or paths.
 
@@ -86,11 +99,7 @@ def environment(job: Job | None = None) -> dict[str, str]:
         "system": platform.system(),
         "hash_seed": os.environ.get(HASH_SEED, "random"),
     }
-    for package in _PACKAGES:
-        try:
-            values[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            continue
+    values.update(_versions())
     kernels = "" if job is None else numerics(job)
     if kernels:
         values["numerics"] = kernels

@@ -158,3 +158,34 @@ def test_a_folder_for_temporary_files_that_somebody_chose_stays(
     with installed():
         assert tempfile.gettempdir() == str(tmp_path)
     assert tempfile.tempdir == str(tmp_path)
+
+
+OWN = """
+import sys
+from rsltrace import Trace, load_job, record
+
+record(load_job(sys.argv[1]), sys.argv[2])
+core = sys.modules["rsltrace.ros.core"]  # was loaded in the run, and stays
+assert type(core.__loader__).__module__ != "rsltrace.guard.ordering", "it is not user code"
+with Trace.open(sys.argv[2]) as trace:
+    assert list(trace.metadata("rsltrace:sources")) == ["cold"], trace.metadata("rsltrace:sources")
+"""
+
+
+def test_rsltrace_is_not_user_code_even_if_it_lies_in_the_search_path(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    import rsltrace
+
+    (tmp_path / "cold.py").write_text(NODE)
+    checkout = str(Path(rsltrace.__file__).parents[1])
+    nodes = [{**COLD, "arguments": {"imports": False}}]
+    job = {"nodes": nodes, "search_path": [".", checkout], "stop": {"duration": "0.2s"}}
+    (tmp_path / "job.yaml").write_text(json.dumps(job))
+    done = subprocess.run(
+        [sys.executable, "-c", OWN, str(tmp_path / "job.yaml"), str(tmp_path / "run.mcap")],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
