@@ -64,7 +64,7 @@ attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "patt
 class JumpSpec(Part):
     """A clock is set: by so much, at some time."""
 
-    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns"}
+    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
 
     at_ns: Annotated[int, check(parse_time)] = Field(
         alias="at", description="When, since the start of the run.", examples=["5s"]
@@ -89,6 +89,8 @@ class RandomJumpsSpec(Part):
 
 class ClockSpec(Part):
     """The clock of some nodes, compared with simulated time."""
+
+    TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
 
     node: Annotated[str, check(text(check_node_glob))] = Field(
         description="Node, a glob; the first entry that fits counts.", examples=["/lidar"]

@@ -243,6 +243,7 @@ attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 
 class SeriesSpec(Part):
     """A value that changes over time: listed here, or in a file."""
 
+    OF_TIMES: ClassVar[tuple[str, ...]] = ("points",)
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("points",), ("file", "unit"))
     MEANT: ClassVar[str] = "points"
     MEANT_LIST: ClassVar[bool] = True

@@ -70,8 +70,15 @@ def _explicit(part: Part) -> dict[str, Any]:
         if field.exclude or value == field.get_default(call_default_factory=True):
             continue
         key = field.alias or name
-        values[key] = format_time(value) if key in part.TIMES else _plain(value, _explicit)
+        values[key] = _times(value) if part.counts_ns(name) else _plain(value, _explicit)
     return values
+
+
+def _times(value: Any) -> Any:
+    """Return nanoseconds, or tuples of them, as a job file says them."""
+    if isinstance(value, tuple):
+        return [_times(item) for item in value]
+    return f"-{format_time(-value)}" if value < 0 else format_time(value)
 
 
 def _complete(part: Part) -> dict[str, Any]:

@@ -40,6 +40,9 @@ class Part(BaseModel):
     TIMES: ClassVar[dict[str, str]] = {}
     """YAML key of each time → name of its field, which ends in ``_ns``."""
 
+    OF_TIMES: ClassVar[tuple[str, ...]] = ()
+    """Other fields that hold times, in tuples."""
+
     def __init__(self, **data: Any) -> None:
         try:
             super().__init__(**data)
@@ -72,8 +75,21 @@ class Part(BaseModel):
         for name, field in type(self).model_fields.items():
             key = field.alias or name
             if key not in changes and name not in changes and name in self.model_fields_set:
-                values[name if key in self.TIMES else key] = getattr(self, name)
+                value = getattr(self, name)
+                values[key] = _counted(value) if self.counts_ns(name) else value
         return type(self)(**values, **changes)
+
+    @classmethod
+    def counts_ns(cls, name: str) -> bool:
+        """Whether a field holds times: nanoseconds, or tuples of these."""
+        return name.endswith("_ns") or name in cls.OF_TIMES
+
+
+def _counted(value: object) -> object:
+    """Mark times as nanoseconds, so that they are not taken for seconds."""
+    if isinstance(value, tuple):
+        return tuple(map(_counted, value))
+    return value if value is None else Nanoseconds(value)
 
 
 def from_file(info: ValidationInfo) -> bool:

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from rsltrace.job import BagSpec, Job, NodeSpec, QosSpec, RecordSpec, StopSpec, TopicStop, load_job
+from rsltrace.job.clocks import ClockSpec, JumpSpec
+from rsltrace.job.distribution import SamplesSpec, SeriesSpec
 from rsltrace.job.schema import job_schema
 
 SCHEMA = jsonschema.Draft202012Validator(job_schema())
@@ -86,8 +88,64 @@ bags = st.builds(
         max_size=2,
     ),
 )
+short_times = st.integers(0, 2**55).map(lambda ns: f"{ns}ns")
+some_times = st.integers(1_000_000, 2**55).map(lambda ns: f"{ns}ns")
+signed_times = st.tuples(st.sampled_from(["", "-"]), short_times).map("".join)
+shares = st.floats(0, 1)
+distributions = st.one_of(
+    st.fixed_dictionaries({"constant": short_times}),
+    st.fixed_dictionaries(
+        {"normal": st.fixed_dictionaries({"mean": short_times, "sd": some_times})}
+    ),
+    st.lists(short_times, min_size=1, max_size=3).map(lambda v: {"samples": {"values": v}}),
+    st.tuples(some_times, short_times, st.booleans()).map(
+        lambda v: {"series": {"points": [["0s", v[1]], [v[0], v[1]]], "steps": v[2]}}
+    ),
+    st.floats(0.1, 10).map(lambda v: {"lognormal": {"median": "5ms", "sigma": v}}),
+    st.floats(0.1, 10).map(lambda v: {"gamma": {"shape": v, "scale": "5ms"}}),
+)
+models = st.tuples(
+    distributions,
+    st.fixed_dictionaries(
+        {"drop": shares, "keep_order": st.booleans(), "retransmit": some_times},
+        optional={"burst": st.fixed_dictionaries({"good_to_bad": shares, "bad_to_good": shares})},
+    ),
+).map(lambda both: {**both[0], **both[1]})
+links = st.tuples(models, topics, topics).map(lambda v: {**v[0], "from": v[1], "topic": v[2]})
+outages = st.tuples(some_times, topics).map(lambda v: {"node": v[1], "from": "1us", "to": v[0]})
+delays = st.fixed_dictionaries(
+    {
+        "default": models,
+        "topics": st.dictionaries(topics, models, max_size=2),
+        "services": st.dictionaries(topics, models, max_size=2),
+        "links": st.lists(links, max_size=2),
+        "outages": st.lists(outages, max_size=2),
+    }
+)
+executions = st.fixed_dictionaries(
+    {"default": distributions, "nodes": st.dictionaries(topics, distributions, max_size=2)}
+)
+clocks = st.fixed_dictionaries(
+    {
+        "node": topics,
+        "offset": signed_times,
+        "drift": st.floats(-1e5, 1e5),
+        "jumps": st.lists(
+            st.fixed_dictionaries({"at": st.just("1s"), "by": signed_times}), max_size=2
+        ),
+        "random_jumps": st.fixed_dictionaries({"every": some_times, "most": some_times}),
+    }
+)
 jobs = st.fixed_dictionaries(
     {
+        "delay": delays,
+        "execution": executions,
+        "clocks": st.lists(clocks, max_size=2),
+        "min_time_step_ns": times_ns,
+        "policy": st.sampled_from(
+            ["permutation", {"priority": [{"priority": -3, "group_of": "/a"}]}, {"function": "m:P"}]
+        ),
+        "executors": st.sampled_from(["per_node", "single_threaded", [{"nodes": ["/a"]}]]),
         "nodes": st.lists(nodes, min_size=1, max_size=3).map(_named),
         "stop": stops,
         "bags": st.lists(bags, max_size=2),
@@ -98,7 +156,7 @@ jobs = st.fixed_dictionaries(
             exclude=globs,
         ),
         "seed": st.integers(0, 2**64 - 1),
-        "timer_ties": st.sampled_from(["creation", "heap"]),
+        "timer_ties": st.just("creation"),
         "livelock_limit": st.integers(1, 2**63 - 1),
     }
 )
@@ -119,6 +177,15 @@ def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:
         assert repr(loaded) == repr(job)  # also tells 1 from 1.0 and True
         assert loaded.to_yaml() == job.to_yaml()
         SCHEMA.validate(YAML(typ="safe", pure=True).load(job.to_yaml()))
+
+
+def test_a_copy_with_changes_keeps_its_times() -> None:
+    points = SeriesSpec(points=[["1s", "2ms"]])
+    assert points.replace(steps=True).points == ((1_000_000_000, 2_000_000),)
+    assert SamplesSpec(values=["1ms"]).replace(unit="ms").values_ns == (1_000_000,)
+    assert ClockSpec(node="/a", offset="-1ms").replace(node="/b").offset_ns == -1_000_000
+    assert ClockSpec(node="/a", offset_ns=-5).offset_ns == -5
+    assert JumpSpec(at="1s", by="-2s").replace(at_ns=7) == JumpSpec(at_ns=7, by_ns=-2_000_000_000)
 
 
 def test_the_yaml_of_a_job_is_short_and_readable() -> None:
