@@ -59,6 +59,9 @@ class Context(Protocol):
     def is_aside(self) -> bool:
         """Return whether others can go on while whoever runs waits for what is outside."""
 
+    def can_step(self) -> bool:
+        """Return whether whoever runs can wait in simulated time at all."""
+
     def step(self, for_ns: int) -> None:
         """Let simulated time pass while whoever runs waits for what is outside."""
 

@@ -7,6 +7,7 @@ import time
 from rsltrace.guard.redirect import copy_of
 
 STEP_NS = 1_000_000
+_IN_A_ROW_MAX = 20
 _LAG_NS_MAX = 100_000_000
 """A run that is slow catches up; but one that computed for minutes has not waited for minutes."""
 
@@ -18,6 +19,16 @@ class Pace:
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
+        self.in_a_row = 0
+        """How often somebody found at once what he would have waited for."""
+
+    def is_greedy(self) -> bool:
+        """Count one more such answer; return whether it is time to let others go on."""
+        self.in_a_row += 1
+        if self.in_a_row < _IN_A_ROW_MAX:
+            return False
+        self.in_a_row = 0
+        return True
 
     def ahead_s(self, now_ns: int) -> float:
         """Return how many seconds to wait for real before simulated time may go on."""

@@ -22,7 +22,7 @@ from rsltrace.guard.callers import user_frame
 from rsltrace.guard.descriptors import Descriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.waiting import awaited, when_readable
+from rsltrace.guard.waiting import awaited, is_patient, patiently, when_readable
 from rsltrace.model.finding import Mode, Source
 
 _MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)
@@ -34,6 +34,7 @@ _TERMINAL = (
     *("tcgetattr", "tcsetattr", "tcsendbreak", "tcdrain", "tcflush", "tcflow"),
     *("tcgetwinsize", "tcsetwinsize"),
 )
+_real_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
 _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
@@ -140,10 +141,22 @@ def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
         found = tracked(fd)
         if found is None:
+            patient = is_patient(sys._getframe(1))
+            if patient is not None and _blocks(fd):
+                return patiently(patient, when_readable(fd, lambda: real(fd, size)))
             return real(fd, size)
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 
     return read
+
+
+def _blocks(fd: int) -> bool:
+    """Return whether reading from a descriptor may have to wait for somebody."""
+    try:
+        kind = _real_fstat(fd).st_mode
+        return (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)) and _get_blocking(fd)
+    except OSError:
+        return False
 
 
 def _reading_into(real: Callable[..., int]) -> Any:

@@ -19,7 +19,7 @@ from rsltrace.guard.descriptors import number_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.recorded_descriptors import recording
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.waiting import NOT_YET, awaited
+from rsltrace.guard.waiting import NOT_YET, awaited, is_patient, patiently
 from rsltrace.model.finding import Source
 
 _RECORDED = (Source.SOCKET, Source.PROCESS, Source.FILE)
@@ -60,7 +60,7 @@ def _answer(
 class RecordedPoll:
     """A ``select.poll`` or ``select.epoll`` object whose answers are recorded."""
 
-    def __init__(self, real: Any, source: Source, *, seconds: bool, mask: int) -> None:
+    def __init__(self, real: Any, source: Source | None, *, seconds: bool, mask: int) -> None:
         self._real = real
         self._source = source
         self._seconds = seconds
@@ -102,28 +102,41 @@ class RecordedPoll:
     def has_outside(self) -> bool:
         """Return whether it waits for somebody who is not part of the run."""
         guard = engaged()
-        return guard is not None and any(map(guard.descriptors.is_outside, self._registered))
+        if guard is None or self._source is None:
+            return False
+        return any(map(guard.descriptors.is_outside, self._registered))
 
     def poll(self, timeout: float | None = None, maxevents: int = -1) -> list[tuple[int, int]]:
         """Return what is ready, in what was registered."""
         limits = (maxevents,) if self._seconds else ()
         guard = engaged()
-        if guard is None or not self.has_outside():
-            return self._real.poll(timeout, *limits)  # type: ignore[no-any-return]
+        frame = sys._getframe(1)
         unit = 1 if self._seconds else 1000
+        timeout_s = None if timeout is None or timeout < 0 else timeout / unit
+        if guard is None or self._source is None or not self.has_outside():
+            patient = None if timeout_s == 0 else is_patient(_past_selectors(frame))
+            if patient is None:
+                return self._real.poll(timeout, *limits)  # type: ignore[no-any-return]
+            return (
+                patiently(
+                    patient,
+                    lambda seconds: self._real.poll(seconds * unit, *limits) or NOT_YET,
+                    None if timeout_s is None else int(timeout_s * _NS_PER_S),
+                )
+                or []
+            )
         places = list(self._registered)
 
         def real(seconds: float | None) -> list[Any]:
             ready = self._real.poll(None if seconds is None else seconds * unit, *limits)
             return [[places.index(fd), events] for fd, events in ready if fd in places]
 
-        timeout_s = None if timeout is None or timeout < 0 else timeout / unit
         found = _answer(
             guard,
             self._source,
             "select.poll()",
             real,
-            sys._getframe(1),
+            frame,
             timeout_s,
             guard.descriptors.number(self),
             self.step,
@@ -131,22 +144,31 @@ class RecordedPoll:
         return [(places[place], events) for place, events in found if place < len(places)]
 
 
+def _past_selectors(frame: FrameType) -> FrameType:
+    """Return the frame of whoever uses a selector."""
+    while frame.f_back is not None and frame.f_globals.get("__name__") == "selectors":
+        frame = frame.f_back
+    return frame
+
+
 def _polling(real: Callable[[], Any]) -> Any:
     def poll() -> Any:
-        found = _recording(sys._getframe(1))
-        if found is None:
+        if engaged() is None:
             return real()
-        return RecordedPoll(real(), found[1], seconds=False, mask=_ALL_EVENTS)
+        found = _recording(sys._getframe(1))
+        source = None if found is None else found[1]
+        return RecordedPoll(real(), source, seconds=False, mask=_ALL_EVENTS)
 
     return poll
 
 
 def _epolling(sizehint: int = -1, flags: int = 0) -> Any:
-    found = _recording(sys._getframe(1))
-    if found is None:
+    if engaged() is None:
         return _real_epoll(sizehint, flags)
+    found = _recording(sys._getframe(1))
+    source = None if found is None else found[1]
     mask = select.EPOLLIN | select.EPOLLPRI | select.EPOLLOUT
-    return RecordedPoll(_real_epoll(sizehint, flags), found[1], seconds=True, mask=mask)
+    return RecordedPoll(_real_epoll(sizehint, flags), source, seconds=True, mask=mask)
 
 
 def _selecting(real: Callable[..., Any]) -> Any:
@@ -162,7 +184,16 @@ def _selecting(real: Callable[..., Any]) -> Any:
         found = _recording(frame)
         things = [thing for kind in kinds for thing in kind]
         if found is None or not any(map(guard.descriptors.is_outside, things)):
-            return real(*kinds, timeout)
+            patient = None if timeout == 0 else is_patient(frame)
+            if patient is None:
+                return real(*kinds, timeout)
+
+            def look(seconds: float) -> Any:
+                ready = real(*kinds, seconds)
+                return ready if any(ready) else NOT_YET
+
+            for_ns = None if timeout is None else int(timeout * _NS_PER_S)
+            return patiently(patient, look, for_ns) or ([], [], [])
 
         def places(seconds: float | None) -> list[Any]:
             chosen = real(*kinds, seconds)

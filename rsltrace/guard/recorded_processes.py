@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import _multiprocessing  # type: ignore[import-not-found]
 import _posixsubprocess
 import os
 import subprocess
@@ -16,10 +17,11 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.exchange import exchange
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.recorded_descriptors import recording, stand_in
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.waiting import NOT_YET, again_and_again, awaited
+from rsltrace.guard.waiting import NOT_YET, again_and_again, awaited, is_patient, patiently
 from rsltrace.model.finding import Source
 
 _KEPT_OPEN = 3
@@ -53,18 +55,21 @@ def _starting(real: Callable[..., int]) -> Any:
 def _waiting(real: Callable[[int, int], Any]) -> Any:
     def waitpid(process: int, options: int, /) -> Any:
         guard = engaged()
-        if guard is None or process not in guard.descriptors.processes:
-            return real(process, options)
         frame, call = sys._getframe(1), "os.waitpid()"
-        if options & os.WNOHANG or not guard.context.is_aside():
-            return guard.recorded(
-                Source.PROCESS, call, lambda: real(process, options), frame, process
-            )
 
         def ended() -> Any:
             found = real(process, options | os.WNOHANG)
             return found if found[0] else NOT_YET
 
+        if guard is None or process not in guard.descriptors.processes:
+            patient = None if options & os.WNOHANG else is_patient(frame)
+            if patient is not None:
+                return patiently(patient, again_and_again(ended))
+            return real(process, options)
+        if options & os.WNOHANG or not guard.context.is_aside():
+            return guard.recorded(
+                Source.PROCESS, call, lambda: real(process, options), frame, process
+            )
         return awaited(guard, Source.PROCESS, call, again_and_again(ended), frame, of=process)
 
     return waitpid
@@ -128,6 +133,19 @@ def _never(seconds: float) -> Any:
     return again_and_again(lambda: NOT_YET)(seconds)
 
 
+def _acquiring(real: Callable[..., bool]) -> Any:
+    def acquire(self: Any, block: bool = True, timeout: float | None = None) -> bool:
+        """Take a lock of multiprocessing, which a process may give back after others went on."""
+        guard = engaged()
+        if guard is None or not block or not guard.context.can_step():
+            return real(self, block, timeout)
+        look = again_and_again(lambda: real(self, False) or NOT_YET)
+        for_ns = None if timeout is None else int(timeout * 1e9)
+        return patiently(guard, look, for_ns) is True
+
+    return acquire
+
+
 @contextmanager
 def recorded_processes() -> Iterator[None]:
     """Let processes answer from the trace in a re-run."""
@@ -141,6 +159,9 @@ def recorded_processes() -> Iterator[None]:
         redirect(os.waitpid, _waiting)
         for name in ("kill", "pidfd_open"):
             redirect(getattr(os, name), partial(_of_process, name))
+        acquire: Any = _multiprocessing.SemLock.acquire
+        exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
+        exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
         module: Any = subprocess
         stack.callback(setattr, module, "_USE_POSIX_SPAWN", module._USE_POSIX_SPAWN)
         module._USE_POSIX_SPAWN = False  # a second way to do the same, that is not recorded

@@ -20,7 +20,7 @@ from rsltrace.guard.exchange import exchange
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded_descriptors import joining, recording
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.waiting import awaited, when_readable
+from rsltrace.guard.waiting import awaited, is_patient, patiently, when_readable
 from rsltrace.model.finding import Source
 
 _NS_PER_S = 1_000_000_000
@@ -71,6 +71,16 @@ def _answer(
     return found[0]
 
 
+def _wait_for(sock: Any, frame: FrameType) -> None:
+    """Let others go on until there is something to read; what it is is not recorded."""
+    guard, timeout_s = is_patient(frame), sock.gettimeout()
+    if guard is None or timeout_s == 0 or sock.fileno() < 0:
+        return
+    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
+    if patiently(guard, when_readable(sock.fileno(), lambda: True), for_ns) is None:
+        raise TimeoutError("timed out")
+
+
 def _of_socket(name: str, real: Callable[..., Any], *, waits: bool = False) -> Any:
     call = f"socket.{name}()"
 
@@ -78,6 +88,8 @@ def _of_socket(name: str, real: Callable[..., Any], *, waits: bool = False) -> A
         frame = sys._getframe(1)
         guard = _recorded_of(self, frame)
         if guard is None:
+            if waits:
+                _wait_for(self, frame)
             return real(self, *arguments, **options)
         return _answer(
             guard, self, call, lambda: real(self, *arguments, **options), frame, waits=waits
@@ -93,6 +105,7 @@ def _into(name: str, real: Callable[..., Any]) -> Any:
         frame = sys._getframe(1)
         guard = _recorded_of(self, frame)
         if guard is None:
+            _wait_for(self, frame)
             return real(self, buffer, nbytes, flags)
 
         def receive() -> list[Any]:
@@ -112,6 +125,7 @@ def _accepting(real: Callable[[Any], Any]) -> Any:
         frame = sys._getframe(1)
         guard = _recorded_of(self, frame)
         if guard is None:
+            _wait_for(self, frame)
             return real(self)
         accepted: list[int] = []
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.guard import Guard, engage
+from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.outside import answered, decoded, numbered
 from rsltrace.guard.pace import STEP_NS
 from rsltrace.guard.redirect import copy_of
@@ -77,6 +77,45 @@ def awaited(
         # None: the run ends before the answer has come, and a re-run will wait as long for it.
         guard.found(source, Mode.RECORD, call, numbered(of, steps, text), frame)
     return decoded(text)
+
+
+def patiently(guard: Guard, look: Look, for_ns: int | None = None) -> Any:
+    """Wait likewise for what is not recorded; return it, or None if it does not come in time.
+
+    A thread that blocked for real would keep everybody from going on, be it those it waits for.
+    """
+    context, steps = guard.context, 0
+    deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
+    while True:
+        with engage(None):
+            found = look(guard.pace.ahead_s(context.now_ns()) if steps else 0.0)
+        if found is not NOT_YET:
+            # Who always finds something may look at what another thread is to fetch.
+            if steps == 0 and guard.pace.is_greedy():
+                context.step(STEP_NS)
+            return found
+        left_ns = STEP_NS
+        if deadline_ns is not None:
+            left_ns = min(left_ns, deadline_ns - context.now_ns())
+            if left_ns <= 0:
+                return None
+        guard.pace.in_a_row = 0
+        context.step(left_ns)
+        steps += 1
+
+
+def is_patient(frame: FrameType) -> Guard | None:
+    """Return the guard if whoever calls from ``frame`` is to wait like that.
+
+    Threads are, and multiprocessing anywhere: it has threads of its own that must go on.
+    """
+    guard = engaged()
+    if guard is None or not guard.context.can_step():
+        return None
+    module = str(frame.f_globals.get("__name__", ""))
+    if guard.context.is_aside() or module.startswith(("multiprocessing.", "torch.multiprocessing")):
+        return guard
+    return None
 
 
 def _looked(look: Look, seconds: float) -> str | None:

@@ -52,10 +52,14 @@ class GuardContext:
     def is_aside(self) -> bool:
         """Return whether a thread or a main waits, not a callback: others can go on meanwhile."""
         core = self._core
-        if core.current_handle is None or core.ending or core.in_callback():
+        if not self.can_step() or core.in_callback():
             return False
         stack = getcurrent()
         return core.is_thread(stack) or core.program_of(stack) is not None
+
+    def can_step(self) -> bool:
+        """Return whether whoever runs can wait in simulated time at all."""
+        return self._core.current_handle is not None and not self._core.ending
 
     def step(self, for_ns: int) -> None:
         """Let simulated time pass, and others go on."""

@@ -8,8 +8,10 @@ of a run, and in real threads, real locks are made.
 from __future__ import annotations
 
 import _thread
+import os
 import sys
 import threading
+import weakref
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
@@ -17,7 +19,7 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.errors import UnsupportedError
 from rsltrace.ros.blocking import Wait, wait
-from rsltrace.ros.simulated_waiting import simulated_core
+from rsltrace.ros.simulated_waiting import simulated_core, world_exists
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -154,6 +156,57 @@ class SimRLock:
 
     def _at_fork_reinit(self) -> None:
         self.__init__()  # type: ignore[misc]
+
+
+# -- in a forked process --------------------------------------------------------------------------
+
+_making = _thread.allocate_lock()
+_real: weakref.WeakKeyDictionary[SimLock, Any] = weakref.WeakKeyDictionary()
+
+
+def _real_of(lock: SimLock, *, anew: bool = False) -> Any:
+    with _making:
+        found = None if anew else _real.get(lock)
+        if found is None:
+            found = _real[lock] = _thread.allocate_lock()
+            if lock._taken and not anew:
+                found.acquire()
+        return found
+
+
+def _acquire(self: SimLock, blocking: bool = True, timeout: float = -1) -> bool:
+    return bool(_real_of(self).acquire(blocking, timeout))
+
+
+def _release(self: SimLock) -> None:
+    _real_of(self).release()
+
+
+def _locked(self: SimLock) -> bool:
+    return bool(_real_of(self).locked())
+
+
+def _reinit(self: SimLock) -> None:
+    _real_of(self, anew=True)
+
+
+def _become_real() -> None:
+    """Have the locks of the simulation lock real threads: a forked process has no others.
+
+    A condition keeps bound methods of its lock, so it is their code that is exchanged.
+    """
+    if world_exists():
+        kind: Any = SimLock
+        for name, real in (
+            ("acquire", _acquire),
+            ("release", _release),
+            ("locked", _locked),
+            ("_at_fork_reinit", _reinit),
+        ):
+            getattr(kind, name).__code__ = real.__code__
+
+
+os.register_at_fork(after_in_child=_become_real)
 
 
 class _Holder:

@@ -34,6 +34,11 @@ def simulated_core() -> Core | None:
     return core if core.current_handle is not None or core.importing else None
 
 
+def world_exists() -> bool:
+    """Return whether a run is under way, here or in the process that this one was forked from."""
+    return bool(_world)
+
+
 def _sleep(seconds: float) -> None:
     """Stand in for ``time.sleep`` while a run lasts."""
     core = simulated_core()
