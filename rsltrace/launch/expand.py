@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from rsltrace.errors import JobError
-from rsltrace.job import Job, LaunchSpec, NodeSpec, locate
+from rsltrace.job import Job, NodeSpec, locate, showing_line
 from rsltrace.launch import ros_launch
 from rsltrace.launch.model import Argument, Launched
 from rsltrace.launch.reader import read_launch_file
@@ -34,8 +34,8 @@ def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
         return Expanded(job)
     nodes: list[NodeSpec] = list(job.nodes)
     notes: list[str] = []
-    for spec in job.launch:
-        launched = _read(job, spec)
+    for index, spec in enumerate(job.launch):
+        launched = _read(job, index)
         nodes += node_specs(launched, skip_unsupported=spec.skip_unsupported, why_not=why_not)
         notes += [f"left out: {item}" for item in launched.unsupported]
         notes += launched.ignored
@@ -45,21 +45,28 @@ def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
     return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 
-def _read(job: Job, spec: LaunchSpec) -> Launched:
+def _read(job: Job, index: int) -> Launched:
+    spec = job.launch[index]
     path = job.resolve(spec.file)
     read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
     launched = read(path, spec.arguments)
-    _check_known(spec.arguments, launched.arguments, spec.file)
+    _check_known(job, index, launched.arguments)
     return launched
 
 
-def _check_known(arguments: Mapping[str, str], known: Mapping[str, Argument], where: str) -> None:
+def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
     """Raise ``JobError`` if an argument is given that no launch file declares."""
-    for name in arguments:
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f"; did you mean {near[0]!r}?" if near else ""
-            listed = "".join(f"\n  {argument}" for argument in known.values()) or " none"
-            raise JobError(
-                f"unknown launch argument {name!r}{hint}\nthere are:{listed}", where=where
-            )
+    spec = job.launch[index]
+    for name in spec.arguments:
+        if name in known:
+            continue
+        near = difflib.get_close_matches(name, known, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        listed = "".join(f"\n  {argument}" for argument in known.values()) or " none"
+        loc = ("launch", index, "arguments", name)
+        where = locate(job, loc)
+        in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
+        of = f" of {spec.file}" if in_file else ""
+        wrong = f"unknown launch argument {name!r}{of}{hint}\nthere are:{listed}"
+        with showing_line(job, loc):
+            raise JobError(wrong, where=where if in_file else spec.file)

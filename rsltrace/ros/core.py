@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.graph import Graph
     from rsltrace.ros.links import Network
     from rsltrace.ros.logs import Logs
-    from rsltrace.ros.met import Met
+    from rsltrace.ros.met import Met, Parameters
     from rsltrace.ros.node import NodeHandle
     from rsltrace.ros.node_clocks import NodeClocks
     from rsltrace.ros.stating import NodeState
@@ -106,6 +106,7 @@ class Core:
         self.unowned: list[EntityHandle | Program | SimThread] = []
         self._entity_count = 0
         self.met: Met | None = None
+        self.parameters: dict[str, Parameters] = {}
         self._channels: dict[tuple[str, str], int] = {}
         self._uuids: dict[str, random.Random] = {}
         self.watchers: dict[str, Callable[[Any, bytes], None]] = {}

@@ -30,6 +30,7 @@ from rsltrace.ros.held_back import held_back
 from rsltrace.ros.installing import installed
 from rsltrace.ros.links import Network
 from rsltrace.ros.logs import Logs
+from rsltrace.ros.met import parameters_of
 from rsltrace.ros.node_clocks import NodeClocks
 from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.process_exit import own_process_ends
@@ -213,6 +214,7 @@ class World:
         core.note_end()
         if core.error is None and not core.stuck:
             core.notes += held_back(core)
+        core.parameters = parameters_of(core)
         end_programs(core)
         end_blocked(core)
         if core.runner_error is not None:

@@ -48,15 +48,19 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
     from rsltrace.bag.playback import Playback
 
     spec = job.bags[index]
-    with open_bag(
-        job.resolve(spec.path),
-        topics=spec.topics,
-        exclude=spec.exclude,
-        start_offset_ns=spec.start_offset_ns,
-        duration_ns=spec.duration_ns,
-        recover=True,
-        skip=never_plays,
-    ) as bag:
+    try:
+        opened = open_bag(
+            job.resolve(spec.path),
+            topics=spec.topics,
+            exclude=spec.exclude,
+            start_offset_ns=spec.start_offset_ns,
+            duration_ns=spec.duration_ns,
+            recover=True,
+            skip=never_plays,
+        )
+    except BagError as error:
+        raise BagError(f"{locate(job, ('bags', index, 'path'))}: {error}") from error
+    with opened as bag:
         _check_names(job, index, bag)
         yield BagInput(
             spec,

@@ -290,7 +290,7 @@ class Session:
         core = self.world.core
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None
         rules = () if core.met is None else unused_rules(self.job, core.met, lasted_ns)
-        return (*rules, *unused_parameters(self.job, parameters_of(core)))
+        return (*rules, *unused_parameters(self.job, {**core.parameters, **parameters_of(core)}))
 
     def finish(self) -> RunResult:
         """Destroy the nodes, close the trace, and say how it went.

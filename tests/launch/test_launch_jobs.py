@@ -120,6 +120,13 @@ def test_print_job_gives_a_job_that_does_the_same(
 def test_a_launch_file_in_a_job(
     rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
 ) -> None:
+    wrong = JOB + "launch:\n  - {file: demo.launch.xml, arguments: {wrd: five}}\n"
+    (folder / "wrong.yaml").write_text(wrong)
+    line = wrong.count("\n")
+    told = rsltrace("check", "wrong.yaml").stderr
+    assert f"wrong.yaml:{line}:46: unknown launch argument 'wrd' of demo.launch.xml; did" in told
+    assert f"{line:>5} |   - {{file: demo.launch.xml" in told
+
     (folder / "both.yaml").write_text(
         JOB
         + "launch:\n  - {file: demo.launch.xml, arguments: {word: five}, skip_unsupported: true}\n"

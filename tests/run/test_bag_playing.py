@@ -173,6 +173,8 @@ class Late(Node):
 @pytest.mark.parametrize("key", ["remappings: {/m: /x}", "qos: {/m: {depth: 1}}"])
 def test_a_name_that_does_not_play_is_shown_in_the_job(play: Any, tmp_path: Path, key: str) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(2))
+    with pytest.raises(BagError, match=r"job\.yaml:1:\d+: \S+a\.mcap: no topic matches '/m'"):
+        play("bags: [{path: a.mcap, topics: [/m]}]")
     with pytest.raises(BagError, match=r"job\.yaml:1:\d+: a\.mcap plays no topic '/m'.* /n$"):
         play(f"bags: [{{path: a.mcap, {key}}}]")
 

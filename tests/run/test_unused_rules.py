@@ -126,6 +126,20 @@ def test_a_rule_that_fits_nothing_is_named(
     assert told.startswith(message)
 
 
+def test_parameters_of_a_node_of_a_main(record_job: Callable[..., Any]) -> None:
+    code = """
+import rclpy
+
+def main():
+    rclpy.init()
+    rclpy.spin(Talker())
+"""
+    yaml = "nodes: [{main: nodes_under_test:main, parameters: {start_type_descriptions: false}}]\n"
+    (note,) = record_job(yaml + "stop: {duration: 1s}\n", code, output=None).notes
+    assert "/talker has not declared the parameter 'start_type_descriptions'" in note
+    assert note.endswith("did you mean 'start_type_description_service'?")
+
+
 def test_check_names_them_and_a_run_that_failed_does_not(
     rsltrace: Any, job_file: Callable[..., Path], record_job: Callable[..., Any]
 ) -> None:
