@@ -19,7 +19,6 @@ from rsltrace.job.launch_spec import LaunchSpec
 from rsltrace.job.names import check_topic
 from rsltrace.job.node import NodeSpec, check_path
 from rsltrace.job.part import Part, attach, check, given, items, one_of, parts, text, whole
-from rsltrace.job.paths import near_path
 from rsltrace.job.problems import Loc, Problem, Problems, describe
 from rsltrace.job.scheduling import (
     ExecutionSpec,
@@ -29,7 +28,8 @@ from rsltrace.job.scheduling import (
     policy_part,
 )
 from rsltrace.job.spec import RecordSpec, StopSpec, TimeLike
-from rsltrace.job.times import format_time, parse_time
+from rsltrace.job.times import parse_time
+from rsltrace.job.whole import problems_of
 
 SEED_MAX = 2**64 - 1
 LIVELOCK_LIMIT = 100_000
@@ -279,119 +279,7 @@ class Job(Part):
 
     @model_validator(mode="after")
     def _check_whole(self) -> Job:
-        problems = [
-            *self._something_to_run(),
-            *self._times_in_order(),
-            *self._distinct_names(),
-            *self._bags_end(),
-            *self._paths_exist(),
-            *self._bags_progress(),
-            *self._ties_are_decided_once(),
-        ]
+        problems = list(problems_of(self))
         if problems:
             raise Problems(problems)
         return self
-
-    def _bags_progress(self) -> Iterator[Problem]:
-        if self.progress is None:
-            return
-        if not self.bags:
-            yield Problem("there are no bags (bags:) whose progress could be told", ("progress",))
-        elif any(bag.loop is True for bag in self.bags):
-            yield Problem("a bag that plays for ever makes no progress", ("progress",))
-
-    def _bags_end(self) -> Iterator[Problem]:
-        if self.stop != StopSpec():
-            return
-        for index, bag in enumerate(self.bags):
-            if bag.loop is True:
-                yield Problem(
-                    "plays for ever, and nothing ends the run: give a 'stop:', or how often it "
-                    "plays",
-                    ("bags", index, "loop"),
-                )
-
-    def _something_to_run(self) -> Iterator[Problem]:
-        if not self.nodes and not self.bags and not self.launch:
-            place = ("nodes",) if "nodes" in self.model_fields_set else ()
-            yield Problem(
-                "a job needs at least one node (nodes:), launch file (launch:) or bag (bags:)",
-                place,
-            )
-
-    def _times_in_order(self) -> Iterator[Problem]:
-        start_ns, construct_ns, stop_ns = self.start_ns, self.construct_time_ns, self.stop.time_ns
-        if start_ns is None:
-            return
-        if construct_ns is not None and construct_ns > start_ns:
-            yield Problem(
-                f"{format_time(construct_ns)} is after the start "
-                f"({format_time(start_ns)}): nodes are constructed before the run starts",
-                ("construct_time",),
-            )
-        if stop_ns is not None and stop_ns < start_ns:
-            yield Problem(
-                f"{format_time(stop_ns)} is before the start ({format_time(start_ns)}): it is a "
-                "simulated time; 'duration' counts from the start",
-                ("stop", "time"),
-            )
-
-    def _distinct_names(self) -> Iterator[Problem]:
-        first: dict[tuple[str, str], int] = {}
-        for index, node in enumerate(self.nodes):
-            if node.name is None:
-                continue
-            key = (node.namespace or "/", node.name)
-            if key in first:
-                full_name = f"{key[0].rstrip('/')}/{node.name}"
-                yield Problem(
-                    f"{full_name} is already the name of nodes[{first[key]}]: give one of them "
-                    "another name or namespace",
-                    ("nodes", index, "name"),
-                )
-            first.setdefault(key, index)
-
-    def _near(self, path: str) -> str:
-        """Say what there is instead of a path that does not lead anywhere."""
-        return near_path(self.resolve(path), path)
-
-    def _ties_are_decided_once(self) -> Iterator[Problem]:
-        if self.timer_ties == "heap" and not (
-            (self.policy is None or self.policy.order == "fifo")
-            and self.executors is None
-            and self.execution is None
-        ):
-            yield Problem(
-                "heap is the order of RSLCPP's timers, which a policy, executors or execution "
-                "times do not go with: leave it out",
-                ("timer_ties",),
-            )
-
-    def _paths_exist(self) -> Iterator[Problem]:
-        for index, folder in enumerate(self.search_path):
-            path = self.resolve(folder)
-            if not path.is_dir():
-                what = "is not a folder" if path.exists() else "there is no such folder"
-                near = self._near(folder)
-                yield Problem(f"{folder!r}: {what}{near}", ("search_path", index))
-        for index, node in enumerate(self.nodes):
-            for number, file in enumerate(node.parameter_files):
-                path = self.resolve(file)
-                if not path.is_file():
-                    what = "is not a file" if path.exists() else "there is no such parameter file"
-                    loc = ("nodes", index, "parameter_files", number)
-                    yield Problem(f"{file!r}: {what}{self._near(file)}", loc)
-        for place, file in self.model_files():
-            path = self.resolve(file)
-            if not path.is_file():
-                what = "is not a file" if path.exists() else "there is no such file"
-                yield Problem(f"{file!r}: {what}{self._near(file)}", place)
-        for index, launch in enumerate(self.launch):
-            if not self.resolve(launch.file).is_file():
-                near = self._near(launch.file)
-                place = ("launch", index, "file")
-                yield Problem(f"{launch.file!r}: there is no such launch file{near}", place)
-        for index, bag in enumerate(self.bags):
-            if not self.resolve(bag.path).exists():
-                message = f"{bag.path!r}: there is no such bag{self._near(bag.path)}"
-                yield Problem(message, ("bags", index, "path"))
