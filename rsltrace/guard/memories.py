@@ -49,12 +49,12 @@ class _Names:
         return str(next(names[stream]))
 
 
-def _unseen(real: Callable[[], str]) -> Callable[[], str]:
+def _unseen(real: Callable[..., str]) -> Callable[..., str]:
     """Where files go is asked by one node for all: neither its chance nor its finding."""
 
-    def default_folder() -> str:
+    def default_folder(*arguments: Any) -> str:
         with engage(None):
-            return real()
+            return real(*arguments)
 
     return default_folder
 
