@@ -72,8 +72,8 @@ def _short(value: str) -> str:
 
 
 _CUT_OFF = (
-    f"its last events, fewer than {EVENTS_PER_SEGMENT}, are missing; record the job again: if it "
-    "crashes, it prints at which line"
+    "record the job again with --set record.segment_events=1, since its last events (up to "
+    f"{EVENTS_PER_SEGMENT - 1}) are missing here; a run that crashes prints at which line"
 )
 
 

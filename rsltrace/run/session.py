@@ -212,7 +212,9 @@ class Session:
         """Create the file, and write down what is known before the run."""
         job = self.job
         check_output(job, path, self._replay)
-        self._writer = writer = stack.enter_context(TraceWriter(path, force=self._force))
+        self._writer = writer = stack.enter_context(
+            TraceWriter(path, force=self._force, events_per_segment=job.record.segment_events)
+        )
         recorder = Recorder(writer, keep_payload=payload_filter(job))
         self.world.core.recorder = recorder
         write_job(writer, job)

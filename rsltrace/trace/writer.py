@@ -71,12 +71,20 @@ class TraceWriter:
     a failing disk, a file too large. The file is then readable up to its last whole segment.
     """
 
-    def __init__(self, path: Path, *, force: bool, compression: str = "zstd") -> None:
-        """Create the file. ``compression`` is ``zstd`` or empty.
+    def __init__(
+        self,
+        path: Path,
+        *,
+        force: bool,
+        compression: str = "zstd",
+        events_per_segment: int | None = None,
+    ) -> None:
+        """Create the file. ``compression`` is ``zstd`` or empty; None is the usual segment.
 
         Raises OutputError if ``path`` exists and ``force`` is false, if it is a folder, or if it
         cannot be created; a missing folder is not made, since it is more often a typing mistake.
         """
+        self._segment_events = events_per_segment or EVENTS_PER_SEGMENT
         self._rests: list[bytes] = []
         self._chain_hashes = array("Q")
         self._outputs: list[bytes] = []
@@ -198,7 +206,7 @@ class TraceWriter:
         """Take the next event, packed by ``format.EVENT_REST``, after all of its outputs."""
         self._rests.append(rest)
         self._chain_hashes.append(chain_hash)
-        if len(self._rests) >= EVENTS_PER_SEGMENT or len(self._outputs) >= OUTPUTS_PER_SEGMENT:
+        if len(self._rests) >= self._segment_events or len(self._outputs) >= OUTPUTS_PER_SEGMENT:
             self._write_segment()
 
     def add_entity(self, entity: Entity) -> int:

@@ -165,9 +165,12 @@ def test_a_crash_prints_the_line_and_the_file_says_that_it_was_cut_off(tmp_path:
         "class Crash(Node):\n"
         "    def __init__(self):\n"
         "        super().__init__('crash')\n"
+        "        self.count = 0\n"
         "        self.create_timer(1.0, self.tick)\n"
         "    def tick(self):\n"
-        "        ctypes.string_at(0)\n"
+        "        self.count += 1\n"
+        "        if self.count == 3:\n"
+        "            ctypes.string_at(0)\n"
     )
     (tmp_path / "job.yaml").write_text(
         "nodes: [{node: 'crash_node:Crash'}]\nstop: {duration: 3s}\n"
@@ -180,10 +183,14 @@ def test_a_crash_prints_the_line_and_the_file_says_that_it_was_cut_off(tmp_path:
     done = command("record", "job.yaml", "-o", "run.mcap")
     assert done.returncode == -signal.SIGSEGV
     assert "Segmentation fault" in done.stderr
-    assert 'crash_node.py", line 8 in tick' in done.stderr
+    assert 'crash_node.py", line 11 in tick' in done.stderr
     info = command("info", "run.mcap")
     assert info.returncode == 0
     assert "cut off: the file has no end" in info.stdout
-    assert "record the job again" in info.stdout
+    assert "--set record.segment_events=1" in info.stdout
     with rsltrace.Trace.open(tmp_path / "run.mcap") as trace:
-        assert not trace.complete
+        assert (trace.complete, trace.event_count) == (False, 0)
+    again = command("record", "job.yaml", "-o", "all.mcap", "--set", "record.segment_events=1")
+    assert again.returncode == -signal.SIGSEGV
+    with rsltrace.Trace.open(tmp_path / "all.mcap") as trace:
+        assert trace.event_count == 3, "construction and two ticks, up to the one that crashed"
