@@ -13,7 +13,7 @@ from rsltrace.job.part import Part, check, flag, items, part, positive_time, tex
 from rsltrace.job.problems import Problem
 from rsltrace.job.sizes import parse_size
 from rsltrace.job.times import parse_time
-from rsltrace.trace.format import EVENTS_PER_SEGMENT
+from rsltrace.model.event import SEGMENT_EVENTS
 
 TimeLike = str | int | float
 """A time in Python as in YAML: seconds as a number, or text with a unit."""
@@ -127,8 +127,8 @@ class RecordSpec(Part):
         description="Topics and services whose messages are not kept, globs.",
         examples=[["/camera/*"]],
     )
-    segment_events: Annotated[int, check(whole(1, EVENTS_PER_SEGMENT))] = Field(
-        default=EVENTS_PER_SEGMENT,
+    segment_events: Annotated[int, check(whole(1, SEGMENT_EVENTS))] = Field(
+        default=SEGMENT_EVENTS,
         description="After how many events they are written to the file; what a killed or crashed "
         "run loses is fewer. 1 is slow, and right for finding out what happened before a crash.",
         examples=[1],
@@ -142,7 +142,7 @@ class RecordSpec(Part):
             payloads: bool = True,
             topics: Sequence[str] = ("*",),
             exclude: Sequence[str] = (),
-            segment_events: int = EVENTS_PER_SEGMENT,
+            segment_events: int = SEGMENT_EVENTS,
         ) -> None: ...
 
     @field_validator("topics")

@@ -12,6 +12,10 @@ NO_SEQUENCE = 2**32 - 1
 """The payload sequence of an output whose payload was not recorded."""
 
 
+SEGMENT_EVENTS = 4096
+"""How many events are written to a trace together, unless a job says fewer."""
+
+
 class EventKind(IntEnum):
     """Kinds of dispatches by the loop. The numbers are part of the trace format."""
 

@@ -10,6 +10,8 @@ import struct
 
 import numpy as np
 
+from rsltrace.model.event import SEGMENT_EVENTS
+
 FORMAT_VERSION = 1
 PROFILE = "ros2"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -38,7 +40,7 @@ METADATA_ROSBAG2 = "rosbag2"
 ATTACHMENT_JOB = "job.yaml"
 ATTACHMENT_INDEX = "rsltrace/segments"
 
-EVENTS_PER_SEGMENT = 4096
+EVENTS_PER_SEGMENT = SEGMENT_EVENTS
 """Events are written in segments of this many: small enough to lose little when a run is killed
 and to read little when a diff looks one up, large enough to compress well."""
 
