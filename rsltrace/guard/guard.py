@@ -114,6 +114,10 @@ class Guard:
                 return Mode.ALLOW
         return policy.modes.get(source, DEFAULT_MODES[source])
 
+    def is_virtual(self, source: Source) -> bool:
+        """Return whether the run makes the answers of a source, unless a node says otherwise."""
+        return self._policy.modes.get(source, DEFAULT_MODES[source]) is Mode.VIRTUAL
+
     def stream(self, frame: FrameType) -> str:
         """Return the name of the random stream of whoever runs: the node's, or its module's.
 

@@ -83,6 +83,8 @@ def randomness() -> Iterator[None]:
 
             _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
             _shared_numpy(stack, np.random)
+            empty: Any = np.empty
+            stack.callback(Redirected(empty, _emptying(copy_of(empty))).restore)
         yield
 
 
@@ -199,6 +201,21 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
     for place in (module, module.mtrand):
         stack.callback(setattr, place, "seed", place.seed)
         place.seed = draw
+
+
+def _emptying(real: Callable[..., Any]) -> Any:
+    """``np.empty`` shows what was in the memory before; in user code, it shows zeros."""
+
+    def empty(*arguments: Any, **options: Any) -> Any:
+        made = real(*arguments, **options)
+        guard = engaged()
+        if guard is not None and not made.dtype.hasobject:
+            frame = sys._getframe(1)
+            if guard.is_user(frame) and guard.mode(Source.RANDOM, frame) is not Mode.ALLOW:
+                made.fill(0)
+        return made
+
+    return empty
 
 
 def begin_shared(seed: int) -> None:

@@ -8,6 +8,7 @@ redirected.
 from __future__ import annotations
 
 import _thread
+import gc
 import hashlib
 import os
 import re
@@ -70,6 +71,16 @@ _FOREIGN = {
     "getrandom": Source.RANDOM,
     "getentropy": Source.RANDOM,
     "arc4random": Source.RANDOM,
+    "drand48": Source.RANDOM,
+    "lrand48": Source.RANDOM,
+    "times": Source.CLOCK,
+    "getrusage": Source.CLOCK,
+    "getpid": Source.ENVIRONMENT,
+    "getppid": Source.ENVIRONMENT,
+    "gettid": Source.ENVIRONMENT,
+    "getenv": Source.ENVIRONMENT,
+    "gethostname": Source.ENVIRONMENT,
+    "sched_getcpu": Source.ENVIRONMENT,
 }
 """Functions of the C library that nodes call through ctypes."""
 
@@ -196,16 +207,44 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
             if _is_installed(arguments[0] if arguments else options.get("path")):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
+        said = f"{name}({shown})"
+        made_of = _RECORDED.get(name)
+        if (
+            made_of is not None
+            and guard.mode(source, frame) is Mode.RECORD
+            and user_frame(frame, guard.packages) is not None
+        ):
+            return made_of(guard.recorded(source, said, lambda: real(*arguments, **options), frame))
         value = real(*arguments, **options)
-        text = (
-            f"{value.st_size} bytes, changed {value.st_mtime_ns}"
-            if hasattr(value, "st_mtime_ns")
-            else repr(value)[:200]
-        )
-        guard.watched(source, f"{name}({shown})", text, frame)
+        guard.watched(source, said, _told(value), frame)
         return value
 
     return call
+
+
+def _told(value: Any) -> str:
+    if hasattr(value, "st_mtime_ns"):
+        return f"{value.st_size} bytes, changed {value.st_mtime_ns}"
+    return f"{len(value)} elements" if isinstance(value, list) else repr(value)[:200]
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+_RECORDED: dict[str, Callable[[Any], Any]] = {
+    **dict.fromkeys(
+        (
+            *("os.getpid", "os.getppid", "os.cpu_count", "os.getcwd", "os.sysconf"),
+            *("os.getlogin", "os.getloadavg", "thread.get_native_id", "gc.get_count"),
+        ),
+        _as_it_is,
+    ),
+    "os.uname": os.uname_result,
+    "os.times": os.times_result,
+    "resource.getrusage": resource.struct_rusage,
+}
+"""What makes of a recorded answer what the function gives."""
 
 
 def _hashing(real: Callable[[Any], int]) -> Any:
@@ -249,10 +288,17 @@ def _watched_functions() -> Iterator[tuple[Source, str, Any]]:
 
     for name, function in builtin(os, "times"):
         yield Source.CLOCK, name, function
-    machine = ("getpid", "getppid", "uname", "cpu_count", "getcwd", "getlogin", "getloadavg")
+    machine = (
+        *("getpid", "getppid", "uname", "cpu_count", "getcwd", "getlogin", "getloadavg"),
+        *("sysconf", "getpgid", "getsid"),
+    )
     for name, function in builtin(os, *machine):
         yield Source.ENVIRONMENT, name, function
-    for name, function in builtin(os, "stat", "lstat"):
+    for name, function in builtin(gc, "get_stats", "get_count", "get_objects"):
+        yield Source.ENVIRONMENT, name, function
+    for name, function in builtin(sys, "getallocatedblocks"):
+        yield Source.ENVIRONMENT, name, function
+    for name, function in builtin(os, "stat", "lstat", "statvfs", "fstatvfs"):
         yield Source.FILE, name, function
     for name, function in builtin(_thread, "start_new_thread", "start_joinable_thread"):
         yield Source.THREAD, name, function

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError
 from rsltrace.guard.guard import Guard, engage
@@ -18,7 +19,7 @@ from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.randomness import begin_shared
 from rsltrace.guard.torch_streams import torch_streams
 from rsltrace.job import Job, NodeSpec, policy_of
-from rsltrace.model.finding import Finding, GuardCount
+from rsltrace.model.finding import Finding, GuardCount, Source
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
 from rsltrace.trace.reader import Trace
@@ -67,8 +68,17 @@ class Guarding:
                     kept = [one for found in trace.findings.values() for one in found]
                 self.guard.outside.replay(kept, str(replay))
         core.default_policy = policy_of(job.guard)
+        if self.guard is not None and self.guard.is_virtual(Source.CLOCK):
+            self._begin_log_time(core.loop.now_ns)
         if "torch" in sys.modules:
             self.torch_loaded()
+
+    def _begin_log_time(self, now_ns: int) -> None:
+        """Let ``logging`` count the time of a record from the begin of the run."""
+        module: Any = logging
+        self._stack.callback(setattr, module, "_startTime", module._startTime)
+        whole = isinstance(module._startTime, int)  # nanoseconds, from Python 3.13 on
+        module._startTime = now_ns if whole else now_ns / 1e9
 
     def torch_loaded(self) -> None:
         """Give each node a state of torch's generator from now on."""

@@ -8,15 +8,24 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import ctypes
+import dataclasses
+import enum
+import functools
 import gc
 import glob
+import heapq
+import json
 import locale
+import logging
+import multiprocessing
 import os
 import pathlib
+import pickle
 import queue
 import random
 import resource
 import secrets
+import select
 import signal
 import socket
 import sqlite3
@@ -25,6 +34,8 @@ import sys
 import tempfile
 import threading
 import time
+import timeit
+import traceback
 import uuid
 import weakref
 from collections.abc import Callable
@@ -49,6 +60,20 @@ def case(expected: str, what: str) -> Callable[[Callable[[Any], object]], Callab
         return function
 
     return add
+
+
+PARTIAL = functools.partial(time.time_ns)
+
+
+@dataclasses.dataclass
+class Stamped:
+    """A message with the time it was made."""
+
+    stamp: float = dataclasses.field(default_factory=time.time)
+
+
+class Way(enum.Enum):
+    NORTH, EAST, SOUTH, WEST, UP, DOWN = "north", "east", "south", "west", "up", "down"
 
 
 class Thing:
@@ -138,6 +163,39 @@ def busy_wait(node: Any) -> object:
 @case(DETERMINISTIC, '`np.datetime64("now")`')
 def numpy_now(node: Any) -> object:
     return np.datetime64("now")
+
+
+@case(DETERMINISTIC, "a clock as the `default_factory` of a dataclass's field")
+def default_factory(node: Any) -> object:
+    return Stamped().stamp
+
+
+@case(DETERMINISTIC, "a clock in a `functools.partial`")
+def clock_in_a_partial(node: Any) -> object:
+    return PARTIAL()
+
+
+@case(DETERMINISTIC, "`datetime.now` as a default argument")
+def datetime_default_argument(node: Any, now: Callable[[], datetime] = datetime.now) -> object:
+    return now()
+
+
+@case(DETERMINISTIC, "the time of a `logging` record")
+def log_record_time(node: Any) -> object:
+    record = logging.LogRecord("x", logging.INFO, "f", 1, "m", (), None)
+    return record.created, record.relativeCreated, logging.Formatter("%(asctime)s").format(record)
+
+
+@case(DETERMINISTIC, "a measured time (`timeit`)")
+def timed(node: Any) -> object:
+    return timeit.timeit("1 + 1", number=100)
+
+
+@case(DETERMINISTIC, "waiting with `select` alone")
+def waiting_in_select(node: Any) -> object:
+    start = time.monotonic_ns()
+    select.select([], [], [], 0.01)
+    return time.monotonic_ns() - start
 
 
 @case(DETERMINISTIC, "the local time zone")
@@ -242,6 +300,47 @@ def sqlite_random(node: Any) -> object:
         return connection.execute("SELECT random()").fetchall()
 
 
+@case(DETERMINISTIC, "`random.seed()` without a seed")
+def random_seed_of_nothing(node: Any) -> object:
+    random.seed()
+    return random.random(), random.Random(None).random()
+
+
+@case(DETERMINISTIC, "`np.random.seed()` without a seed")
+def numpy_seed_of_nothing(node: Any) -> object:
+    np.random.seed()
+    return np.random.rand()
+
+
+@case(DETERMINISTIC, "`np.random.SeedSequence()`, `PCG64()` and other bit generators")
+def numpy_bit_generators(node: Any) -> object:
+    return np.random.SeedSequence().entropy, np.random.PCG64().random_raw()
+
+
+@case(DETERMINISTIC, "`tempfile.mktemp`")
+def made_up_name(node: Any) -> object:
+    return os.path.basename(tempfile.mktemp())
+
+
+@case(DETERMINISTIC, "memory that `np.empty` leaves as it was")
+def uninitialized(node: Any) -> object:
+    for _ in range(3):  # what is free again is given out again
+        np.frombuffer(bytearray(os.urandom(64) * 125), dtype="uint8").copy()
+        random_before = np.random.default_rng(time.time_ns()).random(1000)
+        del random_before
+    return np.empty(1000).tolist()
+
+
+@case(DETECTED, "a generator that is seeded with the process id")
+def seeded_by_process(node: Any) -> object:
+    return random.Random(os.getpid()).random()
+
+
+@case(DETECTED, "the C library's process id through `ctypes`")
+def ctypes_process(node: Any) -> object:
+    return ctypes.CDLL(None).getpid()
+
+
 # -- order and addresses --------------------------------------------------------------------------
 
 
@@ -295,6 +394,47 @@ def default_repr(node: Any) -> object:
 @case(DETECTED, "`ctypes.addressof`")
 def address_of(node: Any) -> object:
     return ctypes.addressof(ctypes.c_int(0))
+
+
+@case(DETERMINISTIC, "a pickled set of texts")
+def pickled_set(node: Any) -> object:
+    return pickle.dumps({"north", "east", "south", "west", "up", "down"})
+
+
+@case(DETERMINISTIC, "`hash` of paths and dates")
+def hash_of_values(node: Any) -> object:
+    return hash(pathlib.PurePath("/a")), hash(date(2020, 1, 1))
+
+
+@case(DETERMINISTIC, "a set of enumeration members")
+def set_of_enums(node: Any) -> object:
+    return [member.name for member in set(Way)]
+
+
+@case(DETECTED, "a heap whose ties are decided by `id`")
+def heap_by_id(node: Any) -> object:
+    heap: list[tuple[int, int, int]] = []
+    for number, thing in enumerate([Thing() for _ in range(200)]):
+        heapq.heappush(heap, (0, id(thing), number))
+    return [heapq.heappop(heap)[2] for _ in range(200)]
+
+
+@case(DETECTED, "an address in a traceback's text")
+def traceback_with_address(node: Any) -> object:
+    try:
+        raise ValueError(Thing())
+    except ValueError:
+        return traceback.format_exc()
+
+
+@case(DETECTED, "`json.dumps` with `default=repr`")
+def json_of_objects(node: Any) -> object:
+    return json.dumps({"thing": Thing()}, default=repr)
+
+
+@case(DETECTED, "how many objects there are (`gc.get_objects`)")
+def objects_there_are(node: Any) -> object:
+    return len(gc.get_objects()), os.getpid()
 
 
 # -- finalizers, threads, event loops -------------------------------------------------------------
@@ -402,6 +542,25 @@ def working_directory(node: Any) -> object:
 @case(DETECTED, "the process id")
 def process_id(node: Any) -> object:
     return os.getpid()
+
+
+@case(DETECTED, "the thread's number in the system")
+def native_thread(node: Any) -> object:
+    return threading.get_native_id()
+
+
+@case(DETECTED, "`multiprocessing.current_process`")
+def present_process(node: Any) -> object:
+    return multiprocessing.current_process().pid
+
+
+@case(DETECTED, "a descriptor that is read (`os.open`, `os.read`)")
+def descriptor_read(node: Any) -> object:
+    descriptor = os.open("/proc/self/stat", os.O_RDONLY)
+    try:
+        return os.read(descriptor, 999)
+    finally:
+        os.close(descriptor)
 
 
 @case(DETECTED, "a file that is read")
