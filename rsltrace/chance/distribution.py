@@ -86,7 +86,10 @@ class Lognormal:
     @classmethod
     def of_moments(cls, mean_ns: float, sd_ns: float) -> Lognormal:
         """Return the one with this mean and standard deviation."""
-        spread = 1.0 + (sd_ns / mean_ns) * (sd_ns / mean_ns)
+        square = (sd_ns / mean_ns) * (sd_ns / mean_ns)
+        spread = 1.0 + square
+        if square < 1e-12:  # of which the sum keeps too little: log(1 + x) is x there
+            return cls(mean_ns, sqrt(square))
         return cls(mean_ns / sqrt(spread), sqrt(log(spread)))
 
     def sampler(self, stream: Stream, start_ns: int) -> Sampler:

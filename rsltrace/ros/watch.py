@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.errors import JobError
+from rsltrace.job.problems import nearest
 from rsltrace.loop.stop import Stop
 from rsltrace.ros.codec import codec_for
 
@@ -20,10 +21,11 @@ class _TopicStop(Protocol):
     def exit_code(self) -> str | None: ...
 
 
-def watch_exit_code(core: Core, spec: _TopicStop) -> Callable[[Any, bytes], None]:
+def watch_exit_code(core: Core, spec: _TopicStop, *, where: str) -> Callable[[Any, bytes], None]:
     """Return a watcher that ends the run after the time step of the first message.
 
-    With ``spec.exit_code`` (a dotted field path) the message's field is the exit status.
+    With ``spec.exit_code`` (a dotted field path; ``where`` it stands in the job) the message's
+    field is the exit status.
     """
 
     def watch(msg_type: Any, data: bytes) -> None:
@@ -31,16 +33,22 @@ def watch_exit_code(core: Core, spec: _TopicStop) -> Callable[[Any, bytes], None
         if spec.exit_code is not None:
             value: Any = codec_for(msg_type).deserialize(data)
             for name in spec.exit_code.split("."):
-                if not hasattr(value, "get_fields_and_field_types") or not hasattr(value, name):
+                fields: dict[str, str] = getattr(value, "get_fields_and_field_types", dict)()
+                if name not in fields:
+                    near = nearest(name, fields)
+                    hint = f"did you mean {near!r}?" if near else f"there are {', '.join(fields)}"
+                    hint = hint if fields else "what comes before it is no message"
                     raise JobError(
-                        f"stop.topic.exit_code: {spec.name} has no field {spec.exit_code!r} "
-                        f"(it is a {msg_type.__qualname__})"
+                        f"stop.topic.exit_code: {spec.name} is a {msg_type.__qualname__} without "
+                        f"the field {spec.exit_code!r}: {hint}",
+                        where=where,
                     )
                 value = getattr(value, name)
             if not isinstance(value, int):
                 raise JobError(
                     f"stop.topic.exit_code: {spec.exit_code!r} of {spec.name} is "
-                    f"{value!r}, not an integer"
+                    f"{value!r}, not an integer",
+                    where=where,
                 )
             code = int(value)
         core.loop.stop_after_step(Stop(f"message on {spec.name}", code))

@@ -14,7 +14,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import BagError, RunError
-from rsltrace.job import Job
+from rsltrace.job import Job, locate
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
@@ -255,7 +255,10 @@ class Session:
         if self.job.stop.topic is not None:
             from rsltrace.ros.watch import watch_exit_code
 
-            core.watch(self.job.stop.topic.name, watch_exit_code(core, self.job.stop.topic))
+            watch = watch_exit_code(
+                core, self.job.stop.topic, where=locate(self.job, ("stop", "topic", "exit_code"))
+            )
+            core.watch(self.job.stop.topic.name, watch)
         with self._failures(), self._engaged():
             self.world.plan(self._entries)
             core.fed = bool(self._bags)

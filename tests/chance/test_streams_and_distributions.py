@@ -184,3 +184,12 @@ def test_series_follow_the_time_since_the_start() -> None:
     assert [value(t) for t in at] == [10, 10, 20, 30, 15, 0, 0, 0]
     steps = Series(points, steps=True).sampler(Stream(0, ""), 100_000)
     assert [steps(t) for t in at] == [10, 10, 10, 30, 30, 30, 0, 0]
+
+
+def test_a_lognormal_may_be_as_narrow_as_a_nanosecond_of_an_hour() -> None:
+    mean, sd = 3.6e12, 1000.0
+    narrow = draws(Lognormal.of_moments(mean, sd), count=10_000)
+    assert abs(fmean(narrow) - mean) < 4 * sd / 100
+    assert abs(math.sqrt(pvariance(narrow)) / sd - 1) < 0.03
+    wide, wider = Lognormal.of_moments(1e9, 1e3 * 0.999), Lognormal.of_moments(1e9, 1e3 * 1.001)
+    assert wide.sigma < 1e-6 < wider.sigma  # both ways of computing it meet

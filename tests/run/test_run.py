@@ -108,7 +108,7 @@ def test_the_exit_code_may_come_from_a_message(record_job: Any) -> None:
     result = record_job(job % "data", code)
     assert (result.exit_code, result.end_ns) == (7, 2 * 10**9)
     result = record_job(job % "nothing", code)
-    assert "no field 'nothing'" in str(result.error)
+    assert "without the field 'nothing'" in str(result.error)
 
 
 @pytest.mark.parametrize(("answer", "code"), [("True", 0), ("4", 4)])

@@ -106,3 +106,20 @@ def test_an_integer_for_a_parameter_with_a_decimal_point(record_job: Callable[..
     more = "arguments: {rate: 3}\n    parameters: {gain: 2}"
     text = told(record_job, "nodes_under_test:Needy", more, NodeError)
     assert text.endswith("  write 2.0: ROS takes no integer for a parameter with a decimal point")
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("dta", "/numbers is a UInt64 without the field 'dta': did you mean 'data'?"),
+        ("code", "/numbers is a UInt64 without the field 'code': there are data"),
+        ("data.x", "/numbers is a UInt64 without the field 'data.x': what comes before it is no "),
+    ],
+)
+def test_a_field_that_no_exit_status_can_come_from(
+    record_job: Callable[..., Any], field: str, message: str
+) -> None:
+    stop = f"stop: {{topic: {{name: /numbers, exit_code: {field}}}}}\n"
+    result = record_job("nodes: [{node: nodes_under_test:Talker}]\n" + stop, NODES, output=None)
+    assert result.exit_code == 3
+    assert f"job.yaml:2:43: stop.topic.exit_code: {message}" in str(result.error)
