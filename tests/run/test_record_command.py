@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import array
+import fcntl
 import json
 import os
 import re
 import signal
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 from typing import Any
@@ -191,6 +194,41 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
     assert process.returncode == 130
     with Trace.open(tmp_path / "out.mcap") as trace:
         assert trace.complete
+
+
+def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
+    job_file: Any, tmp_path: Path
+) -> None:
+    job_file(
+        "nodes: [{node: nodes_under_test:Loud}]\n",
+        "class Loud(Talker):\n"
+        "    def __init__(self):\n"
+        "        super().__init__(0.001)\n"
+        "    def tick(self):\n"
+        "        self.get_logger().info('x' * 1000)\n",
+    )
+    process = _start(tmp_path)
+    status = Path(f"/proc/{process.pid}/stat")
+    still = 0
+    while still < 20:  # nobody reads what it says: sooner or later it waits in a write
+        assert process.poll() is None
+        time.sleep(0.05)
+        waits = status.read_text().rsplit(")", 1)[1].split()[0] == "S"
+        still = still + 1 if waits and _unread(process.stderr) > 40_000 else 0
+    process.send_signal(signal.SIGINT)
+    _, stderr = process.communicate(timeout=300)
+    assert process.returncode == 130, stderr[-2000:]
+    assert "closing the trace" in stderr
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert trace.complete
+        assert not any(flag for part in trace.events() for flag in part["flags"].tolist())
+
+
+def _unread(pipe: Any) -> int:
+    """Return how many bytes wait in a pipe."""
+    waiting = array.array("i", [0])
+    fcntl.ioctl(pipe.fileno(), termios.FIONREAD, waiting)
+    return waiting[0]
 
 
 def test_a_full_disk_ends_the_run_with_a_readable_file(job_file: Any, tmp_path: Path) -> None:
