@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 import zlib
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from rsltrace_viewer.rerun_export.export import export
 
 pytestmark = [
     pytest.mark.slow,
+    pytest.mark.skipif(sys.version_info < (3, 11), reason="needs Rerun 0.41"),
     pytest.mark.skipif(
         picture.software_driver() is None,
         reason="needs a Vulkan driver (Debian: mesa-vulkan-drivers)",

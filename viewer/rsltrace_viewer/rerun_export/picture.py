@@ -46,6 +46,8 @@ def take(
     require()
     from rerun.experimental import ViewerClient
 
+    if not hasattr(ViewerClient, "open"):
+        raise SetupError("pictures need Rerun 0.41, and that needs Python 3.11")
     port = _free_port()
     environment = dict(os.environ, RERUN_APP_ONLY="true")
     driver = software_driver()

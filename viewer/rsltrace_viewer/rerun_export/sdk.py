@@ -14,7 +14,8 @@ from pathlib import Path
 
 from rsltrace.errors import SetupError
 
-VERSION = "0.41"
+VERSION = "0.41" if sys.version_info >= (3, 11) else "0.39"
+"""The last one for Python 3.10 is 0.39; what is used here is the same in both."""
 INSTALL = "pip install 'rsltrace[rerun]'"
 APPLICATION_ID = "rsltrace"
 
