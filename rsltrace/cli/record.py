@@ -100,8 +100,8 @@ def record(
     if print_job:
         _print_job(loaded)
         return
-    if loaded.launch and not (loaded.stop.model_fields_set or loaded.bags):
-        _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
+    if not (loaded.stop.model_fields_set or loaded.bags):
+        _say_that_it_has_no_end(loaded)
     path = output or default_output(named)
     if bag is not None:
         check_bag_folder(bag, force=force)
@@ -128,6 +128,13 @@ def record(
         count = export_bag(path, bag, force=force)
         click.echo(f"wrote {bag}: {count} messages", err=True)
     sys.exit(result.exit_code)
+
+
+def _say_that_it_has_no_end(job: Job) -> None:
+    if job.launch:
+        _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
+    elif any(spec.node is not None for spec in job.nodes):  # mains end by themselves
+        _note("the job does not say when the run ends: 'stop:' in it does, --until T, and Ctrl-C")
 
 
 def _print_job(job: Job) -> None:

@@ -108,6 +108,10 @@ def _read(path: Path) -> str:
         raise JobError(f"this is a folder; {advice}", where=name) from None
     except OSError as error:
         raise JobError(f"cannot read the job file: {error.strerror}", where=name) from None
+    if name.endswith(".py"):
+        raise JobError(
+            f"this is Python, not a job file; `rsltrace init --from {name}` writes one", where=name
+        )
     if data.startswith(b"\x89MCAP"):
         raise JobError(
             "this is a recording, not a job file (rsltrace info, view and diff read traces)",

@@ -77,7 +77,7 @@ def check_field_path(path: str) -> None:
 
 def check_target(target: str) -> None:
     """Raise ``ValueError`` unless ``target`` looks like ``module:Class`` (dots in both parts)."""
-    if not _TARGET.fullmatch(target):
+    if not _TARGET.fullmatch(target) or target.partition(":")[0].endswith(".py"):
         raise ValueError(
             f"expected module:Class or module:function, got {target!r}{_as_target(target)}"
         )

@@ -76,3 +76,38 @@ def test_other_files_are_not_named_on_the_command_line(
     done = rsltrace("check", "job.yaml", "--set", f"{key}=other.yaml")
     assert done.returncode == 2, "it would be left out in silence"
     assert f"--set: {key}: is read before the command line is" in done.stderr
+
+
+def test_a_module_is_no_job(job_file: Callable[..., Path], rsltrace: Any) -> None:
+    job_file("nodes: []\n")
+    done = rsltrace("record", "nodes_under_test.py")
+    assert done.returncode == 2
+    assert done.stderr == (
+        "rsltrace: error: nodes_under_test.py: this is Python, not a job file; "
+        "`rsltrace init --from nodes_under_test.py` writes one\n"
+    )
+    job_file("nodes: [{node: 'nodes_under_test.py:Talker'}]\n")
+    done = rsltrace("record", "job.yaml")
+    assert "a module is named with dots: nodes_under_test:Talker\n" in done.stderr
+
+
+def test_a_command_that_is_misspelt(rsltrace: Any) -> None:
+    done = rsltrace("recrod", "job.yaml")
+    assert done.returncode == 2
+    assert done.stderr.endswith("Error: No such command 'recrod'. Did you mean 'record'?\n")
+    assert rsltrace("xyzzy").stderr.endswith("Error: No such command 'xyzzy'.\n")
+
+
+def test_a_job_without_an_end_says_so(job_file: Callable[..., Path], rsltrace: Any) -> None:
+    """It runs until somebody stops it, here the node; one that is told when does not say it."""
+    code = """
+class Weary(Talker):
+    def tick(self):
+        super().tick()
+        assert self.count < 3
+"""
+    job_file("nodes: [{node: 'nodes_under_test:Weary'}]\n", code)
+    note = "note: the job does not say when the run ends: 'stop:' in it does, --until T, and Ctrl-C"
+    endless = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    assert (endless.returncode, note in endless.stderr) == (3, True)
+    assert note not in rsltrace("record", "job.yaml", "--until", "1", "-o", "2.mcap").stderr
