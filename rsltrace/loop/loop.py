@@ -191,11 +191,16 @@ class EventLoop:
         timers = self.timers
         idle = self.idle
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
+        timer_ns = horizon_ns = -1
         while True:
-            # Time steps in which one thing arrives and nothing else is due.
+            # Time steps in which one thing arrives and nothing else is due. To compare two times
+            # takes Python longer than to see that they are the same object, and here it shows.
             while scheduled and not (ready or tasks or idle):
                 next_ns = scheduled[0][0]
-                if next_ns <= now_ns or next_ns >= timers.next_ns or next_ns >= quiet_ns:
+                if timers.next_ns is not timer_ns:
+                    timer_ns = timers.next_ns
+                    horizon_ns = min(timer_ns, quiet_ns)
+                if next_ns <= now_ns or next_ns >= horizon_ns:
                     break
                 self.now_ns = now_ns = next_ns
                 began = self.events
@@ -208,7 +213,7 @@ class EventLoop:
                     break
                 if ready:
                     ready.popleft().dispatch()
-                if self.events >= self._until_events or self.now_ns != now_ns:
+                if self.now_ns is not now_ns or self.events >= self._until_events:
                     break
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
                 _, _, _, action, what = heappop(scheduled)

@@ -51,15 +51,21 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     ) -> None:
         now_ns = loop.now_ns
         leaves_ns = now_ns + core.busy_ns
-        arrival_ns = leaves_ns + delay(leaves_ns)
+        delay_ns = delay(leaves_ns)
+        arrival_ns = leaves_ns + delay_ns
         if arrival_ns < link.last_ns:
             arrival_ns = link.last_ns
+            delay_ns = arrival_ns - leaves_ns
         link.last_ns = arrival_ns
         recorder = core.recorder
         if recorder is not None:
-            recorder.draw(entity, _DELAY | arrival_ns - leaves_ns)
+            recorder.draw(entity, _DELAY | delay_ns)
         delivery = (data, event, position, digest, stamp_ns, count, arrival_ns)
-        if arrival_ns == now_ns and (link.expected_ns != now_ns or not expects(loop, arrive)):
+        if (
+            not delay_ns
+            and arrival_ns == now_ns
+            and (link.expected_ns != now_ns or not expects(loop, arrive))
+        ):
             arrive(delivery)
         else:
             link.expected_ns = arrival_ns
