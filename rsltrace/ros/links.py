@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from rsltrace.ros.pubsub import Delivery, PublisherHandle, SubscriptionHandle
     from rsltrace.ros.services import ClientHandle, Exchange, ServiceHandle
 
+_DELAY = encode_draw(Draw.DELAY)
 _LOST = {
     LOST_DROP: encode_draw(Draw.DROP),
     LOST_BURST: encode_draw(Draw.BURST),
@@ -103,6 +104,8 @@ class Exchanges:
         self._receiver = receiver
         self._entity = receiver.entity_id
         self._channel = channel
+        self._plain = channel.plain if channel is not None and channel.keep_order else None
+        self._last_ns = 0
 
     def send(self, exchange: Exchange) -> None:
         """Send a request or response on its way."""
@@ -111,7 +114,14 @@ class Exchanges:
         now_ns = loop.now_ns
         arrival_ns = now_ns + core.busy_ns
         channel = self._channel
-        if channel is not None:
+        if self._plain is not None:  # the usual case: some time, in order
+            delay_ns = self._plain(arrival_ns)
+            if arrival_ns + delay_ns < self._last_ns:
+                delay_ns = self._last_ns - arrival_ns
+            self._last_ns = arrival_ns = arrival_ns + delay_ns
+            if core.recorder is not None:
+                core.recorder.draw(self._entity, _DELAY | delay_ns)
+        elif channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
             note(core, self._entity, draw)
