@@ -192,21 +192,9 @@ def wait(
     something comes of it. A ``patient`` one may last for ever.
 
     :raises RunEnded: when the run ends before the wait does.
+    :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
     """
-    if get_ident() != core.thread or getpid() != core.process:
-        place = "thread" if getpid() == core.process else "process"
-        raise UnsupportedError(
-            f"a {place} that a node has started waits for {what}, which takes simulated time: only "
-            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
-            f"there, or let a callback wait and hand the result to the {place}"
-        )
-    if core.ending or core.program.ended:
-        _refuse(core)
-    if core.current_handle is None:
-        raise UnsupportedError(
-            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
-            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
-        )
+    _check_may_wait(core, what)
     group = _hold_group(core)
     blocked = Wait(core, what, group, quiet=quiet, patient=patient)
     if until is not None:
@@ -234,6 +222,24 @@ def wait(
         error, blocked.error = blocked.error, None
         raise error
     return not blocked.timed_out
+
+
+def _check_may_wait(core: Core, what: object) -> None:
+    """Refuse where there is no stack that can be set aside, and when the run is over."""
+    if get_ident() != core.thread or getpid() != core.process:
+        place = "thread" if getpid() == core.process else "process"
+        raise UnsupportedError(
+            f"a {place} that a node has started waits for {what}, which takes simulated time: only "
+            "callbacks, constructors and tasks can wait; use call_async with add_done_callback "
+            f"there, or let a callback wait and hand the result to the {place}"
+        )
+    if core.ending or core.program.ended:
+        _refuse(core)
+    if core.current_handle is None:
+        raise UnsupportedError(
+            f"whoever is outside of all callbacks cannot wait for {what}: a stop function only "
+            "looks; in a Simulation, do it within sim.call(…), or run the simulation until then"
+        )
 
 
 def _end_stretch(core: Core) -> None:
