@@ -69,17 +69,23 @@ def test_seed_and_until_replace_the_jobs_own(rsltrace: Any, job_file: Any) -> No
     assert lines["--until", "9s"].endswith("sim 9.000000000\n")
 
 
-def test_an_existing_file_is_kept_without_force(
+def test_an_existing_file_is_kept_without_force_and_what_is_no_trace_always(
     rsltrace: Any, job_file: Any, tmp_path: Path
 ) -> None:
     job_file(BOTH)
-    (tmp_path / "out.mcap").write_text("precious")
+    out = tmp_path / "out.mcap"
+    assert rsltrace("record", "job.yaml", "-o", "out.mcap").returncode == 0
+    before = out.stat().st_mtime_ns
     done = rsltrace("record", "job.yaml", "-o", "out.mcap")
     assert done.returncode == 2
     assert "out.mcap" in done.stderr
     assert "--force" in done.stderr
-    assert (tmp_path / "out.mcap").read_text() == "precious"
+    assert out.stat().st_mtime_ns == before
     assert rsltrace("record", "job.yaml", "-o", "out.mcap", "--force").returncode == 0
+    assert out.stat().st_mtime_ns != before
+    out.write_text("precious")
+    assert rsltrace("record", "job.yaml", "-o", "out.mcap", "--force").returncode == 2
+    assert out.read_text() == "precious"
 
 
 @pytest.mark.parametrize(
