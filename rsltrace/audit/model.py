@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -91,6 +90,3 @@ class Audit:
     notes: tuple[str, ...] = ()
     allowed: int = 0
     """Places that a comment silences."""
-
-
-Report = Callable[[str, str, Rule], None]

@@ -12,6 +12,8 @@ from typing import Any
 
 
 class Reliability(IntEnum):
+    """Numbers of ``rmw_qos_reliability_policy_t``."""
+
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
     BEST_EFFORT = 2
@@ -20,6 +22,8 @@ class Reliability(IntEnum):
 
 
 class Durability(IntEnum):
+    """Numbers of ``rmw_qos_durability_policy_t``."""
+
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
@@ -28,6 +32,8 @@ class Durability(IntEnum):
 
 
 class History(IntEnum):
+    """Numbers of ``rmw_qos_history_policy_t``."""
+
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
     KEEP_ALL = 2
@@ -35,6 +41,8 @@ class History(IntEnum):
 
 
 class Liveliness(IntEnum):
+    """Numbers of ``rmw_qos_liveliness_policy_t``."""
+
     SYSTEM_DEFAULT = 0
     AUTOMATIC = 1
     MANUAL_BY_TOPIC = 3

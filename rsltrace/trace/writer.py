@@ -145,11 +145,6 @@ class TraceWriter:
         return digest_text(self._chain_hashes[-1] if self._chain_hashes else self._last_chain_hash)
 
     @property
-    def bytes_written(self) -> int:
-        """Size of the file so far; what still waits in memory is not counted."""
-        return self._stream.bytes_written
-
-    @property
     def size(self) -> int:
         """How many bytes are in the file; what is still collected for a chunk is not."""
         return self._stream.bytes_written

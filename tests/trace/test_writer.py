@@ -155,11 +155,11 @@ def test_what_a_segment_refers_to_is_in_the_file_before_its_events(tmp_path: Pat
 def test_payloads_are_written_when_half_a_megabyte_has_gathered(tmp_path: Path) -> None:
     with Opened(tmp_path / "run.mcap", compression="") as feeder:
         channel = feeder.writer.add_channel("/image", "x/msg/Image", "uint8[] data\n")
-        before = feeder.writer.bytes_written
+        before = feeder.writer.size
         feeder.payload(channel, 0, bytes(PAYLOAD_BYTES_PER_CHUNK - 100))
-        assert feeder.writer.bytes_written == before
+        assert feeder.writer.size == before
         feeder.payload(channel, 0, bytes(100))
-        assert feeder.writer.bytes_written > before + PAYLOAD_BYTES_PER_CHUNK
+        assert feeder.writer.size > before + PAYLOAD_BYTES_PER_CHUNK
 
 
 def test_a_segment_with_very_many_outputs_ends_early(tmp_path: Path) -> None:
