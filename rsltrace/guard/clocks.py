@@ -197,6 +197,20 @@ def numpy_now(function: Any, text: str, *more: Any) -> Any:
     )
 
 
+def opencv_clock(stack: ExitStack) -> None:
+    """Redirect the clock of OpenCV, which is loaded: its unit is a nanosecond."""
+    count: Any = sys.modules["cv2"].getTickCount
+    real = copy_of(count)
+
+    def read() -> Any:
+        guard = engaged()
+        if guard is None:
+            return real()
+        return clock_call(guard, sys._getframe(1), "cv2.getTickCount()", lambda ns: ns, real)
+
+    stack.callback(Redirected(count, read).restore)
+
+
 @contextmanager
 def clocks() -> Iterator[None]:
     """Redirect every clock; which guard answers is asked at each call."""

@@ -75,6 +75,8 @@ def randomness() -> Iterator[None]:
     """Redirect what answers by chance; which guard answers is asked at each call."""
     with ExitStack() as stack:
         _module_functions(stack, random, random._inst, "random", _random_of)
+        stack.callback(setattr, random, "_inst", random._inst)
+        random._inst = _Shared()
         _entropy(stack)
         _unseeded(stack)
         _uuids(stack)
@@ -86,6 +88,19 @@ def randomness() -> Iterator[None]:
             empty: Any = np.empty
             stack.callback(Redirected(empty, _emptying(copy_of(empty))).restore)
         yield
+
+
+class _Shared(random.Random):
+    """What libraries (networkx) take for the generator behind ``random``'s functions."""
+
+    def __init__(self) -> None:
+        """Seed nothing: that would seed the module."""
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return the module's function of that name, which asks whose code it is."""
+        if name.startswith("_"):
+            return super().__getattribute__(name)
+        return vars(random).get(name) or super().__getattribute__(name)
 
 
 def _random_of(guard: Guard, frame: FrameType) -> Any:

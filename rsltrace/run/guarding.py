@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError
+from rsltrace.guard.clocks import opencv_clock
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.ordering import ordered_sets
@@ -131,7 +132,9 @@ def guarding(stack: ExitStack, job: Job) -> Guarding:
             stack.enter_context(pinned_place())
         stack.enter_context(installed())
         folders = [str(job.resolve(folder)) for folder in job.search_path]
-        on_loaded = {"torch": made.torch_loaded}
+        on_loaded = {"torch": made.torch_loaded, "cv2": lambda: opencv_clock(stack)}
+        if "cv2" in sys.modules:
+            opencv_clock(stack)
         stack.enter_context(ordered_sets(folders, _packages(job.nodes), on_loaded))
     return made
 

@@ -232,6 +232,29 @@ def test_libraries_work_under_the_guard(said: Said) -> None:
     assert first[0][0] == "1970-01-01 00:00:00.500000"
 
 
+def test_the_generator_that_libraries_take_from_random_is_the_nodes_too(said: Said) -> None:
+    """As networkx does: ``random._inst`` where no seed is given."""
+    code = node_code(
+        "shared = random._inst\n"
+        "self.say(shared.random(), shared.sample(range(99), 3), shared.gauss(0, 1),\n"
+        "    isinstance(shared, random.Random), random.random())",
+        imports="import random",
+    )
+    before = random._inst  # type: ignore[attr-defined]
+    first = said(code)
+    random.random()
+    assert said(code) == first
+    assert said(code, job="nodes: [{node: 'm:N', name: a}, {node: 'm:N'}]")[1] == first[0]
+    assert first[0][3] is True
+    assert random._inst is before  # type: ignore[attr-defined]
+
+
+def test_opencv_counts_simulated_time(said: Said) -> None:
+    pytest.importorskip("cv2")
+    code = node_code("self.say(cv2.getTickCount() / cv2.getTickFrequency())", imports="import cv2")
+    assert said(code) == [[0.5], [1.0]]
+
+
 def test_two_simulations_in_one_process_do_not_disturb_each_other(tmp_path: Path) -> None:
     import rsltrace
 
