@@ -224,9 +224,10 @@ def _mark_stopped(thread: Any) -> None:
     threading._active.pop(thread._ident, None)  # type: ignore[attr-defined]
     if hasattr(thread, "_is_stopped"):
         thread._is_stopped = True
-    done = getattr(getattr(thread, "_handle", None), "_set_done", None)
-    if done is not None:
-        done()
+    make_handle = getattr(threading, "_make_thread_handle", None)  # from Python 3.13 on
+    if make_handle is not None:
+        thread._handle = make_handle(thread._ident)  # its own was never started
+        thread._handle._set_done()
 
 
 def _join(self: Any, timeout: float | None = None) -> None:
