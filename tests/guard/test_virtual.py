@@ -186,6 +186,25 @@ def test_one_node_may_be_allowed_what_others_are_not(said: Said) -> None:
     assert said(code, job=by_module)[0] == [True]
 
 
+def test_a_main_may_be_allowed_what_others_are_not(said: Said) -> None:
+    """Before it has made its node, in its callbacks and in its threads."""
+    code = node_code(
+        "self.say('callback', time.time() > 1e9)",
+        imports="import rclpy, threading, time",
+        init="threading.Thread(target=lambda: self.say('thread', time.time() > 1e9)).start()",
+    )
+    code += (
+        "\ndef main():\n    early = time.time() > 1e9\n    rclpy.init()\n    node = N()\n"
+        "    node.say('main', early)\n    try: rclpy.spin(node)\n"
+        "    except (KeyboardInterrupt, rclpy.executors.ExternalShutdownException): pass\n"
+    )
+    job = "nodes: [{main: 'm:main', name: a, guard: {clock: allow}}, {main: 'm:main', name: b}]"
+    found = said(code, job=job)
+    assert found.count(["main", True]) == found.count(["main", False]) == 1
+    assert found.count(["thread", True]) == found.count(["thread", False]) == 1
+    assert found.count(["callback", True]) == found.count(["callback", False]) == 2
+
+
 def test_nothing_is_left_after_a_run(said: Said) -> None:
     def state() -> list[object]:
         state = np.random.get_state()
