@@ -79,6 +79,11 @@ class Descriptors:
             return None
         return found[1]
 
+    def leads_out(self, fd: int) -> bool:
+        """Return whether a descriptor's other end is not open in this process."""
+        far = self.far_end(fd)
+        return far is None or self._far_ends.get(far, (None, 0))[0] != _identity(far)
+
     def is_outside(self, fd: object) -> bool:
         """Return whether a descriptor leads to somebody who is not part of the run."""
         if self.find(fd) is not None:

@@ -106,6 +106,11 @@ class RecordedPoll:
             return False
         return any(map(guard.descriptors.is_outside, self._registered))
 
+    def leads_out(self) -> bool:
+        """Return whether somebody else may make one of the descriptors ready, recorded or not."""
+        guard = engaged()
+        return guard is not None and any(map(guard.descriptors.leads_out, self._registered))
+
     def poll(self, timeout: float | None = None, maxevents: int = -1) -> list[tuple[int, int]]:
         """Return what is ready, in what was registered."""
         limits = (maxevents,) if self._seconds else ()
@@ -114,7 +119,9 @@ class RecordedPoll:
         unit = 1 if self._seconds else 1000
         timeout_s = None if timeout is None or timeout < 0 else timeout / unit
         if guard is None or self._source is None or not self.has_outside():
-            patient = None if timeout_s == 0 else is_patient(_past_selectors(frame))
+            patient = guard if self.step else is_patient(_past_selectors(frame))
+            if timeout_s == 0:
+                patient = None
             if patient is None:
                 return self._real.poll(timeout, *limits)  # type: ignore[no-any-return]
             return (
@@ -122,6 +129,7 @@ class RecordedPoll:
                     patient,
                     lambda seconds: self._real.poll(seconds * unit, *limits) or NOT_YET,
                     None if timeout_s is None else int(timeout_s * _NS_PER_S),
+                    self.step,
                 )
                 or []
             )

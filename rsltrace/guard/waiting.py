@@ -79,12 +79,18 @@ def awaited(
     return decoded(text)
 
 
-def patiently(guard: Guard, look: Look, for_ns: int | None = None) -> Any:
+def patiently(
+    guard: Guard,
+    look: Look,
+    for_ns: int | None = None,
+    step: Callable[[int], object] | None = None,
+) -> Any:
     """Wait likewise for what is not recorded; return it, or None if it does not come in time.
 
     A thread that blocked for real would keep everybody from going on, be it those it waits for.
     """
     context, steps = guard.context, 0
+    step = step or context.step
     deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
     while True:
         with engage(None):
@@ -100,7 +106,8 @@ def patiently(guard: Guard, look: Look, for_ns: int | None = None) -> Any:
             if left_ns <= 0:
                 return None
         guard.pace.in_a_row = 0
-        context.step(left_ns)
+        if step(left_ns):
+            return None
         steps += 1
 
 

@@ -51,7 +51,7 @@ class SimSelector:
         if core is not self._core:
             return self._real.select(timeout)
         poller = getattr(self._real, "_selector", None)
-        if not polls and isinstance(poller, RecordedPoll) and poller.has_outside():
+        if not polls and isinstance(poller, RecordedPoll) and poller.leads_out():
             poller.step = self._step
             try:
                 return self._real.select(timeout)

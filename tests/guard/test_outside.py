@@ -274,3 +274,15 @@ def test_a_thread_that_waits_for_a_process_lets_time_pass(
     assert len(said) == 4
     assert said[2][0] >= 5, "others went on"
     assert said[3][1] == pytest.approx(0.1, abs=1e-4)
+
+
+def test_an_asyncio_loop_waits_for_a_process_that_is_not_recorded(go: Callable[..., Any]) -> None:
+    code = node_code(
+        f"{ONCE}self.say(looped())", imports="import asyncio, subprocess", module=IN_ASYNCIO
+    )
+    result = go(code, "{process: allow}", "first")
+    assert result.error is None
+    with Trace.open(result.path) as trace:
+        texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
+    assert len(texts) == 1
+    assert "cba" in texts[0]
