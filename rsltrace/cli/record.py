@@ -100,8 +100,6 @@ def record(
     if print_job:
         _print_job(loaded)
         return
-    if not (loaded.stop.model_fields_set or loaded.bags):
-        _say_that_it_has_no_end(loaded)
     path = output or default_output(named)
     if bag is not None:
         check_bag_folder(bag, force=force)
@@ -115,12 +113,18 @@ def record(
         with suppress(OSError, ValueError):  # a stderr that is no file
             faulthandler.enable(sys.__stderr__)
     with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
+
+        def begins(stop: Callable[[Stop], None]) -> None:
+            if not (loaded.stop.model_fields_set or loaded.bags):
+                _say_that_it_has_no_end(loaded)
+            on_interrupt(stop)
+
         result = run(
             loaded,
             path,
             force=force,
             echo=not quiet,
-            observer=Observer(progress=on_progress, interrupt=on_interrupt, note=tell),
+            observer=Observer(progress=on_progress, interrupt=begins, note=tell),
             replay=replay,
         )
     _report(result, path, told, as_json=as_json)

@@ -56,7 +56,7 @@ def test_a_number_without_end_is_not_printed_in_full(
     job_file(f"nodes: [{{node: nodes_under_test:Listener}}]\nseed: {'9' * 5000}\n")
     done = rsltrace("record", "job.yaml")
     assert done.returncode == 2
-    assert "...' is not a number" in done.stderr
+    assert "...' is too long a number" in done.stderr
     assert len(done.stderr) < 500
 
 

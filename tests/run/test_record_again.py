@@ -36,7 +36,7 @@ def test_a_run_is_recorded_again(
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
         words = shlex.split(record_again(trace))
-    assert words[:3] == ["rsltrace", "record", "job.yaml"]
+    assert words[:3] == ["rsltrace", "record", str(tmp_path / "job.yaml")], "beside the trace"
     until = ("--until", "2") if "--until" in given else ()
     again = rsltrace(*words[1:], *until, "-o", "again.mcap")
     assert again.stdout == done.stdout, (words, again.stderr)
