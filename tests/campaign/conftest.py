@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 NODE = """
-import os, signal, sys, time, uuid
+import ctypes, os, signal, sys, time, uuid
 from rclpy.node import Node
 class N(Node):
     def __init__(self):
