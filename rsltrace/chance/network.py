@@ -24,10 +24,12 @@ class LinkRule:
 
 @dataclass(frozen=True, slots=True)
 class NameRule:
-    """A model for the topics or services that a glob describes."""
+    """A model for the topics or services that a glob describes; ``where`` is its line in a file of
+    delays."""
 
     name: str
     model: Model
+    where: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,10 +44,11 @@ class OutageRule:
 @dataclass(frozen=True, slots=True)
 class NetworkPlan:
     """The rules of a job. Of links the first that matches counts, then an exact name, then globs
-    in order, then the default."""
+    in order, then ``table`` (from a file of delays), then the default."""
 
     links: tuple[LinkRule, ...] = ()
     topics: tuple[NameRule, ...] = ()
+    table: tuple[NameRule, ...] = ()
     services: tuple[NameRule, ...] = ()
     default: Model | None = None
     outages: tuple[OutageRule, ...] = ()
@@ -62,6 +65,8 @@ class NetworkPlan:
         model = self._link_model(topic, sender[0], receiver[0])
         if model is None:
             model = _by_name(self.topics, topic)
+        if model is None:
+            model = _by_name(self.table, topic)
         if model is None and topic not in QUIET_TOPICS:
             model = self.default
         outages = self._outages("topic", topic, (sender[0], receiver[0]))

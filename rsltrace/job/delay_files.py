@@ -70,8 +70,9 @@ def read_series(spec: SeriesSpec, path: Path, name: str) -> tuple[tuple[int, int
     return tuple(points)
 
 
-def read_rslcpp(path: Path, name: str) -> dict[str, DelaySpec]:
-    """Return the delays of a table of RSLCPP: topic, FIXED or MEASURED, milliseconds, skew.
+def read_rslcpp(path: Path, name: str) -> dict[str, tuple[int, DelaySpec]]:
+    """Return the delays of a table of RSLCPP (topic, FIXED or MEASURED, milliseconds, skew), by
+    topic, with the numbers of their lines.
 
     The last line of a topic counts, as in RSLCPP; unlike there, a mistake is an error.
 
@@ -103,7 +104,7 @@ def read_rslcpp(path: Path, name: str) -> dict[str, DelaySpec]:
         return True
 
     rows = _rows(path, name, row, header=header, only_first=True, comments=False)
-    return {topic: delay for _, (topic, delay) in rows}
+    return {topic: (number, delay) for number, (topic, delay) in rows}
 
 
 def _truncated_ms(text: str) -> int:

@@ -72,7 +72,7 @@ class Wait:
         self.timed_out = False
         self._woken = False
         self._event = (core.current_handle, core.current_entity, core.current_node)
-        self._arguments = core.node_arguments
+        self._constructing = core.constructing
         self._end_group = core.on_end
         self._cause = (NO_EVENT, 0)
         self._input_hash = 0
@@ -142,7 +142,7 @@ class Wait:
         core.kind = _RESUME
         core.cause_event, core.cause_output = self._cause
         core.input_hash = self._input_hash
-        core.node_arguments = self._arguments
+        core.constructing = self._constructing
         core.on_end = self._end_group
         core.quiet = self.quiet
         core.busy_ns = self._busy_ns
@@ -256,7 +256,7 @@ def _end_stretch(core: Core) -> None:
 def set_aside(core: Core) -> Iterator[None]:
     """Let other events run on this stack, between two parts of the event under way."""
     handle, entity, node = core.current_handle, core.current_entity, core.current_node
-    arguments, on_end = core.node_arguments, core.on_end
+    constructing, on_end = core.constructing, core.on_end
     _end_stretch(core)
     core.on_end = None
     try:
@@ -267,7 +267,7 @@ def set_aside(core: Core) -> Iterator[None]:
             core.on_node(node)
         core.kind, core.input_hash = _RESUME, 0
         core.cause_event, core.cause_output = core.loop.events - 1, 0
-        core.node_arguments, core.on_end = arguments, on_end
+        core.constructing, core.on_end = constructing, on_end
         core.quiet = True
 
 

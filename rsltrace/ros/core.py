@@ -33,7 +33,6 @@ from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
 
 if TYPE_CHECKING:
-    from rsltrace.ros.arguments import RosArguments
     from rsltrace.ros.blocking import Wait
     from rsltrace.ros.context import ContextHandle
     from rsltrace.ros.entity_handle import EntityHandle
@@ -128,8 +127,7 @@ class Core:
         self.poll_stage: tuple[int, int] | None = None
 
         # What is being constructed, and programs and threads of user code.
-        self.node_arguments: list[RosArguments] = []
-        self.log_exceptions = False
+        self.constructing: Entry | None = None
         self.importing = False
         self.main_context: ContextHandle | None = None
         self.host = Program(self)

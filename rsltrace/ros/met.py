@@ -6,7 +6,7 @@ A rule of a job that fits none of them does nothing, and nobody would notice.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from rsltrace.model.entity import Entity, EntityKind
 
@@ -21,6 +21,15 @@ _RECEIVERS = (EntityKind.SUBSCRIPTION, *_ACTIONS)
 _SERVICES = (EntityKind.CLIENT, EntityKind.SERVICE)
 
 
+class Asker(NamedTuple):
+    """A node that has asked what a name becomes; ``entry_key`` is that of the job's entry that made
+    it, empty if none did."""
+
+    entry_key: str
+    name: str
+    namespace: str
+
+
 class Met:
     """The names there have been, each once, in the order of their coming."""
 
@@ -33,6 +42,8 @@ class Met:
         self.subscriptions: dict[tuple[str, str], None] = {}
         self.entities: dict[tuple[str, str], None] = {}
         """(node, name) of all that may have a callback: topic, service, a timer's callback."""
+        self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
+        """What each node has asked for before it was remapped: (full name, whether a service)."""
 
     def add(self, entity: Entity) -> None:
         """Remember an entity; its node comes before it."""
@@ -60,8 +71,12 @@ class Met:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """The parameters of a node: those it has declared, and those it was given besides."""
+    """The parameters of a node: those it has declared, and those it was given besides.
 
+    ``entry_key`` is the key of the job's entry that made the node, empty if none did.
+    """
+
+    entry_key: str
     declared: tuple[str, ...]
     unused: tuple[str, ...]
 
@@ -75,5 +90,5 @@ def parameters_of(core: Core) -> dict[str, Parameters]:
             continue
         declared = tuple(node._parameters)
         unused = tuple(name for name in node._parameter_overrides if name not in node._parameters)
-        found[handle.fully_qualified_name] = Parameters(declared, unused)
+        found[handle.fully_qualified_name] = Parameters(handle.entry_key, declared, unused)
     return found

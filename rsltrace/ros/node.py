@@ -10,6 +10,7 @@ from rsltrace.model.entity import EntityKind
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments, UnknownArgumentsError
 from rsltrace.ros.entity_handle import EntityHandle
 from rsltrace.ros.graph import action_names_and_types
+from rsltrace.ros.met import Asker
 from rsltrace.ros.stating import NodeState
 
 if TYPE_CHECKING:
@@ -58,8 +59,12 @@ class NodeHandle(EntityHandle):
             raise real.RCLInvalidROSArgsError(message) from error
         # The job's arguments for this node are the process's arguments of ``ros2 run``.
         program = core.program
-        own = core.node_arguments if program is core.host else program.parameters
+        is_hosted = program is core.host
+        entry = core.constructing if is_hosted else program.entry
+        given = entry.arguments if entry is not None else []
+        own = given if is_hosted else program.parameters
         self._outer = [context.arguments, *own] if use_global_arguments else []
+        self.entry_key = entry.key if entry is not None else ""
         self.program = program
         self.core = core
         self.boundary = boundary
@@ -81,7 +86,7 @@ class NodeHandle(EntityHandle):
             core.states[self.fully_qualified_name] = self.state
         self.mailbox: Mailbox | None = None
         self.rosout: PublisherHandle | None = None
-        self.log_exceptions = core.log_exceptions or program.log_exceptions
+        self.log_exceptions = entry is not None and entry.log_exceptions
         self.actions: list[Any] = []
         self.user_waitables: dict[Any, UserWaitable] = {}
         self.waitable_count = 0
@@ -128,6 +133,9 @@ class NodeHandle(EntityHandle):
         real = self.boundary.real
         expanded: str = real.rclpy_expand_topic_name(name, self.name, self.namespace)
         if not only_expand:
+            if (met := self.core.met) is not None:
+                asker = Asker(self.entry_key, self.name, self.namespace)
+                met.asked.setdefault(asker, {})[expanded, service] = None
             expanded = self.arguments.remap_topic(
                 expanded, self.name, self.namespace, self._outer_names(), service=service
             )

@@ -45,7 +45,6 @@ class Program:
         """What the job adds to the ROS arguments of every ``rclpy.init`` of this program."""
         self.parameters = arguments[1:]
         """The job's own parameters, which come after those of all files."""
-        self.log_exceptions = entry is not None and entry.log_exceptions
         self.entity_id = 0
         self.announced = True
         self.contexts: list[ContextHandle] = []

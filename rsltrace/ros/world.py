@@ -161,12 +161,10 @@ class World:
             getcurrent().parent = core.runners.pop()
 
         # A constructor that blocks (on a service, say) is left waiting while others go on.
-        core.node_arguments = entry.arguments
-        core.log_exceptions = entry.log_exceptions
+        core.constructing = entry
         core.runners.append(getcurrent())
         greenlet(construct).switch()
-        core.node_arguments = []
-        core.log_exceptions = False
+        core.constructing = None
         return core.loop.stopped is None
 
     def _adopt(self, node: Any, name: str) -> None:

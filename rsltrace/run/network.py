@@ -28,16 +28,13 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
     delay = job.delay
     if delay is None:
         return None
-    topics = [NameRule(name, model_of(job, spec)) for name, spec in delay.topics.items()]
-    if delay.file is not None:
-        table = read_rslcpp(job.resolve(delay.file), job.shown(delay.file))
-        topics += [NameRule(name, model_of(job, spec)) for name, spec in table.items()]
     return NetworkPlan(
         links=tuple(
             LinkRule(spec.topic, spec.sender, spec.receiver, model_of(job, spec))
             for spec in delay.links
         ),
-        topics=tuple(topics),
+        topics=tuple(NameRule(name, model_of(job, s)) for name, s in delay.topics.items()),
+        table=_table(job, delay.file),
         services=tuple(NameRule(name, model_of(job, s)) for name, s in delay.services.items()),
         default=None if delay.default is None else model_of(job, delay.default),
         outages=tuple(
@@ -46,6 +43,17 @@ def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:
         ),
         seed=job.seed,
         start_ns=start_ns,
+    )
+
+
+def _table(job: Job, file: str | None) -> tuple[NameRule, ...]:
+    if file is None:
+        return ()
+    name = job.shown(file)
+    rows = read_rslcpp(job.resolve(file), name)
+    return tuple(
+        NameRule(topic, model_of(job, spec), f"{name}:{line}")
+        for topic, (line, spec) in rows.items()
     )
 
 

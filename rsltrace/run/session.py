@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -48,6 +48,7 @@ from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
+    from rsltrace.chance.network import NetworkPlan
     from rsltrace.ros.entry import Entry
     from rsltrace.ros.world import World
 
@@ -116,6 +117,7 @@ class Session:
         self._notes: tuple[str, ...]
         self._guarded: Guarding
         self._entries: list[Entry]
+        self._plan: NetworkPlan | None
 
     def __enter__(self) -> Session:
         """Open everything. Whatever can be known to be wrong is found before a file is made.
@@ -186,9 +188,9 @@ class Session:
         self.world = world = stack.enter_context(
             World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
-        plan = network_plan(job, self.start_ns)
-        if plan is not None:
-            world.use_network(plan)
+        self._plan = network_plan(job, self.start_ns)
+        if self._plan is not None:
+            world.use_network(self._plan)
         if isinstance(loop, OrderedLoop):
             with self._guarded.engaged():
                 world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
@@ -294,7 +296,9 @@ class Session:
         """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
         core = self.world.core
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None
-        rules = () if core.met is None else unused_rules(self.job, core.met, lasted_ns)
+        rules: Iterable[str] = ()
+        if core.met is not None:
+            rules = unused_rules(self.job, core.met, self._plan, lasted_ns)
         return (*rules, *unused_parameters(self.job, {**core.parameters, **parameters_of(core)}))
 
     def finish(self) -> RunResult:

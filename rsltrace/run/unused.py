@@ -10,27 +10,44 @@ import difflib
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 
-from rsltrace.chance.network import QUIET_TOPICS
+from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
 from rsltrace.job import Job, locate
 from rsltrace.job.problems import Loc
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
 from rsltrace.ros.met import Met, Parameters
+from rsltrace.run.guarding import entry_key
+from rsltrace.run.unused_remappings import has_remappings, unused_remappings
 
 
 def has_rules(job: Job) -> bool:
     """Say whether a job has rules that might fit nothing."""
     parts = (job.delay, job.execution, job.executors, job.policy, job.stop.topic)
-    return bool(any(part is not None for part in parts) or job.clocks)
+    return bool(
+        any(part is not None for part in parts)
+        or job.clocks
+        or has_remappings(job)
+        or any(_record_globs(job))
+    )
 
 
-def unused_rules(job: Job, met: Met, lasted_ns: int | None = None) -> Iterator[str]:
+def unused_rules(
+    job: Job, met: Met, plan: NetworkPlan | None, lasted_ns: int | None = None
+) -> Iterator[str]:
     """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
     topics = [*met.topics, *QUIET_TOPICS]
     nodes = list(met.nodes)
     for place, glob, names, what in _single(job, topics, list(met.services), nodes):
         if not _fits(glob, names):
             yield _note(job, place, what, glob, names)
+    for rule in plan.table if plan is not None else ():
+        if rule.name not in topics:
+            yield f"{rule.where}: no topic is called {rule.name!r}{_instead(rule.name, topics)}"
+    for place, glob in _record_globs(job):
+        names = [*topics, *met.services]
+        if not _fits(glob, names):
+            yield _note(job, place, "topic or service", glob, names)
+    yield from unused_remappings(job, met)
     yield from _links(job, met)
     yield from _entities(job, met)
     yield from _hidden(job, nodes)
@@ -45,11 +62,13 @@ def unused_rules(job: Job, met: Met, lasted_ns: int | None = None) -> Iterator[s
 
 
 def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
-    """Yield the parameters in ``parameters:`` of nodes that none of these has declared."""
+    """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared."""
     for index, spec in enumerate(job.nodes):
+        key = entry_key(spec, job.nodes[:index])
+        made = {node: found for node, found in nodes.items() if found.entry_key == key}
         for name in spec.parameters:
-            given = {node: found for node, found in nodes.items() if name in found.unused}
-            if not given or any(name in found.declared for found in nodes.values()):
+            given = {node: found for node, found in made.items() if name in found.unused}
+            if not given or any(name in found.declared for found in made.values()):
                 continue
             declared = [other for found in given.values() for other in found.declared]
             where = spec.origin or locate(job, ("nodes", index, "parameters", name))
@@ -83,6 +102,15 @@ def _single(
         yield ("clocks", index, "node"), clock.node, nodes, "node"
     if job.stop.topic is not None:
         yield ("stop", "topic", "name"), job.stop.topic.name, topics, "topic"
+
+
+def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
+    """Yield (place, glob) of what the trace keeps. A glob that begins with ``*`` is a habit, about
+    whatever there may be, here or in another job."""
+    for key, globs in (("topics", job.record.topics), ("exclude", job.record.exclude)):
+        for index, glob in enumerate(globs):
+            if not glob.startswith("*"):
+                yield ("record", key, index), glob
 
 
 def _links(job: Job, met: Met) -> Iterator[str]:
@@ -145,8 +173,11 @@ def _fits(glob: str, names: Iterable[str]) -> bool:
 
 
 def _note(job: Job, place: Loc, what: str, glob: str, names: list[str]) -> str:
-    near = _near(glob, names) or _there(names)
-    return f"{locate(job, place)}: no {what} fits {glob!r}{near}"
+    return f"{locate(job, place)}: no {what} fits {glob!r}{_instead(glob, names)}"
+
+
+def _instead(name: str, names: list[str]) -> str:
+    return _near(name, names) or _there(names)
 
 
 def _near(name: str, names: Iterable[str]) -> str:

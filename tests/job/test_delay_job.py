@@ -254,7 +254,9 @@ Topic Name               , Delay Type (FIXED/MEASURED), Fixed Delay_ms, Measured
 
 def test_rslcpps_table_of_fixed_delays(folder: Path) -> None:
     (folder / "d.csv").write_text(RSLCPP)
-    plan = network_plan(load("file: d.csv\ntopics: {/fixed_delay_2: 1ms}\n"), 0)
+    plan = network_plan(
+        load("file: d.csv\ntopics: {/fixed_delay_2: 1ms, '/*_1': 2ms}\ndefault: 3ms\n"), 0
+    )
     assert plan is not None
 
     def delay_of(topic: str) -> int:
@@ -262,10 +264,11 @@ def test_rslcpps_table_of_fixed_delays(folder: Path) -> None:
         assert link is not None
         return link.transmit(0)
 
-    assert [delay_of(t) for t in ("/fixed_delay_1", "/fixed_delay_2", "/fine")] == [
-        10 * MS,
-        MS,  # the job's own word comes first
+    assert [delay_of(t) for t in ("/fixed_delay_1", "/fixed_delay_2", "/fine", "/x")] == [
+        2 * MS,  # the job's own word comes first, in a glob, too
+        MS,
         250_000,
+        3 * MS,
     ]
 
 
@@ -275,7 +278,7 @@ def test_a_table_without_header_does_not_lose_its_first_line(folder: Path) -> No
     (folder / "d.csv").write_text("\n/b,FIXED,5,\n")  # the first line is empty
     plan = network_plan(load("file: d.csv\n"), 0)
     assert plan is not None
-    assert [rule.name for rule in plan.topics] == ["/b"]
+    assert [(rule.name, rule.where) for rule in plan.table] == [("/b", "d.csv:2")]
 
 
 @pytest.mark.parametrize(

@@ -95,3 +95,20 @@ def test_system_exit_is_never_only_logged(record_job: Any, policy: str) -> None:
         (JOB % policy).replace("Talker", "Talker\n    arguments: {period: 100}"), code
     )
     assert result.exit_code == 7
+
+
+def test_it_holds_for_nodes_that_are_made_after_a_wait(record_job: Any) -> None:
+    code = """
+from rclpy.duration import Duration
+
+def both():
+    first = Listener()
+    first.get_clock().sleep_for(Duration(seconds=0.1))
+    second = Node('second')
+    second.create_timer(1.0, lambda: 1 / 0)
+    return [first, second]
+"""
+    yaml = "nodes: [{node: nodes_under_test:both, on_exception: log}]\nstop: {duration: 2s}\n"
+    result = record_job(yaml, code)
+    assert result.error is None
+    assert result.end_ns == 2_000_000_000

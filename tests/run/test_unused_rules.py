@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -161,3 +162,91 @@ class Failing(Node):
     done = rsltrace("record", "job.yaml", "-o", "run.mcap")
     assert done.returncode == 0
     assert "note: job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n" in done.stderr
+
+
+def test_a_parameter_that_only_a_node_of_another_entry_declares_is_named(
+    record_job: Callable[..., Any],
+) -> None:
+    yaml = """\
+nodes:
+  - {node: nodes_under_test:Talker, parameters: {rate: 5.0}}
+  - {node: nodes_under_test:Robot, parameters: {rate: 5.0}}
+  - {node: nodes_under_test:both, parameters: {rate: 5.0}}
+stop: {duration: 1s}
+"""
+    code = """
+def both():
+    listener = Listener()
+    listener.get_clock().sleep_for(rclpy.duration.Duration(seconds=0.1))
+    robot = Node('second')
+    robot.declare_parameter('rate', 1.0)
+    assert robot.get_parameter('rate').value == 5.0
+    return [listener, robot]
+"""
+    result = record_job(yaml, NODES + "import rclpy.duration\n" + code, output=None)
+    assert result.error is None
+    (note,) = result.notes
+    assert "job.yaml:2:" in note
+    assert "/talker has not declared the parameter 'rate', so it has no effect" in note
+
+
+NAMES = """\
+nodes:
+  - node: nodes_under_test:Talker
+    remappings: {numbers: /nums, /tf: tf}
+  - node: nodes_under_test:Robot
+    remappings:
+      odom: /odometry
+      rosservice://reset: /again
+      robot:count: /counting
+  - node: nodes_under_test:Late
+    namespace: /ns
+    remappings: {late_topic: /later}
+ros_arguments: [-r, "late:late_service:=later_service", --remap, "__ns:=/everybody"]
+record:
+  topics: [/odometry, /later, '*/nobody', /counting/_action/send_goal]
+  exclude: [/rosout, '*/image_raw']
+delay: {file: delays.csv}
+stop: {duration: 1s}
+"""
+TABLE = "topic,kind,delay,skew\n/nums,FIXED,5,\n/later,FIXED,1.5,\n"
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("", "", "", ""),
+        ("job.yaml", "numbers: /n", "nubmers: /n", "nothing of /everybody/talker is called 'nub"),
+        ("job.yaml", "/tf: tf", "/ft: tf", "nothing of /everybody/talker is called '/ft'"),
+        ("job.yaml", "odom:", "odometry:", "nothing of /everybody/robot is called 'odometry', so"),
+        ("job.yaml", "rosservice://", "rostopic://", "nothing of /everybody/robot is called 'rost"),
+        ("job.yaml", "robot:count", "robt:count", "nothing of /everybody/robot is called 'robt:c"),
+        ("job.yaml", "late_topic: /l", "ate_topic: /l", "nothing of /everybody/late is called 'a"),
+        ("job.yaml", "late:late_s", "late:lat_s", "nothing of /everybody/talker, /everybody/robot"),
+        ("job.yaml", "/later, ", "/latr, ", "no topic or service fits '/latr'; did you mean '/la"),
+        ("job.yaml", "/rosout", "/camera/*", "no topic or service fits '/camera/*' (there are "),
+        ("delays.csv", "/nums", "/numbers", "no topic is called '/numbers'; did you mean '/nums'?"),
+    ],
+)
+def test_remappings_kept_topics_and_rows_of_a_delay_file(
+    record_job: Callable[..., Any], tmp_path: Path, file: str, old: str, new: str, message: str
+) -> None:
+    texts = {"job.yaml": NAMES, "delays.csv": TABLE}
+    line = 0
+    if file:
+        assert texts[file].count(old) == 1
+        line = texts[file][: texts[file].index(old)].count("\n") + 1
+        texts[file] = texts[file].replace(old, new)
+    (tmp_path / "delays.csv").write_text(texts["delays.csv"])
+    result = record_job(texts["job.yaml"], NODES, output=None)
+    assert result.error is None
+    if not file:
+        assert result.notes == ()
+        return
+    (told,) = [
+        told
+        for note in result.notes
+        for place, _, told in [note.partition(": ")]
+        if re.search(rf"/{file}:{line}\b", place)
+    ]  # what a topic was to be called is missing in other lines, too
+    assert told.startswith(message)

@@ -1,0 +1,76 @@
+"""Remappings of a job that remap nothing: no node has asked for the name that they replace.
+
+rcl itself is asked what a rule does to a name, so its forms (`~/x`, `node:x`, `rosservice://x`)
+mean here what they mean in a run.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+from rsltrace.job import Job, locate
+from rsltrace.job.problems import Loc, nearest
+from rsltrace.ros.arguments import RosArguments
+from rsltrace.ros.met import Asker, Met
+from rsltrace.run.guarding import entry_key
+
+_USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
+"""Launch files remap these for every node (to give robots trees of their own), used or not."""
+
+_ELSEWHERE = "/rsltrace/elsewhere"
+
+
+def has_remappings(job: Job) -> bool:
+    """Say whether a job has remappings that might remap nothing."""
+    return bool(job.ros_arguments) or any(spec.remappings for spec in job.nodes)
+
+
+def unused_remappings(job: Job, met: Met) -> Iterator[str]:
+    """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do."""
+    for index, spec in enumerate(job.nodes):
+        key = entry_key(spec, job.nodes[:index])
+        own = [asker for asker in met.asked if asker.entry_key == key]
+        for old in spec.remappings:
+            loc: Loc = ("nodes", index, "remappings", old)
+            if own and not _is_used(old, own, met):
+                yield f"{spec.origin or locate(job, loc)}: {_note(old, own, met)}"
+    everybody = list(met.asked)
+    for index, old in _rules(job.ros_arguments):
+        if not _is_used(old, everybody, met):
+            yield f"{locate(job, ('ros_arguments', index))}: {_note(old, everybody, met)}"
+
+
+def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
+    """Yield (index, name to be replaced) of the remappings among ROS arguments."""
+    for index, word in enumerate(words[1:], start=1):
+        if words[index - 1] in ("-r", "--remap"):
+            yield index, word.partition(":=")[0]
+
+
+def _is_used(old: str, askers: Iterable[Asker], met: Met) -> bool:
+    bare = old.rpartition(":")[2]
+    if bare.startswith("__") or bare in _USUAL:
+        return True
+    rule = RosArguments(["--ros-args", "-r", f"{old}:={_ELSEWHERE}"])
+    return any(
+        rule.remap_topic(name, asker.name, asker.namespace, None, service=service) == _ELSEWHERE
+        for asker in askers
+        for name, service in met.asked[asker]
+    )
+
+
+def _forms(name: str, asker: Asker) -> list[str]:
+    """Return how a rule may name what is called ``name`` in full."""
+    folder = asker.namespace.rstrip("/") + "/"
+    return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
+
+
+def _note(old: str, askers: list[Asker], met: Met) -> str:
+    names = [
+        form for asker in askers for name, _ in met.asked[asker] for form in _forms(name, asker)
+    ]
+    near = nearest(old, dict.fromkeys(names))
+    advice = f"; did you mean {near!r}?" if near else ""
+    who = ", ".join(f"{asker.namespace.rstrip('/')}/{asker.name}" for asker in askers[:3])
+    who += ", …" if len(askers) > 3 else ""
+    return f"nothing of {who or 'any node'} is called {old!r}, so nothing is remapped{advice}"
