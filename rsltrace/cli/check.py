@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,7 +57,8 @@ def check(
 
     The exit status is 0 if all is well, 1 if something in the graph looks wrong (QoS that keeps a
     publisher and a subscription apart, a subscription or a client without anybody at the other
-    end, a rule of the job that fits nothing), 2 if the job cannot run.
+    end, a topic that a bag plays and a node publishes, a rule of the job that fits nothing), 2 if
+    the job cannot run.
     """
     from rsltrace.run.checking import check_job
 
@@ -78,6 +80,8 @@ def check(
         for note in checked.notes:
             click.echo(f"rsltrace: note: {note}", err=True)
         click.echo("\n".join(map(printable, _text(checked.job, checked))))
+        if not checked.problems and launch is None and not overrides:
+            click.echo(f"next: rsltrace record {shlex.join(words)}", err=True)
     return 1 if checked.problems else 0
 
 

@@ -11,6 +11,7 @@ import click
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option(
     "--bag",
+    "-o",
     type=click.Path(path_type=Path),
     required=True,
     metavar="FOLDER",

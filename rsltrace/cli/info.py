@@ -68,7 +68,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
 def _short(value: str) -> str:
     """Return a value of metadata as it fits on a line; whole job files stand there, too."""
     text = printable(value)
-    return text if len(text) <= _VALUE_MAX else f"{len(text)} characters (see --json)"
+    return text if len(text) <= _VALUE_MAX else f"{len(text)} characters; --json shows them"
 
 
 _CUT_OFF = (

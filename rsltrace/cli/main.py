@@ -101,7 +101,9 @@ def cli() -> None:
     Two runs of one job do the same, down to the last bit: their traces have the same digest.
 
     \b
-    Start with a job.yaml that names your nodes (see examples/), then:
+    Start with a job.yaml that names your nodes:
+      rsltrace init --from FILE.py:CLASS      write a first one, from nodes and bags
+      rsltrace check job.yaml                 see what it means and who talks to whom
       rsltrace record job.yaml -o run.mcap    run it and write the trace
       rsltrace info run.mcap                  see what is in it
       rsltrace cat run.mcap | less            read every callback

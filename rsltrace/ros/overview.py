@@ -52,7 +52,8 @@ class NodeView:
 
 @dataclass(frozen=True, slots=True)
 class Overview:
-    """What there is once the nodes are constructed. ``waiting`` says what has not finished."""
+    """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
+    program that waits for work has)."""
 
     nodes: tuple[NodeView, ...]
     links: tuple[Link, ...]
@@ -75,7 +76,7 @@ def overview(core: Core, *, everything: bool = False) -> Overview:
     return Overview(
         nodes,
         tuple(links),
-        waiting=tuple(wait.waits_for() for wait in core.blocked),
+        waiting=tuple(wait.waits_for() for wait in core.blocked if not wait.is_patient()),
         problems=tuple(problem for link in links for problem in _problems(link)),
     )
 

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from rsltrace.bag.topic import BagTopic
     from rsltrace.ros.world import World
 
+PLAYER = "rosbag2_player"
+"""The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
 _ACTION = "/_action/"
 _SERVICE_EVENT = "/_service_event"
 
@@ -157,7 +159,7 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
     told: list[Any] = []
 
     def build() -> None:
-        player = Node("rosbag2_player", start_parameter_services=False, enable_rosout=False)
+        player = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
         publishers: dict[tuple[str, str], Any] = {}
         for entry in bags:
             ends = []

@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
+from rsltrace.run.bags import PLAYER
 from rsltrace.run.process import Observer
 from rsltrace.run.session import Session
 
 if TYPE_CHECKING:
     from rsltrace.ros.overview import Overview
+
+
+_OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_events"))
+"""Topics that many publish at once, whatever their namespace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +54,20 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.finish()
             raise error
         found = overview(session.world.core, everything=everything)
+        found = replace(found, problems=(*found.problems, *_played_and_published(found)))
         unused = session.unused()
         session.stop = Stop("checked")
         session.finish()
         return Checked(session.job, session.start_ns, found, tuple(notes), unused)
+
+
+def _played_and_published(found: Overview) -> Iterator[str]:
+    """Yield what a bag plays although a node makes it anew: its readers would get both."""
+    for link in found.of_kind("topic"):
+        nodes = list(dict.fromkeys(end.node for end in link.senders))
+        others = [node for node in nodes if node != f"/{PLAYER}"]
+        if len(others) < len(nodes) and others and link.name.rpartition("/")[2] not in _OF_MANY:
+            yield (
+                f"topic {link.name}: a bag plays it, and {', '.join(others)} publishes it, too; "
+                f"unless both are meant: bags: [{{path: ..., exclude: [{link.name}]}}]"
+            )

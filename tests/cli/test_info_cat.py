@@ -333,7 +333,7 @@ def test_nothing_of_a_trace_steers_the_terminal(tmp_path: Path) -> None:
     assert r"\x1b[31mred\x1b[0m\nsecond line\u202e\x07" in line
     assert "#3000000000" in line
     assert "#4000000000" in line
-    assert "5000 characters (see --json)" in output("info", path)
+    assert "5000 characters; --json shows them" in output("info", path)
 
 
 def test_printable_keeps_what_can_be_printed() -> None:

@@ -82,3 +82,14 @@ def test_the_document_shows_the_report_as_it_is() -> None:
     shown = document.split("<!-- sample: nondeterministic_callback -->\n```text\n")[1]
     report = (SAMPLES / "nondeterministic_callback" / "report.txt").read_text(encoding="utf-8")
     assert shown.startswith(f"{report}```\n")
+
+
+def test_the_readme_shows_lines_of_the_report_in_order() -> None:
+    readme = (SAMPLES.parent / "README.md").read_text(encoding="utf-8")
+    shown = readme.partition("$ rsltrace diff a.mcap b.mcap\n")[2].partition("```")[0]
+    folder = SAMPLES / "nondeterministic_callback"
+    report = iter((folder / "report.txt").read_text(encoding="utf-8").splitlines())
+    lines = [line for line in shown.splitlines() if line != "..."]
+    assert len(lines) > 10
+    for line in lines:
+        assert line in report, f"{line!r} is not in the report, or not in this order"

@@ -123,6 +123,38 @@ def test_a_job_in_which_nothing_is_wrong(rsltrace: Any, job_file: Callable[..., 
     assert (link["name"], link["senders"][0]["node"]) == ("/numbers", "/talker")
 
 
+MAIN = """
+import rclpy
+
+def main():
+    rclpy.init()
+    rclpy.spin(Talker())
+"""
+
+
+def test_a_main_that_spins_waits_for_nothing(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+    job_file("nodes: [{main: nodes_under_test:main}, {node: nodes_under_test:Listener}]\n", MAIN)
+    done = rsltrace("check", "job.yaml")
+    assert done.stdout.endswith("  ->  /listener\n\nnothing looks wrong\n")
+    assert done.stderr == "next: rsltrace record job.yaml\n"
+
+
+def test_a_topic_that_is_played_and_published(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+    job_file(FINE)
+    done = rsltrace("record", "job.yaml", "--set", "stop.duration=3s", "--bag", "numbers")
+    assert done.returncode == 0, done.stderr
+    job_file(FINE + "bags: [numbers]\n")
+    done = rsltrace("check", "job.yaml")
+    assert done.returncode == 1
+    assert done.stdout.endswith(
+        "to look at:\n"
+        "  topic /numbers: a bag plays it, and /talker publishes it, too; "
+        "unless both are meant: bags: [{path: ..., exclude: [/numbers]}]\n"
+    )
+    job_file(FINE + "bags: [{path: numbers, exclude: [/numbers]}]\n")
+    assert rsltrace("check", "job.yaml").returncode == 0
+
+
 @pytest.mark.parametrize(
     ("job", "expected"),
     [

@@ -7,6 +7,8 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from rsltrace_viewer.model import match
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.effects import effects_of
@@ -14,11 +16,13 @@ from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector import inspect
 from rsltrace_viewer.model.lanes import LaneMaker, Window
 from rsltrace_viewer.model.lines import Openness, Role
+from rsltrace_viewer.model.names import ShortNames
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.shown import FilteredRows
 from rsltrace_viewer.model.timeline import EventTexts, layout
 from rsltrace_viewer.model.times import parse_time
 from rsltrace_viewer.model.view import SingleView
+from rsltrace_viewer.screens.help import help_text
 
 from rsltrace.model.event import NO_EVENT
 
@@ -47,11 +51,30 @@ def test_wrap_keeps_every_word_and_no_line_is_too_wide() -> None:
     assert "".join("".join(lines).split()) == "".join(text.split())
 
 
+SHARED = ["/camera_pipeline_front/raw", "/camera_pipeline_rear/raw"]
+OF_TWO_ROBOTS = ["/robot_1/controller_manager", "/robot_2/controller_manager"]
+
+
+def test_names_are_cut_where_they_stay_distinct() -> None:
+    names = ShortNames([*SHARED, *OF_TWO_ROBOTS, "/a"])
+    assert [names.fit(name, 16) for name in SHARED] == ["/camera…ront/raw", "/camera…rear/raw"]
+    assert [names.fit(name, 12) for name in OF_TWO_ROBOTS] == ["/robot_1/co…", "/robot_2/co…"]
+    assert names.fit("/a", 5) == "/a   "
+    assert names.fit("/not/one/of/them", 8) == "/not/on…"
+
+
+@given(st.lists(st.text("/ab日本é_", max_size=16), max_size=8), st.integers(0, 12))
+def test_a_cut_name_has_the_width_it_should_have(words: list[str], width: int) -> None:
+    names = ShortNames(words)
+    for word in words:
+        assert cells(names.fit(word, width)) == width
+
+
 @pytest.mark.parametrize("width", [20, 40, 60, 80, 100, 120, 200])
 @pytest.mark.parametrize("signs", [False, True])
 def test_columns_never_exceed_the_width(run: Run, width: int, signs: bool) -> None:
     texts = EventTexts(run)
-    columns = layout(width, index_width=5, time_width=12, node_width=12, signs=signs)
+    columns = layout(width, index_width=5, time_width=12, node_width=12, names={}, signs=signs)
     row = columns.cells(texts.of(7))
     assert sum(cells(text) + 1 for _, text in row) <= width
     assert {"index", "mark"} <= {name for name, _ in row}
@@ -226,3 +249,12 @@ def test_times(text: str, ns: int) -> None:
 def test_what_is_no_time(text: str) -> None:
     with pytest.raises(ValueError, match="no time"):
         parse_time(text)
+
+
+@pytest.mark.parametrize("two", [False, True])
+def test_no_line_of_help_is_wider_than_its_column(two: bool) -> None:
+    # 130 cells for the box, 4 of them for its border: a line that is wrapped breaks both columns.
+    for width in (130, 200):
+        assert max(line.cell_length for line in help_text(width, two=two).split("\n")) <= 126
+    narrow = help_text(80, two=two).split("\n")
+    assert max(line.cell_length for line in narrow) <= 62

@@ -103,7 +103,7 @@ KEYS: tuple[Key, ...] = (
     ),
     Key("minus", "-", "zoom(-1)", "lanes: zoom out", LOOK),
     Key("0", "0", "zoom(0)", "lanes: the whole run", LOOK),
-    Key("z", "z", "maximise", "the current part over the whole screen, and back", LOOK),
+    Key("z", "z", "maximise", "this part over the whole screen, and back", LOOK),
     Key("p", "p", "plot", "plot fields, rates and latencies", LOOK, "plot", 13),
     Key("R", "R", "follow", "follow a file that is still recorded", LOOK),
     Key("d", "d", "theme", "dark or light", LOOK),

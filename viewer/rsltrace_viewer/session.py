@@ -19,6 +19,7 @@ from rsltrace_viewer.model.inspector import Effects, inspect
 from rsltrace_viewer.model.lanes import LaneMaker, Lanes, Window
 from rsltrace_viewer.model.lines import Line, Openness
 from rsltrace_viewer.model.match import Condition
+from rsltrace_viewer.model.names import ShortNames
 from rsltrace_viewer.model.query import parse
 from rsltrace_viewer.model.run import WITH_TOPIC, Run
 from rsltrace_viewer.model.shown import AllRows, FilteredRows, Rows
@@ -65,6 +66,7 @@ class Session:
         self._texts = {"a": EventTexts(a)}
         if b is not None:
             self._texts["b"] = EventTexts(b)
+        self._names = self._short_names()
         self.lane_maker = LaneMaker(a)
         self.window: Window = self.lane_maker.whole
         self._lanes: tuple[tuple[object, ...], Lanes] | None = None
@@ -93,6 +95,7 @@ class Session:
         """Show a newer state of the same recording. The old file is closed."""
         old, self.a = self.a, run
         self._texts["a"] = EventTexts(run)
+        self._names = self._short_names()
         self.view = SingleView(run.count)
         self.rows = AllRows(run.count)
         whole = self.window == self.lane_maker.whole
@@ -151,8 +154,15 @@ class Session:
             index_width=max(t.index_width for t in self._texts.values()),
             time_width=max(t.time_width for t in self._texts.values()),
             node_width=texts.node_width,
+            names=self._names,
             signs=self.b is not None,
         )
+
+    def _short_names(self) -> dict[str, ShortNames]:
+        return {
+            column: ShortNames(set[str]().union(*(t.names[column] for t in self._texts.values())))
+            for column in ("node", "entity")
+        }
 
     def row(self, row: int) -> tuple[EventText, Sign | None, bool, str]:
         """Return the event of a row in words, its sign, whether it is marked, its relation."""

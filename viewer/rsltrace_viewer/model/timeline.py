@@ -12,10 +12,12 @@ from rsltrace.model.event import Event, EventFlag, EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.names import ShortNames
 from rsltrace_viewer.model.run import KIND_WORDS, Run
 from rsltrace_viewer.model.text import LEVEL_WARN, log_of, outputs_text
 
 _ROWS_KEPT = 2048
+_NODE_WIDTH_MAX = 28
 GAP = 1
 """Cells between columns."""
 
@@ -68,6 +70,8 @@ class Columns:
     columns: tuple[Column, ...] = field(default=())
     micros: bool = False
     """Whether times are shown to the microsecond (cut, not rounded) for want of room."""
+    names: Mapping[str, ShortNames] = field(default_factory=dict, compare=False)
+    """By column, the names that may stand there: they are cut so that they stay distinct."""
 
     def header(self) -> str:
         """Return the line of titles."""
@@ -89,7 +93,12 @@ class Columns:
             "output": event.output_hash,
             "outputs": event.outputs,
         }
-        return [(c.name, fit(values[c.name], c.width, right=c.right)) for c in self.columns]
+        return [(c.name, self._fit(values[c.name], c)) for c in self.columns]
+
+    def _fit(self, text: str, column: Column) -> str:
+        if column.name in self.names:
+            return self.names[column.name].fit(text, column.width)
+        return fit(text, column.width, right=column.right)
 
 
 _TITLES = {
@@ -113,7 +122,10 @@ class EventTexts:
         self.index_width = max(len(str(max(run.count - 1, 0))), 5)
         self.time_width = len(format_seconds(run.end_ns))
         names = [run.node_name(e.id) for e in run.entities.values()]
-        self.node_width = min(max(map(len, names), default=5), 20)
+        self.node_width = min(max(map(len, names), default=5), _NODE_WIDTH_MAX)
+        entities = (_short(run.entity_name(e.id)) for e in run.entities.values())
+        self.names = {"node": set(names), "entity": set(entities)}
+        """What may stand in these columns."""
 
     def _of(self, index: int) -> EventText:
         """Return event ``index`` in words. Raises IndexError; damage is written into the row."""
@@ -156,13 +168,22 @@ def entity_of(run: Run, event: Event) -> str:
     """Return the name of what ran, without what the kind says already."""
     if event.entity == 0:
         return "constructor" if event.kind is EventKind.CONSTRUCT else ""
-    name = run.entity_name(event.entity)
+    return _short(run.entity_name(event.entity))
+
+
+def _short(name: str) -> str:
     # Timers are named after their callback: `Class._on_timer`. The node says the class.
     return name.rpartition(".")[2] if "." in name and not name.startswith("/") else name
 
 
 def layout(
-    width: int, *, index_width: int, time_width: int, node_width: int, signs: bool = False
+    width: int,
+    *,
+    index_width: int,
+    time_width: int,
+    node_width: int,
+    names: Mapping[str, ShortNames],
+    signs: bool = False,
 ) -> Columns:
     """Return the columns for a timeline of ``width`` cells. Narrow ones lose the least needed."""
     wanted = [Column("sign", 1)] if signs else []
@@ -186,4 +207,4 @@ def layout(
         spare -= 14
     if spare > 3:
         wanted.append(Column("outputs", spare - GAP))
-    return Columns(width, tuple(wanted), micros)
+    return Columns(width, tuple(wanted), micros, names)

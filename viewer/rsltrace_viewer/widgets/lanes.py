@@ -17,9 +17,10 @@ from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.lanes import Lane, Lanes
+from rsltrace_viewer.model.names import ShortNames
 
 _BLOCKS = " ▁▂▃▄▅▆▇█"
-_LABEL_MAX = 18
+_LABEL_MAX = 28
 
 
 class LanesView(Widget, can_focus=True):
@@ -65,6 +66,7 @@ class LanesView(Widget, can_focus=True):
         self._own = ""
         self._divergence: int | None = None
         self._label_width = 8
+        self._names = ShortNames(())
         self._styles: dict[str, Style] = {}
 
     @property
@@ -74,7 +76,9 @@ class LanesView(Widget, can_focus=True):
 
     def fit_labels(self, labels: list[str], width: int) -> None:
         """Make room for the names of the lanes in ``width`` cells."""
-        longest = max((cells(printable(label)) for label in labels), default=4)
+        shown = [printable(label) for label in labels]
+        longest = max(map(cells, shown), default=4)
+        self._names = ShortNames(shown)
         self._label_width = max(4, min(longest, _LABEL_MAX, width // 6))
 
     def show(self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None) -> None:
@@ -173,7 +177,7 @@ class LanesView(Widget, can_focus=True):
 
     def _lane(self, lane: Lane, width: int) -> Strip:
         own = lane.label == self._own
-        label = fit(printable(lane.label), self._label_width)
+        label = self._names.fit(printable(lane.label), self._label_width)
         pieces = [
             Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))
         ]
