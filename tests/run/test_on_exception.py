@@ -111,4 +111,5 @@ def both():
     yaml = "nodes: [{node: nodes_under_test:both, on_exception: log}]\nstop: {duration: 2s}\n"
     result = record_job(yaml, code)
     assert result.error is None
-    assert result.end_ns == 2_000_000_000
+    assert result.end_ns == 1_100_000_000  # it has raised
+    assert result.stop_reason == "duration of 2.000000000 s"
