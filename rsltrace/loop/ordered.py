@@ -13,6 +13,7 @@ from heapq import heappop
 from typing import Any
 
 from rsltrace.errors import RunError
+from rsltrace.loop.choices import Choices
 from rsltrace.loop.loop import Dispatchable, EventLoop
 from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy
 from rsltrace.loop.timer import TimerState
@@ -89,6 +90,8 @@ class OrderedLoop(EventLoop):
         self.policy: Policy = Fifo()
         self.place: Callable[[Dispatchable], Place]
         self.charge = Charge()
+        self.choices: Choices | None = None
+        """What the policy has chosen so far, where somebody wants to know."""
         self._held: dict[object, None] = {}
         self._ready = _Waiting(lambda item: self.place(item), self._runs)
         self._tasks = _Waiting(lambda item: self.place(item), self._runs)
@@ -135,6 +138,8 @@ class OrderedLoop(EventLoop):
             return None
         moment = Moment(self.now_ns, self.events)
         choice = self._chosen([place.candidate for place in places], moment)
+        if self.choices is not None and len(places) > 1:
+            self.choices.add(choice)
         place = places[choice]
         if choice < len(waiting):
             for index, other in enumerate(self._ready.places):

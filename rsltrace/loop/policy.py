@@ -7,15 +7,12 @@ write one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple, Protocol
 
 from rsltrace.chance.stream import Stream
-from rsltrace.errors import RunError
-from rsltrace.model.event import EventKind
-from rsltrace.model.stamp import format_seconds
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,53 +111,3 @@ class Permutation:
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         return self._below(len(ready)) if len(ready) > 1 else 0
-
-
-class RecordedEvent(NamedTuple):
-    """One event of the recording: when, of which kind, and what ran (id, and name for people)."""
-
-    stamp_ns: int
-    kind: int
-    entity_id: int
-    name: str
-
-
-_TASKS = (int(EventKind.TASK), int(EventKind.RESUME))
-
-
-class Recorded:
-    """The order of a recording, event by event.
-
-    ``event`` returns the recording's event of an index, or None after its end; from there on it is
-    first come, first served.
-
-    :raises RunError: from ``choose``, if what the recording has next cannot run now.
-    """
-
-    def __init__(self, event: Callable[[int], RecordedEvent | None], name: str) -> None:
-        self._event = event
-        self._name = name
-
-    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        expected = self._event(moment.events)
-        if expected is None:
-            return 0
-        if expected.kind not in _TASKS:
-            for index, candidate in enumerate(ready):
-                if candidate.entity_id == expected.entity_id and has_work(candidate.item):
-                    return index
-        for index, candidate in enumerate(ready):
-            if not has_work(candidate.item):
-                return index  # what is left of a message that its queue has dropped
-        names = ", ".join(f"{c.node}: {c.kind} {c.entity}" for c in ready[:5])
-        raise RunError(
-            f"the recorded order of {self._name} cannot be followed: its event {moment.events} is "
-            f"{expected.name} at {format_seconds(expected.stamp_ns)} s, but here at "
-            f"{format_seconds(moment.now_ns)} s ready are {names}. Nodes, job or input differ from "
-            "those of the recording; `rsltrace diff` of the two traces shows where"
-        )
-
-
-def has_work(item: Any) -> bool:
-    """Whether something would happen: not if a full queue has dropped the message it stood for."""
-    return bool(getattr(item, "queue", True)) and not getattr(item, "destroyed", False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
+from rsltrace.loop.recorded import THE_RUN, described
 from rsltrace.model.entity import Entity, EntityKind
 
 if TYPE_CHECKING:
@@ -44,14 +45,18 @@ class Met:
         """(node, name) of all that may have a callback: topic, service, a timer's callback."""
         self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
+        self.described: dict[int, str] = {0: THE_RUN}
+        """Every entity as in ``described``, by its id."""
 
     def add(self, entity: Entity) -> None:
         """Remember an entity; its node comes before it."""
         if entity.kind is EntityKind.NODE:
             self._names[entity.id] = entity.name
+            self.described[entity.id] = described(entity, entity.name)
             self.nodes[entity.name] = None
             return
         node = self._names.get(entity.node, "")
+        self.described[entity.id] = described(entity, node)
         self.entities[node, entity.name] = None
         if entity.kind in _SERVICES:
             self.services[entity.name] = None

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.chance.stream import Stream
-from rsltrace.errors import JobError, TraceError
+from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.loop.policy import (
     Fifo,
@@ -17,13 +14,10 @@ from rsltrace.loop.policy import (
     Priority,
     PriorityRule,
     RateMonotonic,
-    Recorded,
-    RecordedEvent,
 )
-from rsltrace.model.event import EventKind
+from rsltrace.loop.recorded import Recorded
 from rsltrace.run.network import distribution_of
 from rsltrace.run.target import load_target
-from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
     from rsltrace.ros.scheduling import SchedulingPlan
@@ -36,10 +30,10 @@ def is_ordered(job: Job) -> bool:
     return not fifo or job.executors is not None or job.execution is not None
 
 
-def scheduling_plan(job: Job, start_ns: int, stack: ExitStack) -> SchedulingPlan:
-    """Return the plan of a job. A recording that it follows stays open as long as ``stack``.
+def scheduling_plan(job: Job, start_ns: int, recorded: Recorded | None) -> SchedulingPlan:
+    """Return the plan of a job. ``recorded`` is the order that it follows, if it says so.
 
-    :raises JobError: if the recording cannot be read, or the policy's class cannot be made.
+    :raises JobError: if the policy's class cannot be made.
     """
     from rsltrace.ros.scheduling import ExecutionRule, ExecutorRule, SchedulingPlan
 
@@ -52,7 +46,7 @@ def scheduling_plan(job: Job, start_ns: int, stack: ExitStack) -> SchedulingPlan
         if job.execution.default is not None:
             rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
     return SchedulingPlan(
-        policy=_policy(job, stack),
+        policy=recorded or _policy(job),
         executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
         occupies=job.executors is not None or job.execution is not None,
         execution=tuple(rules),
@@ -61,7 +55,7 @@ def scheduling_plan(job: Job, start_ns: int, stack: ExitStack) -> SchedulingPlan
     )
 
 
-def _policy(job: Job, stack: ExitStack) -> Policy:
+def _policy(job: Job) -> Policy:
     spec = job.policy
     if spec is None or spec.order == "fifo":
         return Fifo()
@@ -72,42 +66,7 @@ def _policy(job: Job, stack: ExitStack) -> Policy:
     if spec.priority is not None:
         rules = [PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in spec.priority]
         return Priority(rules)
-    if spec.recorded is not None:
-        return _recorded(job, job.resolve(spec.recorded), stack)
     return _own(job, spec.function)
-
-
-def _recorded(job: Job, path: Path, stack: ExitStack) -> Policy:
-    where = locate(job, ("policy", "recorded"))
-    try:
-        trace = stack.enter_context(Trace.open(path))
-        trace.check()
-    except TraceError as error:
-        raise JobError(str(error), where=where) from None
-    events = _events(trace)
-    seen: list[RecordedEvent] = []
-
-    def event(index: int) -> RecordedEvent | None:
-        while len(seen) <= index:
-            following = next(events, None)
-            if following is None or following.kind == EventKind.SHUTDOWN:
-                return None
-            seen.append(following)
-        return seen[index]
-
-    return Recorded(event, path.name)
-
-
-def _events(trace: Trace) -> Iterator[RecordedEvent]:
-    names = {}
-    for entity in trace.entities.values():
-        node = trace.node_of(entity).name if entity.node else ""
-        names[entity.id] = f"{node}: {entity.kind.label} {entity.name}"
-    for rows in trace.events():
-        for stamp, kind, entity_id in zip(
-            rows["stamp"].tolist(), rows["kind"].tolist(), rows["entity"].tolist(), strict=True
-        ):
-            yield RecordedEvent(stamp, kind, entity_id, names.get(entity_id, "the run"))
 
 
 def _own(job: Job, function: Any) -> Policy:

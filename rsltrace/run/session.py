@@ -39,6 +39,7 @@ from rsltrace.run.inputs import check_output
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
+from rsltrace.run.recorded_order import following, keep_choices, note_choices
 from rsltrace.run.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.unused import has_rules, unused_parameters, unused_rules
@@ -50,6 +51,7 @@ from rsltrace.trace.writer import TraceWriter
 if TYPE_CHECKING:
     from rsltrace.chance.network import NetworkPlan
     from rsltrace.ros.entry import Entry
+    from rsltrace.ros.following import Following
     from rsltrace.ros.world import World
 
 
@@ -118,6 +120,7 @@ class Session:
         self._guarded: Guarding
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
+        self._following: Following | None
 
     def __enter__(self) -> Session:
         """Open everything. Whatever can be known to be wrong is found before a file is made.
@@ -191,11 +194,13 @@ class Session:
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
-        if isinstance(loop, OrderedLoop):
-            with self._guarded.engaged():
-                world.use_scheduling(loop, scheduling_plan(job, self.start_ns, stack))
-        world.use_clocks(clocks_of(job), self.start_ns)
         world.core.met = Met() if has_rules(job) else None
+        self._following = following(job, world.core, stack)
+        if isinstance(loop, OrderedLoop):
+            recorded = None if self._following is None else self._following.order
+            with self._guarded.engaged():
+                world.use_scheduling(loop, scheduling_plan(job, self.start_ns, recorded))
+        world.use_clocks(clocks_of(job), self.start_ns)
 
     def _import_what_is_named(self) -> None:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
@@ -223,6 +228,7 @@ class Session:
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
         writer.add_metadata(METADATA_SOURCES, sources(job))
         self._guarded.trace_begins(recorder, self.loop.now_ns)
+        note_choices(self.loop)
         if job.stop.size is not None:
             self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
 
@@ -310,12 +316,15 @@ class Session:
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
         unused = self.unused(lasted=True) if self.world.error is None else ()
+        if self._following is not None and self.world.error is None:
+            unused = (*self._following.notes(), *unused)
         with self._engaged():
             self.world.destroy()
         error = self.world.error
         exit_code = error.exit_code if error else stop.exit_code or self.world.exit_code
         if self._writer is not None:
             self._guarded.write(self._writer)
+            keep_choices(self._writer, loop)
             self._writer.close(
                 result={
                     "start_time": str(self.start_ns),
