@@ -20,7 +20,8 @@ from contextlib import ExitStack, contextmanager
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
-from rsltrace.guard.callers import module_of, user_frame
+from rsltrace.guard.callers import user_frame
+from rsltrace.guard.environment import environment_watched
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.model.finding import Mode, Source
@@ -329,74 +330,8 @@ def watching() -> Iterator[None]:
         database: Any = sqlite3.connect
         stack.callback(Redirected(database, _connecting(copy_of(database))).restore)
         stack.callback(Redirected(hash, _hashing(copy_of(hash))).restore)  # type: ignore[arg-type]
-        _environment(stack)
+        stack.enter_context(environment_watched())
         yield
-
-
-def _environment(stack: ExitStack) -> None:
-    """Report reads of ``os.environ``, which is a Python class: its methods are exchanged."""
-    kind: Any = type(os.environ)
-    for method in ("__getitem__", "__iter__"):
-        stack.callback(setattr, kind, method, kind.__dict__[method])
-        setattr(kind, method, _reading(method, kind.__dict__[method]))
-
-
-_NOT_READ = ("PYTHON", "ROS_PYTHON_CHECK_FIELDS")
-"""What Python looks at for itself, and what every class of messages does when it is imported."""
-
-_LAYS_OUT = {"os", "_collections_abc", "collections.abc", "shutil", "locale", "gettext", "argparse"}
-
-_SECRET = re.compile("key|token|secret|pass|credential|auth", re.IGNORECASE)
-
-
-def _reading(method: str, real: Callable[..., Any]) -> Any:
-    def read(self: Any, *arguments: Any) -> Any:
-        guard = engaged()
-        if guard is None or self is not os.environ or str(*arguments).startswith(_NOT_READ):
-            return real(self, *arguments)
-        frame = sys._getframe(1)
-        if _lays_out_help(frame):
-            return real(self, *arguments)
-        if method == "__iter__":
-            guard.watched(Source.ENVIRONMENT, "os.environ", f"{len(self)} variables", frame)
-            return real(self)
-        call = f"os.environ[{arguments[0]!r}]"
-        if (
-            guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD
-            and user_frame(frame, guard.packages) is not None
-        ):
-            held: Any = self
-            kept = guard.recorded(
-                Source.ENVIRONMENT, call, lambda: held._data.get(held.encodekey(*arguments)), frame
-            )
-            if kept is None:
-                raise KeyError(*arguments)
-            return self.decodevalue(kept)
-        try:
-            value = real(self, *arguments)
-        except KeyError:
-            guard.watched(Source.ENVIRONMENT, call, "not set", frame)
-            raise
-        guard.watched(Source.ENVIRONMENT, call, _shown(str(arguments[0]), value), frame)
-        return value
-
-    return read
-
-
-def _lays_out_help(frame: FrameType | None) -> bool:
-    """Whether argparse wants the terminal's width and language, which no node looks at."""
-    while frame is not None and (module := module_of(frame)) in _LAYS_OUT:
-        if module == "argparse":
-            return True
-        frame = frame.f_back
-    return False
-
-
-def _shown(name: str, value: str) -> str:
-    """Return a variable's value as evidence; of one that may be a secret, only a hash."""
-    if _SECRET.search(name) or len(value) > 200:
-        return f"SHA-256 {hashlib.sha256(os.fsencode(value)).hexdigest()[:16]}"
-    return repr(value)
 
 
 def text_with_address(text: str) -> None:

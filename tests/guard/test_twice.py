@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 
+from rsltrace.guard.watch import watching
+
 pytestmark = pytest.mark.ros
 
 NODE = """
@@ -36,6 +38,16 @@ class Other(Node):
     def __init__(self):
         super().__init__("other")
         self.create_timer(0.05, lambda: self.get_logger().info(tempfile.mktemp()))
+"""
+
+READS = """
+import os
+from rclpy.node import Node
+
+class Reader(Node):
+    def __init__(self):
+        super().__init__("reader")
+        self.create_timer(0.1, lambda: os.environ.get("NOTHING"))
 """
 
 LIBRARY = """
@@ -158,6 +170,30 @@ def test_a_folder_for_temporary_files_that_somebody_chose_stays(
     with installed():
         assert tempfile.gettempdir() == str(tmp_path)
     assert tempfile.tempdir == str(tmp_path)
+
+
+def test_reads_of_the_environment_are_met_however_many_runs_there_were(tmp_path: Path) -> None:
+    pytest.importorskip("rclpy")
+    from rsltrace import Job, NodeSpec, StopSpec, record
+    from rsltrace.guard.install import installed
+
+    kind = type(os.environ)
+    for _ in range(600):  # Python 3.13 trusts what it has cached after 1000 changes of a class
+        with watching():
+            assert not os.environ.get("NOTHING")
+        assert not any(os.environ.get("NOTHING") for _ in range(3))
+    (tmp_path / "cold.py").write_text(READS)
+    job = Job(
+        nodes=[NodeSpec(node="cold:Reader")],
+        search_path=[tmp_path],
+        stop=StopSpec(duration="0.2s"),
+    )
+    found = record(job, tmp_path / "run.mcap").guarded
+    assert [(met.call, met.count) for met in found] == [("os.environ['NOTHING']", 2)]
+    assert type(os.environ) is kind
+    with pytest.raises(ZeroDivisionError), installed():
+        raise ZeroDivisionError
+    assert type(os.environ) is kind
 
 
 OWN = """
