@@ -46,7 +46,14 @@ class SetupError(RsltraceError):
 
 
 class BagError(RsltraceError):
-    """A rosbag2 recording that cannot be read or played."""
+    """A rosbag2 recording that cannot be read or played.
+
+    ``glob`` is that of the topics to play which fits none.
+    """
+
+    def __init__(self, message: str, *, glob: str | None = None) -> None:
+        super().__init__(message)
+        self.glob = glob
 
 
 class TraceError(RsltraceError):

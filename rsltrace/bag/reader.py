@@ -13,7 +13,7 @@ from types import TracebackType
 from rsltrace.bag.files import ZSTD_MAGIC, BagFiles, open_files
 from rsltrace.bag.mcap_chunk import PUBLISH_TIME_BYTES
 from rsltrace.bag.merge import Message, Piece, merge
-from rsltrace.bag.select import select_topics
+from rsltrace.bag.select import select_topics, unmatched
 from rsltrace.bag.storage import Extent, Storage, StoredTopic
 from rsltrace.bag.topic import BagTopic
 from rsltrace.errors import BagError
@@ -29,12 +29,14 @@ class Bag:
     topics in the order of the recording. ``recording_start_ns`` and ``recording_end_ns`` are the
     log times of the first and last message of the whole recording; ``start_ns`` is that of the
     first message that plays. Log times are integer nanoseconds. ``notes`` say what is missing from
-    the recording, ``skipped`` are the topics that never play.
+    the recording, ``skipped`` are the topics that never play, ``excluded_nothing`` the globs of
+    ``exclude`` that fit no topic.
     """
 
     path: Path
     notes: tuple[str, ...]
     skipped: tuple[str, ...]
+    excluded_nothing: tuple[str, ...]
     storage_id: str
     topics: tuple[BagTopic, ...]
     recording_start_ns: int
@@ -161,6 +163,7 @@ class Bag:
         everything = [topic for storage in self._files.storages for topic in storage.topics]
         skipped = [topic for topic in everything if self._skip is not None and self._skip(topic)]
         self.skipped = tuple(dict.fromkeys(topic.name for topic in skipped))
+        self.excluded_nothing = unmatched(exclude, [topic.name for topic in everything])
         names = [topic.name for topic in everything if topic.name not in self.skipped]
         selected = select_topics(names, globs, exclude, str(self.path))
         merged: dict[tuple[str, str, str], BagTopic] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 
@@ -17,9 +18,10 @@ def select_topics(
     ``topics`` matches nothing, or nothing is left.
     """
     there_are = f"the bag has {', '.join(sorted(set(names))) or 'no topics'}"
-    for glob in topics:
-        if not any(fnmatchcase(name, glob) for name in names):
-            raise BagError(f"{bag}: no topic matches {glob!r}: {there_are}")
+    for glob in unmatched(topics, names):
+        close = difflib.get_close_matches(glob, names, n=1)
+        hint = f"did you mean {close[0]!r}?" if close else there_are
+        raise BagError(f"{bag}: no topic matches {glob!r}: {hint}", glob=glob)
     selected = {
         name
         for name in names
@@ -29,3 +31,8 @@ def select_topics(
     if not selected:
         raise BagError(f"{bag}: every topic is excluded: {there_are}")
     return selected
+
+
+def unmatched(globs: Sequence[str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the globs that match none of the names."""
+    return tuple(g for g in globs if not any(fnmatchcase(name, g) for name in names))

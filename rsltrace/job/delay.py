@@ -113,8 +113,10 @@ class OutageSpec(Part):
     def _one_thing(self) -> OutageSpec:
         if sum(name is not None for name in (self.topic, self.service, self.node)) != 1:
             raise Problem("give one of topic, service or node")
-        if self.to_ns <= self.from_ns:
+        if self.to_ns < self.from_ns:
             raise Problem("the outage ends before it begins", ("to",))
+        if self.to_ns == self.from_ns:
+            raise Problem("the outage ends when it begins: 'to' has to be later", ("to",))
         return self
 
     @property

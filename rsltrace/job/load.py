@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from rsltrace.errors import JobError
 from rsltrace.job.compose import Composition, compose
 from rsltrace.job.job import Job
-from rsltrace.job.model import file_fields
+from rsltrace.job.model import file_fields, keys_with
 from rsltrace.job.part import FROM_FILE
 from rsltrace.job.problems import Problem, format_loc, problems_of, unknown_key
 from rsltrace.job.tree import Item, Place, YamlSource, place_at, plain
@@ -24,7 +24,7 @@ Overrides = Sequence["str | tuple[str, str]"]
 FREE_PREFIX = "x-"
 """Keys of a job that begin so mean nothing: a place for YAML anchors, as in other formats."""
 
-SIZE_MAX = 16 << 20
+SIZE_MAX = 4 << 20
 """A job file of more bytes is something else."""
 
 
@@ -66,7 +66,8 @@ def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides
         if key in job_keys:
             values[key] = value
         elif key not in composing and not str(key).startswith(FREE_PREFIX):
-            problems.append(unknown_key(key, [*job_keys, *sorted(composing)], ()))
+            below = keys_with(Job, str(key))
+            problems.append(unknown_key(key, [*job_keys, *sorted(composing)], (), below=below))
     values["base_dir"] = base_dir
     values["source_name"] = name
     if composed.is_plain:

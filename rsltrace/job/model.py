@@ -28,6 +28,15 @@ def models_in(annotation: Any) -> list[type[BaseModel]]:
     return []
 
 
+def keys_with(model: type[BaseModel], key: str) -> list[str]:
+    """Return the keys of a model whose parts have a key of that name."""
+    return [
+        own
+        for own, field in file_fields(model)
+        if any(key == name for part in models_in(field.annotation) for name, _ in file_fields(part))
+    ]
+
+
 def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
     """Return the field that governs the value at ``loc``, or None below free-form values."""
     models, found = [model], None
@@ -63,6 +72,15 @@ def without_alternatives(
     chosen = [set(group) for group in alternatives if given & set(group)]
     gone = {key for group in alternatives for key in group if chosen} - set().union(*chosen)
     return {key: value for key, value in values.items() if key not in gone}
+
+
+def is_list_at(model: type[BaseModel], loc: Loc) -> bool:
+    """Say whether the value at ``loc`` is a list and nothing else."""
+    field = field_at(model, loc) if loc else None
+    if field is None or field is field_at(model, loc[:-1]):
+        return False  # free-form values, or an entry of a list or mapping
+    kinds = [kind for kind in get_args(field.annotation) if get_origin(kind) is tuple]
+    return get_origin(field.annotation) is tuple or bool(kinds)
 
 
 def attached(field: FieldInfo, name: str) -> Any:

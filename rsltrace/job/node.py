@@ -172,6 +172,11 @@ class NodeSpec(Part):
 
     ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
 
+    @staticmethod
+    def meant_key(word: str) -> str:
+        """Return the key that text in place of an entry was meant for."""
+        return "executable" if "/" in word and ":" not in word else "node"
+
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
         description="What to construct: `module:Class`, a Node subclass, or `module:function`, "

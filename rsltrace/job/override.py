@@ -10,7 +10,7 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.job.model import shorthand_at, without_alternatives
+from rsltrace.job.model import is_list_at, shorthand_at, without_alternatives
 from rsltrace.job.problems import Loc, describe
 from rsltrace.job.tree import Item, Place, YamlSource
 from rsltrace.job.yaml_source import Mark, parse_yaml
@@ -34,7 +34,7 @@ class _Step:
 def apply_override(root: Item, label: str, override: str, *, folder: str) -> Item:
     """Return the job with ``override`` (``path=value``) applied; ``label`` names it in messages.
 
-    The value is YAML; null (or nothing) takes the key away. List entries are given by index, by
+    The value is YAML; null takes the key away. List entries are given by index, by
     a node's name, or as ``+`` for a new one at the end. Paths start at ``folder``.
     """
     shown = YamlSource(label, override, folder, is_option=True)
@@ -43,6 +43,9 @@ def apply_override(root: Item, label: str, override: str, *, folder: str) -> Ite
         raise steps[0].place.error(
             f"{steps[0].text}: is read before the command line is: write it in the job file"
         )
+    if not override[at:].strip():
+        # A shell variable without a value must not take a stop condition away.
+        raise shown.error("there is no value after '=': null takes the key away", Mark(1, at))
     source = parse_yaml(override[at:], label, folder=folder, option=override)
     value = source.root or Item(None, steps[-1].place)
     if value.value is None:
@@ -83,6 +86,9 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
     step = steps[0]
     if item is None or item.value is None:
         starts_list = not step.quoted and step.text == _APPEND
+        if not step.quoted and step.text.isdecimal() and is_list_at(_job(), loc):
+            name = ".".join(map(str, loc))
+            raise step.place.error(f"{name} has no entries yet: write {name}.+ for a new one")
         item = Item([] if starts_list else {}, step.place, step.place)
     inner: Any = item.value
     if is_shorthand(inner) and (key := shorthand_at(_job(), loc)) is not None:

@@ -7,9 +7,12 @@ Validators raise ``Problem`` (a ``ValueError``, so pydantic collects it with its
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 from pydantic import BaseModel, ValidationError
+
+_VARIABLE = re.compile(r"\$\{?([A-Za-z_][A-Za-z0-9_]*)\}?")
 
 Loc = tuple["str | int", ...]
 """A place in a job as keys and list indices: ``("nodes", 0, "name")``."""
@@ -66,8 +69,16 @@ def nearest(word: str, names: Iterable[str]) -> str | None:
     return next(iter([*swapped, *close]), None)
 
 
-def unknown_key(key: object, valid: Iterable[str], loc: Loc) -> Problem:
-    """Return the finding that ``key``, below ``loc``, is none of the ``valid`` keys."""
+_BY_NAME = ("topics", "nodes")
+"""Keys below which names stand as keys."""
+
+
+def unknown_key(
+    key: object, valid: Iterable[str], loc: Loc, *, below: Iterable[str] = ()
+) -> Problem:
+    """Return the finding that ``key``, below ``loc``, is none of the ``valid`` keys; ``below`` are
+    those of them that have such a key."""
+    below = list(below)
     names = list(valid)
     inside = f" in {format_loc(loc)}" if loc else ""
     text = str(key)
@@ -77,6 +88,10 @@ def unknown_key(key: object, valid: Iterable[str], loc: Loc) -> Problem:
         advice = f"put a blank after the colon: '{glued}: {value.strip()}'"
     elif near:
         advice = f"did you mean {near!r}?"
+    elif text.startswith("/") and (part := next((n for n in _BY_NAME if n in names), None)):
+        advice = f"names of {part} go below '{part}:'"
+    elif below:
+        advice = f"it goes below {' or '.join(f'{key!r}' for key in below)}"
     else:
         advice = f"valid keys are {', '.join(names)}"
     shown = repr(key) if isinstance(key, str) else describe(key).removeprefix("the number ")
@@ -133,7 +148,10 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
         cause = entry.get("ctx", {}).get("error")
         if isinstance(cause, (Problem, Problems)):
             items = cause.items if isinstance(cause, Problems) else [cause]
-            found += [_named(item.message, loc + item.loc, at_key=item.at_key) for item in items]
+            hint = _as_variable(entry["input"])
+            found += [
+                _named(item.message + hint, loc + item.loc, at_key=item.at_key) for item in items
+            ]
         elif entry["type"] == "extra_forbidden":
             found.append(unknown_key(loc[-1], _keys_at(model, loc[:-1]), loc[:-1]))
         elif entry["type"] == "missing" and loc in meant:
@@ -143,6 +161,7 @@ def problems_of(error: ValidationError, model: type[BaseModel]) -> list[Problem]
             found.append(Problem(f"{inside}the key '{loc[-1]}' is missing", loc))
         else:
             text = _wording(entry["type"], entry["msg"], cause, entry["input"])
+            text += _as_variable(entry["input"])
             is_part = entry["type"].startswith("model_") and not isinstance(cause, ValueError)
             if is_part and isinstance(entry["input"], (str, int, float, list, tuple)):
                 keys = _keys_at(model, loc)
@@ -181,6 +200,12 @@ def as_flag(value: object) -> str:
     return "; write false" if word in ("no", "off", "n", "false") else ""
 
 
+def _as_variable(value: object) -> str:
+    """Say how to write an environment variable, if a shell would take a text for one."""
+    found = _VARIABLE.search(value) if isinstance(value, str) else None
+    return f"; an environment variable is $(env {found[1]})" if found else ""
+
+
 def _as_part(value: object, models: list[type[BaseModel]]) -> str:
     """Say how to write what was meant: ``stop: 60s`` is ``{duration: 60s}``."""
     for inner in models:
@@ -189,6 +214,8 @@ def _as_part(value: object, models: list[type[BaseModel]]) -> str:
             values = ", ".join(f"{k}: {_written(v)}" for k, v in zip(keys, value, strict=True))
             return f"; write {{{values}}}"
         key: str | None = getattr(inner, "MEANT", None)
+        if hasattr(inner, "meant_key") and isinstance(value, str):
+            key = inner.meant_key(value)
         wanted = (list, tuple) if getattr(inner, "MEANT_LIST", False) else (str, int, float)
         if key is not None and isinstance(value, wanted) and not isinstance(value, bool):
             return f"; write {{{key}: {_written(value)}}}"

@@ -11,7 +11,7 @@ from rsltrace.job.distribution import DistributionSpec, named, shorthand
 from rsltrace.job.names import check_node_glob
 from rsltrace.job.node import Target, check_callable_target, check_path
 from rsltrace.job.part import Part, attach, check, from_file, items, one_of, parts, text, whole
-from rsltrace.job.problems import Problem, describe
+from rsltrace.job.problems import Problem, describe, nearest
 
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
@@ -136,6 +136,13 @@ def policy_part() -> BeforeValidator:
             example = PolicySpec.model_fields[value].examples or [None]
             shown = json.dumps({value: example[0]}).replace('"', "")
             raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
+        if isinstance(value, str) and value not in ORDERS:
+            near = nearest(value, [*ORDERS, *PolicySpec.ONE_OF])
+            hint = f"; did you mean {near}?" if near else ""
+            raise Problem(
+                f"expected {' or '.join(ORDERS)}, or a mapping with "
+                f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
+            )
         return {"order": value} if isinstance(value, str) else value
 
     return BeforeValidator(attach(validate, shorthand="order"))

@@ -28,6 +28,8 @@ UNITS_NS = {
 _TIME_TEXT = re.compile(
     r"\s*([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?)\s*([A-Za-zµμ]*)\s*"
 )
+_COMMA = re.compile(r"\s*([0-9]+),([0-9]+ ?[A-Za-z]*)\s*")
+_CLOCK = re.compile(r"\s*([0-9]{1,6}):([0-5][0-9])\s*")
 _MICRO = re.compile("[µμ]")  # the sign, and the Greek letter
 _WORDS = {
     "ns": ("nsec", "nsecs", "nanosecond", "nanoseconds"),
@@ -120,7 +122,7 @@ def format_time(time_ns: int) -> str:
 def _parse_text(text: str) -> int:
     match = _TIME_TEXT.fullmatch(text)
     if match is None:
-        raise ValueError(f"{_EXPECTED}, got {text!r}")
+        raise ValueError(f"{_EXPECTED}, got {text!r}{_otherwise(text)}")
     number, unit = match.groups()
     unit = _MICRO.sub("u", unit)
     if not unit:
@@ -130,6 +132,16 @@ def _parse_text(text: str) -> int:
         hint = f"write '{number}{meant}'" if meant else f"units are {', '.join(UNITS_NS)}"
         raise ValueError(f"unknown unit {unit!r} in {text!r}; {hint}")
     return _exact(number, UNITS_NS[unit], text.strip())
+
+
+def _otherwise(text: str) -> str:
+    """Say how to write a decimal comma, or minutes and seconds."""
+    comma, clock = _COMMA.fullmatch(text), _CLOCK.fullmatch(text)
+    if comma is not None:
+        return f"; write {comma[1]}.{comma[2]}"
+    if clock is not None:
+        return f"; write {60 * int(clock[1]) + int(clock[2])}s"
+    return ""
 
 
 def _exact(number: str, unit_ns: int, shown: str, *, rounded: bool = False) -> int:

@@ -269,6 +269,9 @@ _ADVICE = {
     "expected ',' or": "a bracket is not closed, or a comma is missing",
     "could not find expected ':'": "there is no ': ' after this key",
     "found unexpected end of stream": "a quote is not closed",
+    "found character '@'": "quote a text that begins with '@'",
+    "found character '%'": "quote a text that begins with '%'",
+    "found character '`'": "quote a text that begins with '`'",
     "found undefined alias": "quote a text that begins with '*'",
 }
 """What to do about the parser's commonest complaints, by how they begin."""

@@ -91,6 +91,14 @@ def hint_for(error: BaseException) -> str:
     return f"\n  {where_to_get(package)}" if _is_interface(package, line) else ""
 
 
+def parameter_in(error: BaseException | None) -> str | None:
+    """Return the name of the parameter whose value an exception of rclpy is about, if it is."""
+    if not type(error).__name__.startswith("InvalidParameter"):
+        return None
+    found = re.search(r"\bparameter '([^']+)'", str(error))
+    return found[1] if found is not None else None
+
+
 def _as_double(said: str) -> str:
     """Say how to write the commonest parameter of a wrong type."""
     found = re.search(r"to '(-?[0-9]+)' of type 'INTEGER', expecting type 'DOUBLE'", said)

@@ -61,7 +61,10 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
             skip=never_plays,
         )
     except BagError as error:
-        raise BagError(f"{locate(job, ('bags', index, 'path'))}: {error}") from error
+        loc: tuple[str | int, ...] = ("bags", index, "path")
+        if error.glob in spec.topics:
+            loc = ("bags", index, "topics", spec.topics.index(error.glob or ""))
+        raise BagError(f"{locate(job, loc)}: {error}") from error
     with opened as bag:
         _check_names(job, index, bag)
         yield BagInput(
@@ -109,8 +112,14 @@ def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
 
 def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
     """Yield what somebody should know about the bags: what is missing, what does not play."""
-    for entry in bags:
+    for index, entry in enumerate(bags):
         yield from entry.bag.notes
+        for number, glob in enumerate(entry.spec.exclude):
+            if glob in entry.bag.excluded_nothing and not glob.startswith("*"):
+                yield (
+                    f"{locate(job, ('bags', index, 'exclude', number))}: {entry.spec.path} has no "
+                    f"topic {glob!r}, so nothing is left out for it"
+                )
         begin_ns = entry.playback.start_ns
         if job.start_ns is not None and begin_ns < job.start_ns:
             yield (

@@ -34,7 +34,7 @@ from rsltrace.run.bags import (
 from rsltrace.run.clocks import clocks_of
 from rsltrace.run.entries import hook_entries, node_entries
 from rsltrace.run.executables import why_not
-from rsltrace.run.guarding import Guarding, guarding
+from rsltrace.run.guarding import Guarding, entry_key, guarding
 from rsltrace.run.inputs import check_output
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
@@ -272,11 +272,24 @@ class Session:
             core.fed = bool(self._bags)
             for entry in self._entries:
                 if not self.world.construct(entry):
+                    self._say_where(entry)
                     break
             if not self.ended:
                 start_players(self.world, self.job, self._bags)
             if not self.ended:
                 self.world.jump(self.start_ns)
+
+    def _say_where(self, entry: Entry) -> None:
+        """Add the line of the job to the error of a constructor that refused a parameter."""
+        from rsltrace.ros.hints import parameter_in
+
+        error = self.world.error
+        name = parameter_in(None if error is None else error.__cause__)
+        for index, spec in enumerate(self.job.nodes):
+            if entry_key(spec, self.job.nodes[:index]) == entry.key and name in spec.parameters:
+                where = spec.origin or locate(self.job, ("nodes", index, "parameters", name or ""))
+                assert error is not None
+                error.args = (f"{error}\n  the job gives it at {where}",)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""

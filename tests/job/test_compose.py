@@ -278,7 +278,7 @@ def test_every_key_can_be_set(folder: Path) -> None:
             "bags.+=other_bag",
             "stop.topic=/done",
             "stop.topic.exit_code=data",
-            "stop.events=",
+            "stop.events=null",
             "seed=null",
         ],
     )
@@ -318,7 +318,13 @@ def test_every_key_can_be_set(folder: Path) -> None:
         ),
         ("seed.x=1", 6, "seed is the number 3: there is nothing below it to set"),
         ("stop={duration: 1s", 19, None),
-        ("timer_ties=", 1, "no value is given, and timer_ties has none to take away"),
+        ("timer_ties=null", 1, "no value is given, and timer_ties has none to take away"),
+        ("stop.events=", 12, "there is no value after '=': null takes the key away"),
+        (
+            "record.topics.0=/a",
+            15,
+            "record.topics has no entries yet: write record.topics.+ for a new one",
+        ),
         ("bags.0.path=nowhere", 13, "bags[0].path: 'nowhere': there is no such bag"),
     ],
 )

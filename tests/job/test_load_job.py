@@ -234,8 +234,8 @@ def test_an_empty_file(text: str) -> None:
 
 
 def test_a_file_too_large_to_be_a_job() -> None:
-    Path("job.yaml").write_bytes(b" " * ((16 << 20) + 1))
-    with pytest.raises(JobError, match="larger than 16 MiB: this is not a job file"):
+    Path("job.yaml").write_bytes(b" " * ((4 << 20) + 1))
+    with pytest.raises(JobError, match="larger than 4 MiB: this is not a job file"):
         load_job("job.yaml")
 
 
@@ -459,7 +459,7 @@ GOLDEN = {
     "a node as text": (
         "nodes: [my_nodes:Talker]\n",
         """
-        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard
+        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard; write {node: my_nodes:Talker}
             1 | nodes: [my_nodes:Talker]
               |         ^
         """,  # noqa: E501
@@ -769,3 +769,11 @@ def test_aliases_cannot_blow_up_a_small_file() -> None:
 def test_deep_nesting_is_an_error_not_a_crash() -> None:
     text = "\n".join(" " * depth + "a:" for depth in range(1000))
     assert message(text) == "job.yaml: the values are nested too deeply"
+
+
+def test_text_in_place_of_a_node_is_shown_as_one(tmp_path: Path) -> None:
+    path = tmp_path / "job.yaml"
+    for text, key in (("robot:Ekf", "node"), ("demo_nodes_py/talker", "executable")):
+        path.write_text(f"nodes: [{text}]\n")
+        with pytest.raises(JobError, match=rf"job.yaml:1:9: .*; write {{{key}: {text}}}"):
+            load_job(path)

@@ -81,8 +81,8 @@ def test_clocks() -> None:
     [
         (
             "policy: fifoo",
-            "job.yaml:2:9: policy.order: expected fifo or rate_monotonic or permutation, got text "
-            "'fifoo'; did you mean fifo?",
+            "job.yaml:2:9: policy: expected fifo or rate_monotonic or permutation, or a mapping "
+            "with priority or recorded or function, got text 'fifoo'; did you mean fifo?",
         ),
         (
             "policy: {order: fifo, recorded: job.yaml}",

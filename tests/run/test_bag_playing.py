@@ -173,10 +173,17 @@ class Late(Node):
 @pytest.mark.parametrize("key", ["remappings: {/m: /x}", "qos: {/m: {depth: 1}}"])
 def test_a_name_that_does_not_play_is_shown_in_the_job(play: Any, tmp_path: Path, key: str) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(2))
-    with pytest.raises(BagError, match=r"job\.yaml:1:\d+: \S+a\.mcap: no topic matches '/m'"):
+    with pytest.raises(BagError, match=r"job\.yaml:1:32: \S+a\.mcap: no topic matches '/m'"):
         play("bags: [{path: a.mcap, topics: [/m]}]")
     with pytest.raises(BagError, match=r"job\.yaml:1:\d+: a\.mcap plays no topic '/m'.* /n$"):
         play(f"bags: [{{path: a.mcap, {key}}}]")
+
+
+def test_a_glob_that_excludes_nothing_is_noted(play: Any, tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a.mcap", numbers(2))
+    play("bags: [{path: a.mcap, exclude: ['*/image', /m]}]")
+    (note,) = play.notes
+    assert note.endswith("job.yaml:1:44: a.mcap has no topic '/m', so nothing is left out for it")
 
 
 def test_bags_are_merged_by_time_and_then_by_their_order_in_the_job(

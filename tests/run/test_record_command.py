@@ -284,7 +284,9 @@ def test_the_trace_has_the_job_as_it_ran(rsltrace: Any, job_file: Any, tmp_path:
     """What an override changed is in the trace's job, which loads as the job that ran."""
     job_file("nodes: [{node: nodes_under_test:Talker, name: a}]\nstop: {duration: 9s}\n")
     command = ("record", "job.yaml", "-o", "run.mcap", "--seed", "4", "--until", "3")
-    done = rsltrace(*command, "--set", "nodes.a.arguments.period=0.5", "--set", "stop.duration=")
+    done = rsltrace(
+        *command, "--set", "nodes.a.arguments.period=0.5", "--set", "stop.duration=null"
+    )
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
         text, resolved = trace.job_text, json.loads(trace.job["resolved"])
@@ -292,7 +294,7 @@ def test_the_trace_has_the_job_as_it_ran(rsltrace: Any, job_file: Any, tmp_path:
     assert text.startswith(
         "# The effective job of job.yaml\n"
         "#   with --set nodes.a.arguments.period=0.5\n"
-        "#   with --set stop.duration=\n"
+        "#   with --set stop.duration=null\n"
         "#   with --seed seed=4\n"
         '#   with --until stop.time="3s"\n'
     )

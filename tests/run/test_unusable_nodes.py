@@ -105,7 +105,10 @@ def test_a_parameter_file_that_rcl_cannot_read(
 def test_an_integer_for_a_parameter_with_a_decimal_point(record_job: Callable[..., Any]) -> None:
     more = "arguments: {rate: 3}\n    parameters: {gain: 2}"
     text = told(record_job, "nodes_under_test:Needy", more, NodeError)
-    assert text.endswith("  write 2.0: ROS takes no integer for a parameter with a decimal point")
+    lines = text.splitlines()
+    assert lines[-2] == "  write 2.0: ROS takes no integer for a parameter with a decimal point"
+    assert lines[-1].startswith("  the job gives it at ")
+    assert lines[-1].endswith("job.yaml:4:24")
 
 
 @pytest.mark.parametrize(
