@@ -115,7 +115,10 @@ class Channel:
         return delay_ns
 
     def _troubled(self, now_ns: int) -> int:
-        """Return the delay over a link that may lose, duplicate or be cut off."""
+        """Return the delay over a link that may lose, duplicate or be cut off.
+
+        What is lost has its delay drawn, too, so that losses leave the delays of others alone.
+        """
         self.duplicate_ns = self.held_until_ns = -1
         waited_ns = 0
         for _ in range(_ATTEMPTS_MAX):
@@ -123,6 +126,7 @@ class Channel:
             end_ns = self._cut_off_until(sent_ns)
             if end_ns is not None:
                 if not self._reliable:
+                    self._delay(sent_ns)
                     return LOST_OUTAGE
                 self.held_until_ns = end_ns
                 waited_ns = end_ns - now_ns
@@ -131,9 +135,11 @@ class Channel:
             if not lost:
                 break
             if not self._reliable:
+                self._delay(sent_ns)
                 return lost
             waited_ns += self._model.retransmit_ns
         else:
+            self._delay(sent_ns)
             return lost
         model = self._model
         if model.duplicate > 0.0 and self._duplicate() < model.duplicate:
