@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.errors import BagError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.stop import Stop
-from rsltrace.model.stamp import format_seconds
-from rsltrace.run.stopping import has_stop
+from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
+from rsltrace.run.stopping import end_ns_of, has_stop
 
 if TYPE_CHECKING:
     from rsltrace.bag import Bag
@@ -28,6 +28,8 @@ PLAYER = "rosbag2_player"
 """The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
 _ACTION = "/_action/"
 _SERVICE_EVENT = "/_service_event"
+_LONG_GAP_NS = 3600 * NS_PER_S
+"""No robot is silent for so long in the middle of a run: the bags are from different days."""
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,26 @@ def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
                     f"{entry.spec.path}: recorded {what} are not played: {', '.join(names)} (only "
                     "topics play; what a server answers, its node must answer again)"
                 )
+    yield from _apart(job, bags)
+
+
+def _apart(job: Job, bags: list[BagInput]) -> Iterator[str]:
+    """Yield the bags that were recorded at another time than what plays before them."""
+    start_ns = start_ns_of(job, bags)
+    run_ends_ns = end_ns_of(job, start_ns)
+    until_ns: int | None = start_ns
+    for entry in sorted(bags, key=lambda entry: entry.playback.start_ns):
+        begin_ns = entry.playback.start_ns
+        gap_ns = 0 if until_ns is None else begin_ns - until_ns
+        begins = f"{entry.spec.path}: begins at {format_seconds(begin_ns)} s, "
+        if run_ends_ns is not None and begin_ns > run_ends_ns:
+            end = f"after the end of the run ({format_seconds(run_ends_ns)} s)"
+            yield f"{begins}{end}: nothing of it plays; move it with at"
+        elif gap_ns > _LONG_GAP_NS:
+            gap = f"{format_duration(gap_ns)} after everything before it has played"
+            yield f"{begins}{gap}, and simulated time passes until then; move it with at"
+        end_ns = entry.playback.end_ns
+        until_ns = None if until_ns is None or end_ns is None else max(until_ns, end_ns)
 
 
 def start_ns_of(job: Job, bags: list[BagInput]) -> int:

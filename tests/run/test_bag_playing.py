@@ -179,6 +179,24 @@ def test_a_name_that_does_not_play_is_shown_in_the_job(play: Any, tmp_path: Path
         play(f"bags: [{{path: a.mcap, {key}}}]")
 
 
+def test_bags_of_different_days_are_noted(play: Any, tmp_path: Path) -> None:
+    day = 86_400 * S
+    write_mcap(tmp_path / "a.mcap", numbers(2))
+    write_mcap(tmp_path / "b.mcap", [(t + day, p + day, n, m) for t, p, n, m in numbers(2)])
+    play("bags: [b.mcap, a.mcap]")
+    assert play.notes == [
+        "b.mcap: begins at 86410.000000000 s, 86399 s after everything before it has played, and "
+        "simulated time passes until then; move it with at"
+    ]
+    play("{bags: [b.mcap, a.mcap], stop: {duration: 1h}}")
+    assert play.notes == [
+        "b.mcap: begins at 86410.000000000 s, after the end of the run (3610.000000000 s): nothing "
+        "of it plays; move it with at"
+    ]
+    play("bags: [{path: b.mcap, at: 12s}, a.mcap]")
+    assert play.notes == []
+
+
 def test_a_glob_that_excludes_nothing_is_noted(play: Any, tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(2))
     play("bags: [{path: a.mcap, exclude: ['*/image', /m]}]")
