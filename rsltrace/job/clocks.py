@@ -65,6 +65,7 @@ class JumpSpec(Part):
     """A clock is set: by so much, at some time."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
+    LISTED: ClassVar[tuple[str, ...]] = ("at", "by")
 
     at_ns: Annotated[int, check(parse_time)] = Field(
         alias="at", description="When, since the start of the run.", examples=["5s"]

@@ -118,8 +118,10 @@ _OTHER_WORDS = {
     "workers": ("threads",),
     "file": ("path", "filename", "csv"),
     "path": ("file", "bag", "uri"),
-    "from": ("start", "begin", "since"),
-    "to": ("end", "until", "stop"),
+    "from": ("start", "begin", "since", "sender", "publisher", "source", "src"),
+    "to": ("end", "until", "stop", "receiver", "subscriber", "subscription", "destination", "dst"),
+    "permutation": ("random", "shuffle", "shuffled"),
+    "rate_monotonic": ("rm", "rms"),
     "at": ("time", "when"),
     "by": ("size", "jump"),
 }

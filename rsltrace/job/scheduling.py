@@ -11,7 +11,7 @@ from rsltrace.job.distribution import DistributionSpec, named, shorthand
 from rsltrace.job.names import check_node_glob
 from rsltrace.job.node import Target, check_callable_target, check_path
 from rsltrace.job.part import Part, attach, check, from_file, items, one_of, parts, text, whole
-from rsltrace.job.problems import Problem, describe, nearest
+from rsltrace.job.problems import Problem, describe, meant_by, nearest
 
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
@@ -137,7 +137,8 @@ def policy_part() -> BeforeValidator:
             shown = json.dumps({value: example[0]}).replace('"', "")
             raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
         if isinstance(value, str) and value not in ORDERS:
-            near = nearest(value, [*ORDERS, *PolicySpec.ONE_OF])
+            word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
+            near = meant_by(word, names) or nearest(word, names)
             hint = f"; did you mean {near}?" if near else ""
             raise Problem(
                 f"expected {' or '.join(ORDERS)}, or a mapping with "

@@ -266,6 +266,7 @@ _ADVICE = {
     "expected <block end>": "check the indentation: this does not line up with what is above",
     "found character '\\t'": "indent with spaces, not tabs",
     "but found another document": "a job file holds one document, without '---' in between",
+    "expected the node content": "a value is missing, or a bracket is not closed",
     "expected ',' or": "a bracket is not closed, or a comma is missing",
     "could not find expected ':'": "there is no ': ' after this key",
     "found unexpected end of stream": "a quote is not closed",

@@ -280,16 +280,21 @@ class Session:
                 self.world.jump(self.start_ns)
 
     def _say_where(self, entry: Entry) -> None:
-        """Add the line of the job to the error of a constructor that refused a parameter."""
+        """Add to the error of a constructor the line of the job at which the parameter stands that
+        it refused, or the node, if there are several that are made in the same way."""
         from rsltrace.ros.hints import parameter_in
 
-        error = self.world.error
-        name = parameter_in(None if error is None else error.__cause__)
-        for index, spec in enumerate(self.job.nodes):
-            if entry_key(spec, self.job.nodes[:index]) == entry.key and name in spec.parameters:
-                where = spec.origin or locate(self.job, ("nodes", index, "parameters", name or ""))
-                assert error is not None
-                error.args = (f"{error}\n  the job gives it at {where}",)
+        job, error = self.job, self.world.error
+        for index, spec in enumerate(job.nodes):
+            if error is None or entry_key(spec, job.nodes[:index]) != entry.key:
+                continue
+            name = parameter_in(error.__cause__)
+            if name in spec.parameters:
+                place = spec.origin or locate(job, ("nodes", index, "parameters", name or ""))
+                error.args = (f"{error}\n  the job gives it at {place}",)
+            elif sum(other.target == spec.target for other in job.nodes) > 1:
+                place = spec.origin or locate(job, ("nodes", index))
+                error.args = (f"{error}\n  the job names it at {place}",)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""

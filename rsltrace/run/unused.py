@@ -39,7 +39,11 @@ def unused_rules(
     nodes = list(met.nodes)
     for place, glob, names, what in _single(job, topics, list(met.services), nodes):
         if not _fits(glob, names):
-            yield _note(job, place, what, glob, names)
+            other, others = ("topics", topics) if what == "service" else ("services", met.services)
+            if what != "node" and _fits(glob, others):
+                yield f"{locate(job, place)}: {glob!r} fits {other} only: name it as such"
+            else:
+                yield _note(job, place, what, glob, names)
     for rule in plan.table if plan is not None else ():
         if rule.name not in topics:
             yield f"{rule.where}: no topic is called {rule.name!r}{_instead(rule.name, topics)}"

@@ -126,3 +126,12 @@ def test_a_field_that_no_exit_status_can_come_from(
     result = record_job("nodes: [{node: nodes_under_test:Talker}]\n" + stop, NODES, output=None)
     assert result.exit_code == 3
     assert f"job.yaml:2:43: stop.topic.exit_code: {message}" in str(result.error)
+
+
+def test_which_of_several_alike_could_not_be_made(record_job: Callable[..., Any]) -> None:
+    yaml = "nodes:\n  - node: nodes_under_test:Talker\n  - node: nodes_under_test:Talker\n"
+    error = record_job(yaml, NODES, output=None).error
+    first, *_, last = str(error).splitlines()
+    assert first.startswith("there is already a node named /talker")
+    assert last.startswith("  the job names it at ")
+    assert last.endswith("job.yaml:3:5")
