@@ -45,6 +45,7 @@ _REAL_NS = {
 }
 
 _monotonic_ns = _REAL_NS["monotonic"]
+_real_gettime_ns = copy_of(time.clock_gettime_ns)  # type: ignore[arg-type]
 
 
 def clock_call(
@@ -53,8 +54,9 @@ def clock_call(
     call: str,
     virtual: Callable[[int], Any],
     real: Callable[[], Any],
+    real_ns: Callable[[], int] | None = None,
 ) -> Any:
-    """Answer the reading of a clock as the job says."""
+    """Answer the reading of a clock as the job says; ``real_ns`` is read if it is recorded."""
     module = frame.f_globals.get("__name__")
     if module in REAL_TIME_MODULES:
         if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
@@ -71,7 +73,8 @@ def clock_call(
     if mode is Mode.ALLOW:
         return real()
     if mode is Mode.RECORD:
-        real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
+        if real_ns is None:
+            real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
         return virtual(guard.recorded(Source.CLOCK, call, real_ns, frame))
     value = real()
     guard.found(Source.CLOCK, mode, call, value, frame)
@@ -105,7 +108,14 @@ def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[...,
         value = real(*arguments)  # raises for a clock that does not exist
         if guard is None:
             return value
-        return clock_call(guard, sys._getframe(1), f"time.{name}()", virtual, lambda: value)
+        return clock_call(
+            guard,
+            sys._getframe(1),
+            f"time.{name}()",
+            virtual,
+            lambda: value,
+            lambda: _real_gettime_ns(*arguments),
+        )
 
     return read
 

@@ -8,7 +8,6 @@ did.
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from collections import Counter
 from collections.abc import Callable
@@ -268,9 +267,3 @@ class engage:  # noqa: N801  (used like a function)
             _engaged[:] = self._before
         else:
             _engaged.remove(self._guard)
-
-
-def caller(depth: int = 2) -> FrameType:
-    """Return the frame of whoever called the function that calls this one."""
-    frame: Any = sys._getframe(depth)
-    return frame  # type: ignore[no-any-return]

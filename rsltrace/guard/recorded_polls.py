@@ -12,7 +12,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 from rsltrace.guard.descriptors import number_of
@@ -75,12 +75,7 @@ class RecordedPoll:
     def __enter__(self) -> RecordedPoll:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        where: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._real.close()
 
     def register(self, fd: Any, eventmask: int | None = None) -> None:

@@ -251,7 +251,8 @@ def recorded_sockets() -> Iterator[None]:
             ("_accept", _accepting),
         ]
         for name, make in makers:
-            stack.callback(delattr, kind, name)
+            put_back = partial(setattr, kind, name, vars(kind).get(name))
+            stack.callback(put_back if name in vars(kind) else partial(delattr, kind, name))
             setattr(kind, name, make(getattr(kind, name)))
         tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
         memory = ssl.MemoryBIO

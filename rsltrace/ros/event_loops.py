@@ -65,16 +65,17 @@ class SimSelector:
     def _step(self, for_ns: int | None) -> bool:
         """Wait in simulated time; return whether something woke the loop."""
         stack_is_thread = self._core.is_thread
-        is_woken = wait(
-            self._core,
-            "something to do in its asyncio loop",
-            until=self._keep,
-            for_ns=for_ns,
-            quiet=True,
-            patient=lambda: self._blocked is not None and stack_is_thread(self._blocked.stack),
-        )
-        self._blocked = None
-        return is_woken
+        try:
+            return wait(
+                self._core,
+                "something to do in its asyncio loop",
+                until=self._keep,
+                for_ns=for_ns,
+                quiet=True,
+                patient=lambda: self._blocked is not None and stack_is_thread(self._blocked.stack),
+            )
+        finally:
+            self._blocked = None
 
     def _costs_time(self) -> bool:
         rounds = self._rounds

@@ -55,6 +55,20 @@ def test_real_clocks_and_real_chance_are_given_again(go: Callable[..., Any]) -> 
     assert go(code, guard, "once more", replay=again.path).digest == first.digest
 
 
+def test_each_real_clock_is_itself_when_it_is_recorded(go: Callable[..., Any]) -> None:
+    code = node_code(
+        "near = lambda a, b: abs(a - b) < 100\n"
+        "good = [near(time.clock_gettime(time.CLOCK_MONOTONIC), time.monotonic()),\n"
+        "    near(time.clock_gettime_ns(time.CLOCK_REALTIME) / 1e9, time.time()),\n"
+        "    near(time.clock_gettime(time.CLOCK_PROCESS_CPUTIME_ID), time.process_time())]\n"
+        "assert all(good), good",
+        imports="import time",
+    )
+    first = go(code, "{clock: record}", "first")
+    assert first.error is None
+    assert go(code, "{clock: record}", "again", replay=first.path).digest == first.digest
+
+
 def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
     code = node_code(
         "start = time.perf_counter()\nsum(range(1000))\nself.say(time.perf_counter() - start)",

@@ -159,6 +159,21 @@ def test_what_the_standard_library_remembers_is_put_back() -> None:
     assert names._get_default_tempdir is finder
 
 
+def test_what_somebody_has_made_of_sockets_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    import socket
+
+    from rsltrace.guard.install import installed
+
+    def connect(self: object, address: object) -> None:
+        raise AssertionError("no network in tests")
+
+    monkeypatch.setattr(socket.socket, "connect", connect)
+    members = dict(vars(socket.socket))
+    with installed():
+        assert socket.socket.connect is not connect
+    assert dict(vars(socket.socket)) == members
+
+
 def test_a_folder_for_temporary_files_that_somebody_chose_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
