@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
@@ -55,10 +55,10 @@ class Recorded:
 
     ``event`` returns the recording's event of an index, or None after its end; from there on it is
     first come, first served. Entities are the same if their names are: ``name_of`` returns the name
-    of one of this run, by its id. ``choices`` are what the recording's own policy chose, where it
-    could. With them the run is the recording's as long as it does the same, which whoever ends the
-    events has to look at (``ros/following.py``). Without them (the recording was cut off) what has
-    no event of its own, see ``choices.py``, runs as it comes.
+    of one of this run, by its id. ``chosen`` chooses as the recording's own policy did: then the
+    run is the recording's as long as it does the same, which whoever ends the events has to look at
+    (``ros/following.py``). Where nobody knows what it chose (None) the events are all there is, and
+    what has none of its own, see ``choices.py``, runs as it comes.
 
     :raises RunError: from ``choose``, if what the recording has next cannot run now.
     """
@@ -67,16 +67,16 @@ class Recorded:
         self,
         file: str,
         event: Callable[[int], RecordedEvent | None],
-        choices: Iterator[int] | None,
+        chosen: Callable[[Sequence[Candidate], Moment], int | None] | None,
         name_of: Callable[[int], str | None],
     ) -> None:
         self.file = file
         self.event = event
         self.name_of = name_of
-        self._choices = choices
+        self._chosen = chosen
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        chosen = self._next_choice() if len(ready) > 1 else 0
+        chosen = None if self._chosen is None else self._chosen(ready, moment)
         expected = self.event(moment.events)
         if expected is None:
             return 0
@@ -103,14 +103,13 @@ class Recorded:
 
     def cannot_follow(self, index: int, expected: RecordedEvent, here: str) -> RunError:
         """Return the error that this run does not do what the recording did."""
+        why = "Nodes, job or input differ from those of the recording"
+        if self._chosen is None:
+            why += ", or its events are not enough: what its policy chose is not in it (cut off?)"
         return RunError(
             f"the recorded order of {self.file} cannot be followed: its event {index} is "
-            f"{expected}, but {here}. Nodes, job or input differ from those of the recording; "
-            "`rsltrace diff` of the two traces shows where"
+            f"{expected}, but {here}. {why}; `rsltrace diff` of the two traces shows where"
         )
-
-    def _next_choice(self) -> int | None:
-        return None if self._choices is None else next(self._choices, None)
 
     def _is(self, candidate: Candidate, expected: RecordedEvent) -> bool:
         goes_on = candidate.kind == "resume"

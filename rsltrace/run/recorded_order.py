@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
-from contextlib import ExitStack
-from itertools import repeat
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.loop.choices import Choices, decoded
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
-from rsltrace.loop.policy import Fifo
+from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
 from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
 from rsltrace.model.event import EventKind
+from rsltrace.run.scheduling import of_order, own_policy
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -42,7 +42,7 @@ def following(job: Job, core: Core, stack: ExitStack) -> Following | None:
     met = core.met
     assert met is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
-    order = Recorded(file, _Events(trace).event, _choices(trace), met.described.get)
+    order = Recorded(file, _Events(trace).event, _chosen(trace), met.described.get)
     return Following(core, order, is_whole=trace.complete)
 
 
@@ -75,15 +75,30 @@ def keep_choices(writer: TraceWriter, loop: EventLoop) -> None:
         writer.add_attachment(ATTACHMENT_CHOICES, "application/octet-stream", data)
 
 
-def _choices(trace: Trace) -> Iterator[int] | None:
-    """Return what the recording's policy has chosen, None if that is not known."""
+def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:
+    """Return what chooses as the recording's policy did, None if nobody knows.
+
+    A recording that was cut off has no choices; its policy, made again, makes the same ones.
+    """
     data = trace.attachment(ATTACHMENT_CHOICES)
     if data is not None:
-        return decoded(data)
-    policy = json.loads(trace.job.get("resolved", "null") or "null")
-    policy = policy.get("policy") if isinstance(policy, dict) else None
-    is_fifo = policy is None or policy.get("order") == "fifo"
-    return repeat(0) if is_fifo else None
+        choices = decoded(data)
+        return lambda ready, moment: next(choices, None) if len(ready) > 1 else 0
+    resolved = json.loads(trace.job.get("resolved") or "null")
+    if not isinstance(resolved, dict):
+        return None
+    policy = _same_policy(resolved.get("policy") or {"order": "fifo"}, int(resolved["seed"]))
+    return None if policy is None else policy.choose
+
+
+def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
+    """Return the policy of a resolved job, None if it cannot be made."""
+    if spec.get("priority") is not None:
+        return Priority([PriorityRule(**rule) for rule in spec["priority"]])
+    if spec.get("function") is not None:
+        with suppress(JobError):
+            return own_policy(spec["function"], "")
+    return of_order(str(spec.get("order")), seed)
 
 
 class _Events:

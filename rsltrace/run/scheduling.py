@@ -57,20 +57,32 @@ def scheduling_plan(job: Job, start_ns: int, recorded: Recorded | None) -> Sched
 
 def _policy(job: Job) -> Policy:
     spec = job.policy
-    if spec is None or spec.order == "fifo":
+    if spec is None:
         return Fifo()
-    if spec.order == "rate_monotonic":
-        return RateMonotonic()
-    if spec.order == "permutation":
-        return Permutation(Stream(job.seed, "permutation"))
+    if spec.order is not None:
+        policy = of_order(spec.order, job.seed)
+        assert policy is not None, "the job has been checked"
+        return policy
     if spec.priority is not None:
         rules = [PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in spec.priority]
         return Priority(rules)
-    return _own(job, spec.function)
+    return own_policy(spec.function, locate(job, ("policy", "function")))
 
 
-def _own(job: Job, function: Any) -> Policy:
-    where = locate(job, ("policy", "function"))
+def of_order(order: str, seed: int) -> Policy | None:
+    """Return the policy that a job calls by a word alone, None if there is none of that name."""
+    if order == "permutation":
+        return Permutation(Stream(seed, "permutation"))
+    if order == "rate_monotonic":
+        return RateMonotonic()
+    return Fifo() if order == "fifo" else None
+
+
+def own_policy(function: Any, where: str) -> Policy:
+    """Make a policy of the user's own.
+
+    :raises JobError: beginning with ``where``, if there is no such class, or it is no policy.
+    """
     if isinstance(function, str):
         function = load_target(function, where=where)
     try:
