@@ -13,6 +13,7 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.ros.blocking import lose_patience
 from rsltrace.ros.pump import pump_of
 from rsltrace.ros.tasks import Resume, create_task
 from rsltrace.ros.waitables import sync_waitables
@@ -77,6 +78,8 @@ def _methods(
                 core.pending.remove(guard.handle)  # type: ignore[union-attr]
 
     def add_node(self: Any, node: Any) -> bool:
+        if core.closing:  # ``while True: rclpy.spin(node)`` does nothing else from then on
+            lose_patience(core)
         added: bool = real["add_node"](self, node)
         if added:
             pump_of(core, self).add(node)

@@ -51,6 +51,7 @@ class Program:
         self.failures: deque[Raised] = deque(maxlen=_FAILURES_MAX)
         """What callbacks have raised out of a spin of this program, most recent last."""
         self.exit_handlers: list[Handler] = []
+        self.signal_handlers: dict[int, object] = {}
         self.stack: greenlet | None = None
         self.begun = False
         self.spun = False
@@ -126,6 +127,7 @@ class Program:
     def forget(self) -> None:
         """Let go of everything user code made, so that its finalizers run."""
         self._kept = self._main = self.entry = self.stack = None
+        self.signal_handlers.clear()
         self.contexts.clear()
         self.failures.clear()
 

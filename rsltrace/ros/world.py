@@ -36,6 +36,7 @@ from rsltrace.ros.own_executors import own_executors
 from rsltrace.ros.process_exit import own_process_ends
 from rsltrace.ros.program import Program
 from rsltrace.ros.scheduling import Scheduling, SchedulingPlan
+from rsltrace.ros.signals import own_signal_handlers
 from rsltrace.ros.simulated_waiting import simulated_waiting
 from rsltrace.ros.threads import cooperative_threads
 from rsltrace.ros.waits_for import who_waits
@@ -76,6 +77,7 @@ class World:
             stack.enter_context(simulated_event_loops(self.core))
             stack.enter_context(own_exit_handlers(self.core))
             stack.enter_context(own_process_ends(self.core))
+            stack.enter_context(own_signal_handlers(self.core))
             rclpy.init(args=[])
             self.core.main = getcurrent()
             self.core.executor = SimExecutor(self.core, rclpy.get_default_context())

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 from rsltrace.run.bags import PLAYER
-from rsltrace.run.process import Observer
+from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
 
 if TYPE_CHECKING:
@@ -46,7 +46,8 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     from rsltrace.ros.overview import overview
 
     notes: list[str] = []
-    with Session(job, None, observer=Observer(note=notes.append)) as session:
+    observer = Observer(note=notes.append)
+    with kept_process(), Session(job, None, observer=observer) as session:
         session.begin()
         if session.error is not None:
             error = session.error

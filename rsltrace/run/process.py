@@ -6,7 +6,7 @@ import gc
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,6 +74,33 @@ def quiet_gc() -> Iterator[None]:
 
 
 _INSTALLED = frozenset(("site-packages", "dist-packages"))
+
+
+@contextmanager
+def kept_process() -> Iterator[None]:
+    """Put back afterwards what user code may change of the process: where it is, what it was told.
+
+    Paths of the caller (the trace, in the first place) are relative to the folder it was in. Not
+    for a ``Simulation``: who drives it may change the process, too, and mean it.
+    """
+    folder = ""
+    with suppress(FileNotFoundError):  # somebody may have removed it, before or meanwhile
+        folder = os.getcwd()
+    argv, words, environment = sys.argv, list(sys.argv), dict(os.environ)
+    mask = os.umask(0o077)
+    os.umask(mask)
+    try:
+        yield
+    finally:
+        with suppress(FileNotFoundError):
+            os.chdir(folder)
+        os.umask(mask)
+        sys.argv, argv[:] = argv, words
+        for name in set(os.environ) - set(environment):
+            del os.environ[name]
+        for name, value in environment.items():
+            if os.environ.get(name) != value:
+                os.environ[name] = value
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rsltrace.job import Job
-from rsltrace.run.process import Observer
+from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import RunResult, Session
 
 
@@ -43,7 +43,10 @@ def run(
     """Do ``record``, but return a failed run's error in the result instead of raising it."""
     path = None if output is None else Path(output)
     earlier = None if replay is None else Path(replay)
-    with Session(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session:
+    with (
+        kept_process(),
+        Session(job, path, force=force, echo=echo, observer=observer, replay=earlier) as session,
+    ):
         session.begin()
         if not session.ended:
             session.go_on()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 import pytest
@@ -427,17 +428,24 @@ def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("spins", [True, False])
-def test_a_main_that_will_not_hear_of_the_end_is_left_behind(simulate: Any, spins: bool) -> None:
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda node: rclpy.spin_once(node, timeout_sec=0.5),
+        lambda node: rclpy.spin(node),
+        lambda node: time.sleep(0.5),
+    ],
+    ids=["spin_once", "spin", "sleep"],
+)
+def test_a_main_that_will_not_hear_of_the_end_is_left_behind(
+    simulate: Any, work: Callable[[Node], None]
+) -> None:
     def deaf() -> None:
         rclpy.init()
         node = Node("deaf")
         while True:
             try:
-                if spins:
-                    rclpy.spin_once(node, timeout_sec=0.5)
-                else:
-                    time.sleep(0.5)
+                work(node)
             except BaseException:
                 continue
 

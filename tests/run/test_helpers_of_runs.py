@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +45,38 @@ def test_rslcpps_error_code_ends_a_run(record_job: Any) -> None:
         code,
     )
     assert (result.exit_code, result.end_ns) == (42, 2 * 10**9)
+
+
+def test_what_a_node_makes_of_the_process_ends_with_the_run(
+    record_job: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = (
+        "import os, sys\n"
+        "class Careless(Talker):\n"
+        "    def __init__(self):\n"
+        "        super().__init__()\n"
+        "        os.chdir('/')\n"
+        "        os.umask(0o077)\n"
+        "        os.environ['LEFT'] = 'here'\n"
+        "        del os.environ['KEPT']\n"
+        "        sys.argv = ['another']\n"
+    )
+
+    def process() -> tuple[Any, ...]:
+        mask = os.umask(0o022)
+        os.umask(mask)
+        return os.getcwd(), mask, dict(os.environ), list(sys.argv)
+
+    monkeypatch.setenv("KEPT", "as it was")
+    before, argv = process(), sys.argv
+    node = "nodes: [{node: nodes_under_test:Careless}]\n"
+    assert record_job(node + "stop: {duration: 2s}\n", code).error is None
+    assert process() == before
+    assert sys.argv is argv
+    monkeypatch.setenv("KEPT", "again")
+    code += "        raise ValueError\n"
+    assert record_job(node + "stop: {duration: 2s}\n", code).error is not None
+    assert process() == (*before[:2], {**before[2], "KEPT": "again"}, before[3])
 
 
 # -- progress --------------------------------------------------------------------------------------

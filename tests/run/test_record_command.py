@@ -180,6 +180,27 @@ def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) ->
         assert trace.event(4095).index == 4095
 
 
+def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
+    job_file: Any, tmp_path: Path
+) -> None:
+    job_file(
+        ENDLESS.replace("Talker", "Deaf"),
+        "import signal\n"
+        "class Deaf(Talker):\n"
+        "    def __init__(self, period=1.0):\n"
+        "        super().__init__(period)\n"
+        "        signal.signal(signal.SIGINT, lambda number, frame: print('caught'))\n",
+    )
+    process = _start(tmp_path)
+    _wait_for_bytes(tmp_path / "out.mcap", 10_000)
+    process.send_signal(signal.SIGINT)
+    stdout, _ = process.communicate(timeout=300)
+    assert process.returncode == 130
+    assert "caught" not in stdout
+    with Trace.open(tmp_path / "out.mcap") as trace:
+        assert trace.complete
+
+
 def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_path: Path) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",

@@ -1,0 +1,84 @@
+"""Handlers of signals that nodes set: each main has its own, the process keeps what it had."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.node import Node
+
+from rsltrace import NodeSpec
+
+pytestmark = pytest.mark.ros
+
+
+def handle(number: int, frame: object) -> None:
+    raise AssertionError("nobody sends this")
+
+
+def other(number: int, frame: object) -> None:
+    raise AssertionError("nobody sends this")
+
+
+def main_of(own: Any, seen: list[Any]) -> NodeSpec:
+    def main() -> None:
+        rclpy.init()
+        node = Node("node")
+        seen.append(signal.signal(signal.SIGINT, own))
+        node.create_timer(0.5, lambda: seen.append(signal.getsignal(signal.SIGINT)))
+        rclpy.spin(node)
+
+    return NodeSpec(main=main, namespace=f"/{own.__name__}")
+
+
+def test_each_main_has_its_own_and_the_process_keeps_its(simulate: Any) -> None:
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    seen: list[Any] = []
+    simulate(main_of(handle, seen), main_of(other, seen), duration=1.1)
+    assert seen == [before[0], before[0], handle, other, handle, other]
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_handlers_of_other_signals_work_until_the_run_is_over(simulate: Any) -> None:
+    before = signal.getsignal(signal.SIGUSR1)
+    seen: list[int] = []
+
+    class Kicks(Node):
+        def __init__(self) -> None:
+            super().__init__("kicks")
+            signal.signal(signal.SIGUSR1, lambda number, frame: seen.append(number))
+            self.create_timer(0.5, lambda: os.kill(os.getpid(), signal.SIGUSR1))
+
+    simulate(Kicks, duration=1.1)
+    assert seen == [signal.SIGUSR1, signal.SIGUSR1]
+    assert signal.getsignal(signal.SIGUSR1) is before
+
+
+def test_mistakes_are_those_that_python_reports(simulate: Any) -> None:
+    said: list[str] = []
+
+    class Wrong(Node):
+        def __init__(self) -> None:
+            super().__init__("wrong")
+            self.try_(signal.SIGTERM, "nothing to call")
+            self.try_(1000, signal.SIG_IGN)
+            thread = threading.Thread(target=self.try_, args=(signal.SIGTERM, signal.SIG_IGN))
+            thread.start()
+            thread.join()
+
+        def try_(self, number: int, handler: Any) -> None:
+            try:
+                signal.signal(number, handler)
+            except (TypeError, ValueError) as error:
+                said.append(str(error))
+
+    simulate(Wrong, duration=0.1)
+    assert said == [
+        "signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object",
+        "signal number out of range",
+        "signal only works in main thread of the main interpreter",
+    ]
