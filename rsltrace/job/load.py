@@ -15,7 +15,7 @@ from rsltrace.job.compose import Composition, compose
 from rsltrace.job.job import Job
 from rsltrace.job.model import file_fields, keys_with
 from rsltrace.job.part import FROM_FILE
-from rsltrace.job.problems import Problem, format_loc, problems_of, unknown_key
+from rsltrace.job.problems import Problem, format_loc, nearest, problems_of, unknown_key
 from rsltrace.job.tree import Item, Place, YamlSource, place_at, plain
 from rsltrace.job.yaml_source import Mark, parse_yaml
 
@@ -96,13 +96,27 @@ def _composition_problems(values: dict[str, object]) -> list[Problem]:
     return []
 
 
+def _beside(path: Path) -> str:
+    """Say which file of the folder was probably meant."""
+    try:
+        files = {file.stem: file.name for file in sorted(path.parent.iterdir()) if _is_job(file)}
+    except OSError:
+        return ""
+    near = nearest(path.stem, files)
+    return f"; did you mean {str(path.with_name(files[near]))!r}?" if near else ""
+
+
+def _is_job(file: Path) -> bool:
+    return file.suffix in (".yaml", ".yml", ".json")
+
+
 def _read(path: Path) -> str:
     name = str(path)
     try:
         with path.open("rb") as file:
             data = file.read(SIZE_MAX + 1)
     except FileNotFoundError:
-        raise JobError("there is no such job file", where=name) from None
+        raise JobError(f"there is no such job file{_beside(path)}", where=name) from None
     except IsADirectoryError:
         inside = path / "job.yaml"
         advice = f"name the job file in it: {inside}" if inside.is_file() else "name a job file"

@@ -194,10 +194,14 @@ def test_times_are_read_without_pydantic() -> None:
 # --- files that are no jobs -----------------------------------------------------------------------
 
 
-def test_missing_file() -> None:
+def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(JobError) as caught:
         load_job("nowhere/job.yaml")
     assert str(caught.value) == "nowhere/job.yaml: there is no such job file"
+    (tmp_path / "robot.yaml").touch()
+    with pytest.raises(JobError) as caught:
+        load_job(tmp_path / "robot.yml")
+    assert str(caught.value).endswith(f"; did you mean '{tmp_path}/robot.yaml'?")
 
 
 def test_a_folder(folder: Path) -> None:
