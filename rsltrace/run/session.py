@@ -31,7 +31,7 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.clocks import clocks_of
+from rsltrace.run.clocks import clock_notes, clocks_of
 from rsltrace.run.entries import hook_entries, node_entries
 from rsltrace.run.executables import why_not
 from rsltrace.run.guarding import Guarding, entry_key, guarding
@@ -168,12 +168,12 @@ class Session:
         self._bags = [
             stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))
         ]
-        self._notes = (*notes, *notes_of(job, self._bags))
+        self.start_ns = start_ns_of(job, self._bags)
+        self.end_ns = end_ns_of(job, self.start_ns)
+        self._notes = (*notes, *notes_of(job, self._bags), *clock_notes(job, self.start_ns))
         if self._observer.note is not None:
             for note in self._notes:
                 self._observer.note(note)
-        self.start_ns = start_ns_of(job, self._bags)
-        self.end_ns = end_ns_of(job, self.start_ns)
 
     def _make_world(self, stack: ExitStack) -> None:
         """Make the loop and the world that the job describes, still without nodes."""

@@ -252,3 +252,24 @@ def test_remappings_kept_topics_and_rows_of_a_delay_file(
         if re.search(rf"/{file}:{line}\b", place)
     ]  # what a topic was to be called is missing in other lines, too
     assert told.startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("clock", "column", "shown"),
+    [
+        ("offset: -20ms", 34, "20 ms"),
+        ("offset: 1s, jumps: [{at: 1s, by: 1s}, {at: 2s, by: -9s}]", 77, "5 s"),
+        ("offset: 20ms, jumps: [{at: 1s, by: -1s}]", 0, ""),
+    ],
+)
+def test_a_clock_that_would_show_times_before_0_is_named(
+    record_job: Callable[..., Any], clock: str, column: int, shown: str
+) -> None:
+    yaml = "nodes: [{node: nodes_under_test:Talker}]\n"
+    yaml += f"clocks: [{{node: /talker, {clock}}}]\nstop: {{duration: 3s}}\n"
+    notes = record_job(yaml, output=None).notes
+    assert len(notes) == bool(column)
+    for note in notes:
+        assert f"job.yaml:2:{column}: this clock would show times before 0, which ROS does " in note
+        assert f"it shows 0 for {shown};" in note
+    assert record_job(yaml + "start: 100s\n", output=None).notes == ()
