@@ -1,4 +1,4 @@
-"""``os._exit`` and the like end the process of a node, which here is everybody's.
+"""``os._exit``, signals to oneself and the like end the process of a node, which is everybody's.
 
 So for the time of a run they end what they would end natively: one main with its threads, or,
 called by a node that the job constructs, the run. As natively, no ``finally`` block and no exit
@@ -7,8 +7,10 @@ handler runs: the stacks are left where they are. The trace is whole, and says w
 
 from __future__ import annotations
 
+import _signal  # type: ignore[import-not-found]
 import os
 import signal
+import sys
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -35,21 +37,22 @@ _real: dict[str, Callable[..., Any]] = {}
 @contextmanager
 def own_process_ends(core: Core) -> Iterator[None]:
     """Let nodes end their process, and not ours, within the ``with`` block."""
-    targets: dict[str, Callable[..., Any]] = {
-        "_exit": _exit,
-        "abort": _abort,
-        "kill": _kill,
-        "execv": _execv,
-        "execve": _execve,
-    }
+    targets: list[tuple[Any, Callable[..., Any]]] = [
+        (os._exit, _exit),
+        (os.abort, _abort),
+        (os.kill, _kill),
+        (os.execv, _execv),
+        (os.execve, _execve),
+        (_signal.raise_signal, _raise_signal),
+    ]
     before = dict(_real)
     with ExitStack() as stack:
         stack.callback(_real.update, before)
         stack.callback(_real.clear)
-        for name, target in targets.items():
-            redirected = Redirected(getattr(os, name), target)
+        for function, target in targets:
+            redirected = Redirected(function, target)
             stack.callback(redirected.restore)
-            _real[name] = redirected.real
+            _real[function.__name__] = redirected.real
         yield
 
 
@@ -71,10 +74,26 @@ def _abort() -> None:
 
 def _kill(pid: int, number: int, /) -> None:
     core = _core()
-    if core is None or pid != getpid() or number not in _DEADLY:
+    if core is None or pid != getpid() or not _signalled(core, number, "os.kill"):
         _real["kill"](pid, number)
-    else:
-        _leave(core, f"os.kill with {signal.Signals(number).name} for itself", 128 + number)
+
+
+def _raise_signal(signalnum: int) -> None:
+    core = _core()
+    if core is None or not _signalled(core, signalnum, "signal.raise_signal"):
+        _real["raise_signal"](signalnum)
+
+
+def _signalled(core: Core, number: int, call: str) -> bool:
+    """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
+    handler = core.program.signal_handlers.get(number)
+    if number in _DEADLY or handler == signal.SIG_DFL:
+        _leave(core, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+    if handler is None:
+        return False
+    if callable(handler):
+        handler(number, sys._getframe(2))
+    return True
 
 
 def _execv(path: Any, argv: Any, /) -> None:

@@ -58,6 +58,49 @@ def test_handlers_of_other_signals_work_until_the_run_is_over(simulate: Any) -> 
     assert signal.getsignal(signal.SIGUSR1) is before
 
 
+SENDERS = [lambda number: os.kill(os.getpid(), number), signal.raise_signal]
+
+
+@pytest.mark.parametrize("send", SENDERS, ids=["kill", "raise_signal"])
+def test_who_sends_itself_a_signal_is_told_as_it_has_said(simulate: Any, send: Any) -> None:
+    seen: list[Any] = []
+
+    class Told(Node):
+        def __init__(self) -> None:
+            super().__init__("told")
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            signal.signal(signal.SIGINT, self.on_interrupt)
+            self.create_timer(0.5, self.tick)
+
+        def on_interrupt(self, number: int, frame: Any) -> None:
+            seen.append((number, frame.f_code.co_name))
+
+        def tick(self) -> None:
+            send(signal.SIGTERM)
+            send(signal.SIGINT)
+            seen.append("went on")
+
+    recorded = simulate(Told, duration=0.6)
+    assert [one for one in seen if one == "went on"] == ["went on"]
+    assert seen[0][0] == signal.SIGINT
+    assert seen[0][1] in ("tick", "<lambda>")
+    assert recorded.result.exit_code == 0
+
+
+def test_a_default_that_ends_the_process_ends_the_main(simulate: Any) -> None:
+    def main() -> None:
+        rclpy.init()
+        node = Node("node")
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        node.create_timer(0.5, lambda: os.kill(os.getpid(), signal.SIGINT))
+        rclpy.spin(node)
+
+    recorded = simulate(NodeSpec(main=main), duration=3)
+    assert recorded.result.exit_code == 130
+    assert recorded.result.end_ns == 500_000_000
+    assert any("os.kill with SIGINT for itself" in note for note in recorded.result.notes)
+
+
 def test_mistakes_are_those_that_python_reports(simulate: Any) -> None:
     said: list[str] = []
 
