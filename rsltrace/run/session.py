@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -42,7 +42,12 @@ from rsltrace.run.provenance import environment, payload_filter, sources, write_
 from rsltrace.run.recorded_order import following, keep_choices, note_choices
 from rsltrace.run.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
-from rsltrace.run.unused import has_rules, unused_parameters, unused_rules
+from rsltrace.run.unused import (
+    has_rules,
+    unused_parameters,
+    unused_ros_parameters,
+    unused_rules,
+)
 from rsltrace.run.watchdog import Watchdog
 from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
 from rsltrace.trace.recorder import Recorder
@@ -320,10 +325,12 @@ class Session:
         """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
         core = self.world.core
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None
-        rules: Iterable[str] = ()
+        parameters = {**core.parameters, **parameters_of(core)}
+        rules: list[str] = []
         if core.met is not None:
-            rules = unused_rules(self.job, core.met, self._plan, lasted_ns)
-        return (*rules, *unused_parameters(self.job, {**core.parameters, **parameters_of(core)}))
+            rules += unused_rules(self.job, core.met, self._plan, lasted_ns)
+            rules += unused_ros_parameters(self.job, core.met, parameters)
+        return (*rules, *unused_parameters(self.job, parameters))
 
     def finish(self) -> RunResult:
         """Destroy the nodes, close the trace, and say how it went.

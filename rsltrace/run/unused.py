@@ -15,6 +15,7 @@ from rsltrace.job import Job, locate
 from rsltrace.job.problems import Loc
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
+from rsltrace.ros.arguments import RosArguments
 from rsltrace.ros.met import Met, Parameters
 from rsltrace.run.guarding import entry_key
 from rsltrace.run.unused_remappings import has_remappings, unused_remappings
@@ -81,6 +82,28 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
             yield (
                 f"{where}: {who} has not declared the parameter {name!r}, so it has no effect{near}"
             )
+
+
+def unused_ros_parameters(job: Job, met: Met, nodes: dict[str, Parameters]) -> Iterator[str]:
+    """Yield the parameters among ``ros_arguments`` that no node which gets them has declared."""
+    words = job.ros_arguments
+    for index, word in enumerate(words[1:], start=1):
+        if words[index - 1] not in ("-p", "--param"):
+            continue
+        arguments = RosArguments(["--ros-args", "-p", word])
+        given = {name: list(arguments.parameters(name)) for name in met.nodes}
+        name = next((found[0] for found in given.values() if found), None)
+        place = locate(job, ("ros_arguments", index))
+        if name is None:
+            who = word.partition(":=")[0].rpartition(":")[0]
+            yield f"{place}: no node is called {who!r}{_instead(who, list(met.nodes))}"
+            continue
+        who_gets = [node for node, found in given.items() if found]
+        if any(node not in nodes or name in nodes[node].declared for node in who_gets):
+            continue
+        near = _near(name, [other for node in who_gets for other in nodes[node].declared])
+        who = ", ".join(who_gets[:3]) + (", …" if len(who_gets) > 3 else "")
+        yield f"{place}: {who} has not declared the parameter {name!r}, so it has no effect{near}"
 
 
 def _single(

@@ -273,3 +273,24 @@ def test_a_clock_that_would_show_times_before_0_is_named(
         assert f"job.yaml:2:{column}: this clock would show times before 0, which ROS does " in note
         assert f"it shows 0 for {shown};" in note
     assert record_job(yaml + "start: 100s\n", output=None).notes == ()
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("rate:=5.0", ""),
+        ("anything:=1", ""),  # /free takes what it is given
+        ("talker:rate:=1", "/talker has not declared the parameter 'rate', so it has no effect"),
+        ("free:rate:=1", ""),
+        ("robot:rate:=1", "no node is called 'robot'; did you mean '/r1/robot'?"),
+    ],
+)
+def test_parameters_of_ros_arguments(
+    record_job: Callable[..., Any], word: str, message: str
+) -> None:
+    yaml = ALL + f"ros_arguments: [-p, '{word}']\nstop: {{duration: 1s}}\n"
+    result = record_job(yaml, NODES, output=None)
+    assert result.error is None
+    assert len(result.notes) == bool(message), result.notes
+    for note in result.notes:
+        assert f"job.yaml:8:21: {message}" in note
