@@ -37,6 +37,8 @@ def read_samples(spec: SamplesSpec, path: Path, name: str) -> tuple[int, ...]:
     def row(line: str) -> int:
         if len(line.replace(",", " ").replace(";", " ").split()) > 1 and not line[-1].isalpha():
             raise ValueError(f"expected one value per line, got {line!r}")
+        if line.isidentifier() and line.lower() not in ("nan", "inf", "true", "false"):
+            raise ValueError(f"expected a time, got {line!r}: a header is left out")
         return check_short(parse_measured(line, spec.unit), line)
 
     values = [value for _, value in _rows(path, name, row)]
@@ -104,7 +106,13 @@ def read_rslcpp(path: Path, name: str) -> dict[str, tuple[int, DelaySpec]]:
         return True
 
     rows = _rows(path, name, row, header=header, only_first=True, comments=False)
-    return {topic: (number, delay) for number, (topic, delay) in rows}
+    found = {topic: (number, delay) for number, (topic, delay) in rows}
+    if not found:
+        raise JobError(
+            "it has no delays: below its header, write 'topic,FIXED,milliseconds,' lines",
+            where=name,
+        )
+    return found
 
 
 def _truncated_ms(text: str) -> int:

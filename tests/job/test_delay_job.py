@@ -272,6 +272,14 @@ def test_rslcpps_table_of_fixed_delays(folder: Path) -> None:
     ]
 
 
+def test_a_table_without_rows_and_samples_with_a_header_are_refused(folder: Path) -> None:
+    (folder / "d.csv").write_text("Topic,Type,Delay,Skew\n\n")
+    assert mistake("file: d.csv\n").startswith("d.csv: it has no delays: below its header, ")
+    (folder / "s.txt").write_text("delay_ms\n1\n")
+    text = mistake("default: {samples: {file: s.txt, unit: ms}}\n")
+    assert text.startswith("s.txt:1:1: expected a time, got 'delay_ms': a header is left out")
+
+
 def test_a_table_without_header_does_not_lose_its_first_line(folder: Path) -> None:
     (folder / "d.csv").write_text("/a,FIXED,5,\n/b,FIXED,5,\n")
     assert mistake("file: d.csv\n").startswith("d.csv:1:1: the first line is a header")
