@@ -219,7 +219,7 @@ def test_measured_values_are_rounded_to_nanoseconds(folder: Path) -> None:
     [
         ("1\n 1;2\n", "sub/s.txt:2:2: expected one value per line, got '1;2'"),
         ("1,2\n", "sub/s.txt:1:1: expected one value per line, got '1,2'"),
-        ("# ms\ndelay\n", "sub/s.txt:2:1: expected a number, or a number with a unit"),
+        ("# ms\ndelay\n", "sub/s.txt:2:1: expected a time, got 'delay': a header is left out"),
         ("-1\n", "sub/s.txt:1:1: a time must not be negative, got -1"),
         ("1e400\n", "sub/s.txt:1:1: 1e400 is too large"),
         ("20000h\n", "sub/s.txt:1:1: 20000h is too long: at most 10007h"),
