@@ -7,10 +7,12 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
+from rsltrace.model.stamp import format_duration
 from rsltrace.ros.action_client import ActionClientHandle
 from rsltrace.ros.entity_handle import callback_name
 from rsltrace.ros.interfaces import type_name as name_of_type
-from rsltrace.ros.qos import incompatible_policy
+from rsltrace.ros.qos import Liveliness, incompatible_policy
+from rsltrace.ros.qos_time import finite
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -137,7 +139,12 @@ def _end(endpoint: Any) -> End:
     qos = endpoint.qos
     history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
     words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
-    return End(_name_of(endpoint), ", ".join([*words, history]))
+    words.append(history)
+    if qos.liveliness is Liveliness.MANUAL_BY_TOPIC:
+        words.append("liveliness manual by topic")
+    limits = {"deadline": qos.deadline_ns, "lease": qos.lease_ns, "lifespan": qos.lifespan_ns}
+    words += [f"{name} {format_duration(ns)}" for name, ns in limits.items() if finite(ns)]
+    return End(_name_of(endpoint), ", ".join(words))
 
 
 def _name_of(endpoint: Any) -> str:

@@ -218,3 +218,36 @@ def test_the_picture_of_a_graph_is_the_same_every_time(job_file: Callable[..., P
     job = load_job(job_file(JOB, NODES))
     pictures = {graph_svg(check_job(job).overview) for _ in range(3)}
     assert len(pictures) == 1
+
+
+def test_what_keeps_ends_apart_is_shown_with_its_values(
+    rsltrace: Any, job_file: Callable[..., Path]
+) -> None:
+    code = """
+from rclpy.duration import Duration
+from rclpy.qos import LivelinessPolicy, QoSProfile
+
+class Slow(Node):
+    def __init__(self):
+        super().__init__('slow')
+        qos = QoSProfile(depth=1, deadline=Duration(seconds=2), lifespan=Duration(seconds=1))
+        self.create_publisher(UInt64, 'slow', qos)
+
+class Picky(Node):
+    def __init__(self):
+        super().__init__('picky')
+        lease = Duration(seconds=0.5)
+        manual = LivelinessPolicy.MANUAL_BY_TOPIC
+        qos = QoSProfile(
+            depth=1, deadline=Duration(seconds=1), liveliness=manual, liveliness_lease_duration=lease
+        )
+        self.create_subscription(UInt64, 'slow', print, qos)
+"""
+    job_file("nodes: [{node: nodes_under_test:Slow}, {node: nodes_under_test:Picky}]\n", code)
+    done = rsltrace("check", "job.yaml")
+    assert done.returncode == 1
+    assert done.stdout.endswith(
+        "do not connect: deadline (/slow offers reliable, volatile, keep last 1, deadline 2 s, "
+        "lifespan 1 s; /picky asks for reliable, volatile, keep last 1, liveliness manual by topic, "
+        "deadline 1 s, lease 500 ms)\n"
+    )
