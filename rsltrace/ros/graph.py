@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from rsltrace.errors import UnsupportedError
-from rsltrace.ros.qos import incompatible_policy
+from rsltrace.ros.qos import incompatible_policies
 
 if TYPE_CHECKING:
     from rsltrace.ros.entity_handle import EntityHandle
@@ -111,10 +111,10 @@ class Graph:
         self._services[service.service].remove(service)
 
     def _connect(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> None:
-        policy = incompatible_policy(publisher.qos, subscription.qos)
-        if policy is not None:
-            publisher.events.incompatible(policy)
-            subscription.events.incompatible(policy)
+        apart = incompatible_policies(publisher.qos, subscription.qos)
+        if apart:
+            publisher.events.incompatible(apart[0])
+            subscription.events.incompatible(apart[0])
             return
         publisher.connect(subscription)
         subscription.publishers.append(publisher)

@@ -11,7 +11,7 @@ from rsltrace.model.stamp import format_duration
 from rsltrace.ros.action_client import ActionClientHandle
 from rsltrace.ros.entity_handle import callback_name
 from rsltrace.ros.interfaces import type_name as name_of_type
-from rsltrace.ros.qos import Liveliness, incompatible_policy
+from rsltrace.ros.qos import Liveliness, incompatible_policies
 from rsltrace.ros.qos_time import finite
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ class End:
 @dataclass(frozen=True, slots=True)
 class Link:
     """A topic, service or action with its ends. ``senders`` publish or call, ``receivers``
-    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policy) of the
+    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policies) of the
     pairs that do not connect."""
 
     kind: str
@@ -103,10 +103,14 @@ def _topics(core: Core) -> Iterator[Link]:
             tuple(_end(publisher) for publisher in publishers),
             tuple(_end(subscription) for subscription in subscriptions),
             tuple(
-                (_end(publisher), _end(subscription), policy.name.lower())
+                (
+                    _end(publisher),
+                    _end(subscription),
+                    " and ".join(p.name.lower() for p in policies),
+                )
                 for publisher in publishers
                 for subscription in subscriptions
-                if (policy := incompatible_policy(publisher.qos, subscription.qos)) is not None
+                if (policies := incompatible_policies(publisher.qos, subscription.qos))
             ),
         )
 

@@ -183,29 +183,30 @@ class Qos:
         return shown
 
 
-def incompatible_policy(offered: Qos, requested: Qos) -> PolicyKind | None:
-    """Return the policy that keeps a publisher and a subscription apart, or None if they match.
+def incompatible_policies(offered: Qos, requested: Qos) -> list[PolicyKind]:
+    """Return the policies that keep a publisher and a subscription apart, none if they match.
 
-    Of several it is the one that Fast DDS names, which counts a lease as liveliness.
+    The first is the one that Fast DDS names, which counts a lease as liveliness.
     """
+    found = []
     if (
         offered.reliability is Reliability.BEST_EFFORT
         and requested.reliability is Reliability.RELIABLE
     ):
-        return PolicyKind.RELIABILITY
+        found.append(PolicyKind.RELIABILITY)
     if (
         offered.liveliness is Liveliness.AUTOMATIC
         and requested.liveliness is Liveliness.MANUAL_BY_TOPIC
     ) or (offered.lease_ns or INFINITE_NS) > (requested.lease_ns or INFINITE_NS):
-        return PolicyKind.LIVELINESS
+        found.append(PolicyKind.LIVELINESS)
     if (offered.deadline_ns or INFINITE_NS) > (requested.deadline_ns or INFINITE_NS):
-        return PolicyKind.DEADLINE
+        found.append(PolicyKind.DEADLINE)
     if (
         offered.durability is Durability.VOLATILE
         and requested.durability is Durability.TRANSIENT_LOCAL
     ):
-        return PolicyKind.DURABILITY
-    return None
+        found.append(PolicyKind.DURABILITY)
+    return found
 
 
 def _limit(duration_ns: int) -> int:

@@ -236,18 +236,16 @@ class Slow(Node):
 class Picky(Node):
     def __init__(self):
         super().__init__('picky')
-        lease = Duration(seconds=0.5)
-        manual = LivelinessPolicy.MANUAL_BY_TOPIC
-        qos = QoSProfile(
-            depth=1, deadline=Duration(seconds=1), liveliness=manual, liveliness_lease_duration=lease
-        )
+        qos = QoSProfile(depth=1, deadline=Duration(seconds=1))
+        qos.liveliness = LivelinessPolicy.MANUAL_BY_TOPIC
+        qos.liveliness_lease_duration = Duration(seconds=0.5)
         self.create_subscription(UInt64, 'slow', print, qos)
 """
     job_file("nodes: [{node: nodes_under_test:Slow}, {node: nodes_under_test:Picky}]\n", code)
     done = rsltrace("check", "job.yaml")
     assert done.returncode == 1
     assert done.stdout.endswith(
-        "do not connect: deadline (/slow offers reliable, volatile, keep last 1, deadline 2 s, "
-        "lifespan 1 s; /picky asks for reliable, volatile, keep last 1, liveliness manual by topic, "
-        "deadline 1 s, lease 500 ms)\n"
+        "do not connect: liveliness and deadline (/slow offers reliable, volatile, keep last 1, "
+        "deadline 2 s, lifespan 1 s; /picky asks for reliable, volatile, keep last 1, "
+        "liveliness manual by topic, deadline 1 s, lease 500 ms)\n"
     )
