@@ -21,55 +21,77 @@ LEAVES_MAX = 20_000
 
 BLOCK_BYTES = 4096
 
+_Arrays = dict[str, tuple[str, list[bytes]]]
+"""Arrays by path: their type and shape, and their data in blocks."""
+
 
 class Snapshots:
     """Writes the states of one node, each as what is new in it."""
 
     def __init__(self) -> None:
         self._attributes: dict[str, int] = {}
-        self._arrays: dict[str, tuple[str, list[bytes]]] = {}
+        self._arrays: dict[str, _Arrays] = {}
+        """By attribute, the arrays that were in it when it was written last: a reader knows those
+        and no others."""
 
     def changes(self, attributes: Mapping[str, Any], hashes: Mapping[str, int]) -> dict[str, Any]:
         """Return what changed: by attribute its values by path (None: it is gone)."""
         changed: dict[str, Any] = {}
         for name in self._attributes.keys() - hashes.keys():
             changed[name] = None
+            self._arrays.pop(name, None)
         for name, digest in hashes.items():
             if self._attributes.get(name) != digest:
-                leaves: dict[str, Any] = {}
+                leaves = _Leaves(self._arrays.pop(name, {}))
                 try:
-                    self._flatten(attributes[name], name, leaves, set())
+                    leaves.add(attributes[name], name)
                 except _TooMany:
-                    leaves = {name: f"(more than {LEAVES_MAX} values, hash {digest:016x})"}
-                changed[name] = leaves
+                    text = f"(more than {LEAVES_MAX} values, hash {digest:016x})"
+                    changed[name] = {name: text}
+                    continue
+                changed[name] = leaves.found
+                if leaves.arrays:
+                    self._arrays[name] = leaves.arrays
         self._attributes = dict(hashes)
         return dict(sorted(changed.items()))
 
-    def _flatten(self, value: Any, path: str, leaves: dict[str, Any], parents: set[int]) -> None:
-        if len(leaves) >= LEAVES_MAX:
+
+class _Leaves:
+    """The values of one attribute by their paths; of arrays, the blocks that are not as before."""
+
+    def __init__(self, before: _Arrays) -> None:
+        self._before = before
+        self._parents: set[int] = set()
+        self.found: dict[str, Any] = {}
+        self.arrays: _Arrays = {}
+
+    def add(self, value: Any, path: str) -> None:
+        """Add a value with all its parts."""
+        if len(self.found) >= LEAVES_MAX:
             raise _TooMany
         if isinstance(value, np.ndarray) and value.dtype.kind in "biufcmM":
-            leaves[path] = self._array(path, value)
+            self.found[path] = self._array(path, value)
             return
-        children = None if id(value) in parents else _children(value, path)
+        parents, key = self._parents, id(value)
+        children = None if key in parents else _children(value, path)
         if children is None:
-            leaves[path] = _text(value, is_parent=id(value) in parents)
+            self.found[path] = _text(value, is_parent=key in parents)
             return
         if not children:
-            leaves[path] = "empty"
-        parents.add(id(value))
+            self.found[path] = "empty"
+        parents.add(key)
         for child, item in children:
-            self._flatten(item, child, leaves, parents)
-        parents.discard(id(value))
+            self.add(item, child)
+        parents.discard(key)
 
     def _array(self, path: str, value: Any) -> dict[str, Any]:
         data = np.ascontiguousarray(value).tobytes()
         kind = f"{value.dtype.str} {list(value.shape)}"
         blocks = [data[at : at + BLOCK_BYTES] for at in range(0, len(data), BLOCK_BYTES)]
-        before_kind, before = self._arrays.get(path, ("", []))
+        before_kind, before = self._before.get(path, ("", []))
         if before_kind != kind:
             before = []
-        self._arrays[path] = (kind, blocks)
+        self.arrays[path] = (kind, blocks)
         new = {
             str(number): base64.b64encode(block).decode()
             for number, block in enumerate(blocks)
