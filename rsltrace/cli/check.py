@@ -125,6 +125,8 @@ def _text(job: Job, checked: Checked) -> list[str]:
     lines.append("")
     if checked.problems:
         lines += ["to look at:", *(f"  {problem}" for problem in checked.problems)]
+        if checked.unused:
+            lines.append("(what nodes create later, in callbacks, is not there yet)")
     else:
         lines.append("nothing looks wrong")
     return lines

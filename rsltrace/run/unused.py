@@ -132,12 +132,14 @@ def _single(
 
 
 def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
-    """Yield (place, glob) of what the trace keeps. A glob that begins with ``*`` is a habit, about
-    whatever there may be, here or in another job."""
+    """Yield (place, glob) of what the trace keeps. A glob that begins with ``*``, or stands in a
+    file that several jobs share, is a habit: about whatever there may be, here or elsewhere."""
     for key, globs in (("topics", job.record.topics), ("exclude", job.record.exclude)):
         for index, glob in enumerate(globs):
-            if not glob.startswith("*"):
-                yield ("record", key, index), glob
+            loc: Loc = ("record", key, index)
+            is_own = locate(job, loc).startswith((f"{job.source_name}:", "--"))
+            if is_own and not glob.startswith("*"):
+                yield loc, glob
 
 
 def _links(job: Job, met: Met) -> Iterator[str]:

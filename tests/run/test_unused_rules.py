@@ -160,6 +160,7 @@ class Failing(Node):
     assert done.returncode == 1
     assert done.stdout.endswith(
         "to look at:\n  job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n"
+        "(what nodes create later, in callbacks, is not there yet)\n"
     )
     done = rsltrace("record", "job.yaml", "-o", "run.mcap")
     assert done.returncode == 0
@@ -294,3 +295,13 @@ def test_parameters_of_ros_arguments(
     assert len(result.notes) == bool(message), result.notes
     for note in result.notes:
         assert f"job.yaml:8:21: {message}" in note
+
+
+def test_topics_to_keep_in_a_file_that_jobs_share_are_not_named(
+    record_job: Callable[..., Any], tmp_path: Path
+) -> None:
+    (tmp_path / "common.yaml").write_text("record: {exclude: [/camera/*]}\n")
+    yaml = "nodes: [{node: nodes_under_test:Talker}]\nstop: {duration: 1s}\n"
+    assert record_job("include: common.yaml\n" + yaml, output=None).notes == ()
+    (note,) = record_job(yaml + "record: {exclude: [/camera/*]}\n", output=None).notes
+    assert "job.yaml:3:20: no topic or service fits '/camera/*'" in note
