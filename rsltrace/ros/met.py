@@ -5,6 +5,7 @@ A rule of a job that fits none of them does nothing, and nobody would notice.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -45,18 +46,19 @@ class Met:
         """(node, name) of all that may have a callback: topic, service, a timer's callback."""
         self.asked: dict[Asker, dict[tuple[str, bool], None]] = {}
         """What each node has asked for before it was remapped: (full name, whether a service)."""
-        self.described: dict[int, str] = {0: THE_RUN}
-        """Every entity as in ``described``, by its id."""
+        self.described: dict[int, str] | None = None
+        """Every entity as in ``described``, by its id, if somebody wants to know: a run may make
+        a thread in each of a million callbacks."""
 
     def add(self, entity: Entity) -> None:
         """Remember an entity; its node comes before it."""
         if entity.kind is EntityKind.NODE:
             self._names[entity.id] = entity.name
-            self.described[entity.id] = described(entity, entity.name)
+            self._describe(entity, entity.name)
             self.nodes[entity.name] = None
             return
         node = self._names.get(entity.node, "")
-        self.described[entity.id] = described(entity, node)
+        self._describe(entity, node)
         self.entities[node, entity.name] = None
         if entity.kind in _SERVICES:
             self.services[entity.name] = None
@@ -67,6 +69,15 @@ class Met:
                 topics.update({(node, f"{entity.name}/_action/{t}"): None for t in _ACTION_TOPICS})
             elif entity.kind in kinds:
                 topics[node, entity.name] = None
+
+    def describe_all(self) -> Callable[[int], str | None]:
+        """Keep the names of all entities from now on; return the function that knows them."""
+        self.described = {0: THE_RUN}
+        return self.described.get
+
+    def _describe(self, entity: Entity, node: str) -> None:
+        if self.described is not None:
+            self.described[entity.id] = described(entity, node)
 
     @property
     def topics(self) -> dict[str, None]:

@@ -42,7 +42,7 @@ def following(job: Job, core: Core, stack: ExitStack) -> Following | None:
     met = core.met
     assert met is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
-    order = Recorded(file, _Events(trace).event, _chosen(trace), met.described.get)
+    order = Recorded(file, _Events(trace).event, _chosen(trace), met.describe_all())
     return Following(core, order, is_whole=trace.complete)
 
 
