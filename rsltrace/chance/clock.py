@@ -38,6 +38,7 @@ class WrongClock:
         self._drawn_at: list[int] = []
         self._drawn_sum = [0]
         self._drawn_until_ns = 0
+        self._told = 0
 
     def shows(self, now_ns: int) -> int:
         """Return what the clock shows at simulated time ``now_ns``."""
@@ -50,6 +51,16 @@ class WrongClock:
             self._draw_until(since_ns)
             wrong_ns += self._drawn_sum[bisect_right(self._drawn_at, since_ns)]
         return max(now_ns + wrong_ns, 0)
+
+    def set_since(self, now_ns: int) -> int:
+        """Return by how much random jumps have set the clock since this was last asked."""
+        if not self._model.random_every_ns:
+            return 0
+        since_ns = now_ns - self._start_ns
+        self._draw_until(since_ns)
+        count = max(bisect_right(self._drawn_at, since_ns), self._told)
+        before, self._told = self._told, count
+        return self._drawn_sum[count] - self._drawn_sum[before]
 
     def _draw_until(self, since_ns: int) -> None:
         """Draw the jumps up to a time: gaps are exponential."""

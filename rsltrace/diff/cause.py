@@ -286,8 +286,10 @@ class Cone:
                 self._taint(owner, mark)
             return
         outputs = self._different_outputs(item)
-        if not outputs or any(output[0] != _DRAW for output in outputs):
-            self._taint(owner, mark)  # what chance decides on the way leaves the sender as it was
+        nodes = rows.run.identity.nodes
+        if not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
+            # What chance decides on the way leaves the sender as it was; its own clock does not.
+            self._taint(owner, mark)
         found = self.found[mark.root]
         stamp = self._stretch.stamp(item)
         for kind, number, _, _ in outputs:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from rsltrace.diff.cause import NODE
 from rsltrace.diff.model import EventView, MessageDifference, Root, Setting, Verdict
-from rsltrace.diff.views import at, phrase, raised
+from rsltrace.diff.views import CLOCK_OF, at, phrase, raised
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 
@@ -93,6 +93,8 @@ def judge(case: Case) -> Judgement:
     draws = [m for m in case.messages if m.kind is OutputKind.DRAW]
     if draws and all(m.kind is OutputKind.DRAW for m in case.messages):
         return _draw(case, a, b, draws)
+    if draws and draws[0] is case.messages[0] and draws[0].topic.startswith(CLOCK_OF):
+        return _draw(case, a, b, draws)  # what was done with the time that was read is different
     return _same_input(case, a, b)
 
 
@@ -245,8 +247,10 @@ def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
 def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDifference]) -> Judgement:
     first = draws[0]
     was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("?", "?")
+    is_clock = first.topic.startswith(CLOCK_OF)
+    same = "read a clock" if is_clock else "did the same in both runs"
     sentence = (
-        f"{phrase(a)} {at(a.stamp_ns)} did the same in both runs, but chance decided otherwise: "
+        f"{phrase(a)} {at(a.stamp_ns)} {same}, but chance decided otherwise: "
         f"{first.topic}: {was_a} in a, {was_b} in b"
     )
     if len(draws) > 1:

@@ -21,6 +21,9 @@ _SUMMARY_OUTPUTS_MAX = 4
 _DRAW = int(OutputKind.DRAW)
 _SEGMENTS_BACK = 2
 
+CLOCK_OF = "the clock of "
+"""How the text of a draw begins that has set a clock."""
+
 
 class Viewer:
     """Makes the views of one run's events."""
@@ -121,6 +124,8 @@ def output_text(key: EntityKey, kind: int) -> str:
         return f"reply {key.name}"
     if kind == OutputKind.ENTITY:
         return f"new {key.kind} {key.name}"
+    if kind == OutputKind.DRAW and key.kind == EntityKind.NODE.label:
+        return f"{CLOCK_OF}{key.name}"
     if kind == OutputKind.DRAW:
         return f"{key.kind} {key.name} of {key.node}"
     if kind in (OutputKind.LOG, OutputKind.EXCEPTION, OutputKind.SHUTDOWN):

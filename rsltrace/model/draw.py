@@ -23,6 +23,8 @@ class Draw(IntEnum):
     OUTAGE = 4
     DUPLICATE = 5
     EXECUTION = 6
+    CLOCK_AHEAD = 7
+    CLOCK_BACK = 8
 
 
 _WORDS = {
@@ -32,9 +34,17 @@ _WORDS = {
 }
 
 
+_CLOCKS = {Draw.CLOCK_AHEAD: "ahead", Draw.CLOCK_BACK: "back"}
+
+
 def encode_draw(kind: int, value_ns: int = 0) -> int:
     """Return the number for a decision."""
     return (kind << _SHIFT) | min(value_ns, _VALUE_MAX)
+
+
+def encode_clock(by_ns: int) -> int:
+    """Return the number for a clock that has been set by so much."""
+    return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
 
 
 def is_second_copy(number: int) -> bool:
@@ -51,5 +61,7 @@ def draw_text(number: int) -> str:
         return f"draw of kind {kind}: {value_ns}"
     if draw in _WORDS:
         return _WORDS[draw]
+    if draw in _CLOCKS:
+        return f"clock set {format_duration(value_ns)} {_CLOCKS[draw]}"
     names = {Draw.DELAY: "delay", Draw.DUPLICATE: "second copy after", Draw.EXECUTION: "takes"}
     return f"{names[draw]} {format_duration(value_ns)}"

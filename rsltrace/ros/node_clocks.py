@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING
 
 from rsltrace.chance.clock import ClockModel, WrongClock
 from rsltrace.chance.stream import Stream
+from rsltrace.model.draw import encode_clock
+from rsltrace.ros.links import note
+
+if TYPE_CHECKING:
+    from rsltrace.ros.core import Core
 
 
 class NodeClocks:
-    """What each node's clock shows. Each has a stream of its own for random jumps."""
+    """What each node's clock shows. Each has a stream of its own for random jumps; that one has
+    happened is an output of the event in which the clock is read next."""
 
     def __init__(
-        self, rules: tuple[tuple[str, ClockModel], ...], *, seed: int, start_ns: int
+        self, core: Core, rules: tuple[tuple[str, ClockModel], ...], *, start_ns: int
     ) -> None:
+        self._core = core
         self._rules = rules
-        self._seed = seed
         self._start_ns = start_ns
         self._clocks: dict[str, WrongClock | None] = {}
 
@@ -27,7 +34,16 @@ class NodeClocks:
             model = next((model for glob, model in self._rules if fnmatchcase(node, glob)), None)
             self._clocks[node] = None
             if model is not None:
-                stream = Stream(self._seed, f"clock\0{node}")
+                stream = Stream(self._core.seed, f"clock\0{node}")
                 self._clocks[node] = WrongClock(model, stream, self._start_ns)
         clock = self._clocks[node]
-        return now_ns if clock is None else clock.shows(now_ns)
+        if clock is None:
+            return now_ns
+        if self._core.current_handle is not None and (by_ns := clock.set_since(now_ns)):
+            self._note(node, by_ns)
+        return clock.shows(now_ns)
+
+    def _note(self, node: str, by_ns: int) -> None:
+        for handle in self._core.graph.nodes:
+            if handle.fully_qualified_name == node:
+                note(self._core, handle.entity_id, encode_clock(by_ns))

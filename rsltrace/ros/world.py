@@ -132,7 +132,7 @@ class World:
     def use_clocks(self, rules: tuple[tuple[str, ClockModel], ...], start_ns: int) -> None:
         """Let the clocks of some nodes (globs) be wrong. Before the first node is made."""
         if rules:
-            self.core.clocks = NodeClocks(rules, seed=self.core.seed, start_ns=start_ns)
+            self.core.clocks = NodeClocks(self.core, rules, start_ns=start_ns)
 
     def use_scheduling(self, loop: OrderedLoop, plan: SchedulingPlan) -> None:
         """Let a plan say what runs when, and how long it takes. Before the first node is made."""

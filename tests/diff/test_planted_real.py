@@ -282,3 +282,43 @@ def test_a_message_that_only_one_run_loses_is_named(tmp_path: Path) -> None:
     a_ms, b_ms = (float(text.split()[1]) for text in (field.a, field.b))
     assert b_ms == pytest.approx(a_ms + 10, abs=1e-3)
     assert "job.yaml:8" in first.root_sentence  # the line with the drop
+
+
+def test_a_clock_that_jumped_otherwise_is_the_root_and_is_named(tmp_path: Path) -> None:
+    """Its node sends what it has read, and only later: that follows, it is no cause of its own."""
+    (tmp_path / "clock_nodes.py").write_text(
+        """
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+class Reader(Node):
+    def __init__(self):
+        super().__init__('reader')
+        self.seen = 0
+        self.publisher = self.create_publisher(UInt64, 'seen', 10)
+        self.create_timer(0.1, self.look)
+        self.create_timer(0.25, lambda: self.publisher.publish(UInt64(data=self.seen)))
+
+    def look(self):
+        self.seen = self.get_clock().now().nanoseconds
+"""
+    )
+    from rsltrace.run import run
+
+    for seed in (0, 1):
+        (tmp_path / "job.yaml").write_text(
+            "nodes: [{node: clock_nodes:Reader}]\nstart: 10s\nstop: {duration: 1s}\n"
+            "clocks: [{node: /reader, random_jumps: {every: 50ms, most: 20ms}}]\n"
+            f"seed: {seed}\n"
+        )
+        run(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / f"{seed}.mcap", force=True)
+    diff = rsltrace.diff(tmp_path / "0.mcap", tmp_path / "1.mcap")
+    first = diff.divergences[0]
+    assert (diff.verdict, first.root) == (Verdict.DRAW, Root.DRAW)
+    (message,) = first.messages
+    assert message.topic == "the clock of /reader"
+    (field,) = message.fields
+    assert {text[:10] for text in (field.a, field.b)} <= {"clock set ", "none"}
+    assert "read a clock, but chance decided otherwise: the clock of /reader" in first.sentence
+    assert "job.yaml:5" in first.root_sentence  # the line with the seed
+    assert {divergence.verdict for divergence in diff.divergences} == {Verdict.DRAW}

@@ -81,3 +81,12 @@ def test_each_node_has_its_own_clock(simulate: Callable[..., Any]) -> None:
     assert [shown for shown, _ in seen["drifts"]] == [101 * S + MS, 102 * S + 2 * MS]
     for name in seen:  # Python's own clock is the same computer's
         assert [shown for shown, _ in seen[name]] == [python for _, python in seen[name]]
+
+
+def test_each_jump_is_told_once_whenever_it_is_asked_for() -> None:
+    wrong = clock(ClockModel(random_every_ns=S, random_most_ns=50 * MS))
+    told = [wrong.set_since(t * 7 * S) for t in range(100)]
+    assert sum(told) == wrong.shows(99 * 7 * S) - 99 * 7 * S
+    assert wrong.set_since(99 * 7 * S) == 0
+    assert wrong.set_since(0) == 0  # time has gone back: nothing is told twice
+    assert clock(ClockModel(offset_ns=S)).set_since(9 * S) == 0
