@@ -17,7 +17,7 @@ from pathlib import Path
 
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
-from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT
+from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT_CONTENT
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -64,7 +64,8 @@ def write_trace(path: Path, events: int) -> None:
                 values = [step]
             sequence = writer.add_payload(channel, stamp, CDR_HEADER + layout.pack(*values))
             seed = index * 0x9E3779B97F4A7C15 & mask
-            writer.add_output(OUTPUT.pack(index, seed, node + 2, OutputKind.MESSAGE, sequence))
+            writer.add_output(OUTPUT_CONTENT.pack(seed, node + 2, OutputKind.MESSAGE))
+            writer.add_sequence(sequence)
             rest = EVENT_REST.pack(
                 *(index, stamp, NO_EVENT, step, seed ^ mask, 0, node + 1, 0, 1),
                 *(EventKind.TIMER, 0),

@@ -21,7 +21,7 @@ from mcap.writer import CompressionType, Writer
 
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT
+from rsltrace.trace.format import CDR_HEADER, EVENT_REST, OUTPUT, OUTPUT_CONTENT
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -33,7 +33,7 @@ _TOPIC, _TYPE, _SCHEMA = "/topic", "std_msgs/msg/UInt64MultiArray", "uint64[] da
 
 def write_trace(path: Path, events: int) -> None:
     """Write ``events`` events, each with one output that is a message."""
-    pack_event, pack_output = EVENT_REST.pack, OUTPUT.pack
+    pack_event, pack_output = EVENT_REST.pack, OUTPUT_CONTENT.pack
     with TraceWriter(path, force=True) as writer:
         writer.add_entity(Entity(1, 0, EntityKind.PUBLISHER, _TOPIC, _TYPE, 0, {}))
         channel = writer.add_channel(_TOPIC, _TYPE, _SCHEMA)
@@ -41,7 +41,8 @@ def write_trace(path: Path, events: int) -> None:
         for index in range(events):
             stamp = index * 1000
             sequence = writer.add_payload(channel, stamp, _PAYLOAD)
-            writer.add_output(pack_output(index, index * 7, 1, output_kind, sequence))
+            writer.add_output(pack_output(index * 7, 1, output_kind))
+            writer.add_sequence(sequence)
             rest = pack_event(index, stamp, 0, index * 3, index * 5, 0, 1, 0, 1, kind, 0)
             writer.add_event(rest, index * 11)
         writer.close(result={"stop_reason": "benchmark", "exit_code": "0"})

@@ -139,15 +139,11 @@ OUTPUT_HASHED = slice(8, 24)
 """The bytes of an output (hash, entity, kind) that the event's output hash covers. The sequence is
 left out so that an event with the same outputs hashes alike wherever it stands."""
 
-OUTPUT_DTYPE = np.dtype(
-    [
-        ("event", "<u8"),
-        ("hash", "<u8"),
-        ("entity", "<u4"),
-        ("kind", "<u4"),
-        ("sequence", "<u4"),
-    ]
-)
+OUTPUT_CONTENT = struct.Struct("<QII")
+"""These bytes alone: hash, entity, kind."""
+
+OUTPUT_CONTENT_DTYPE = np.dtype([("hash", "<u8"), ("entity", "<u4"), ("kind", "<u4")])
+OUTPUT_DTYPE = np.dtype([("event", "<u8"), *OUTPUT_CONTENT_DTYPE.descr, ("sequence", "<u4")])
 
 MESSAGE_HEADER_DTYPE = np.dtype(
     [

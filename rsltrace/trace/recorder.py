@@ -12,11 +12,11 @@ from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.model.finding import Finding
 from rsltrace.trace.chain import hash64
-from rsltrace.trace.format import EVENT_REST, OUTPUT
+from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
 from rsltrace.trace.writer import TraceWriter
 
 _pack_event = EVENT_REST.pack
-_pack_output = OUTPUT.pack
+_pack_output = OUTPUT_CONTENT.pack
 _DRAW = int(OutputKind.DRAW)
 
 
@@ -35,6 +35,7 @@ class Recorder:
         self.output_hash = 0
         self._add_event = writer.add_event
         self._add_output = writer.add_output
+        self._add_sequence = writer.add_sequence
         self._add_payload = writer.add_payload
 
     @property
@@ -44,17 +45,18 @@ class Recorder:
 
     def output(self, kind: int, entity: int, content_hash: int, sequence: int = NO_SEQUENCE) -> int:
         """Add an output to the event under way; return which of its outputs it is."""
-        packed = _pack_output(self.index, content_hash, entity, kind, sequence)
-        self.output_hash = hash64(packed[8:24], self.output_hash)
+        packed = _pack_output(content_hash, entity, kind)
+        self.output_hash = hash64(packed, self.output_hash)
         self._add_output(packed)
+        self._add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
         return position
 
     def draw(self, entity: int, draw: int) -> None:
-        """Add what chance has decided to the event under way: ``output`` in a hurry."""
-        packed = _pack_output(self.index, draw, entity, _DRAW, NO_SEQUENCE)
-        self.output_hash = hash64(packed[8:24], self.output_hash)
+        """Add what chance has decided to the event under way: it has no payload."""
+        packed = _pack_output(draw, entity, _DRAW)
+        self.output_hash = hash64(packed, self.output_hash)
         self._add_output(packed)
         self.outputs += 1
 
@@ -66,9 +68,10 @@ class Recorder:
             sequence = self._add_payload(channel, stamp_ns, data)
         else:
             sequence = NO_SEQUENCE
-        packed = _pack_output(self.index, content_hash, entity, kind, sequence)
-        self.output_hash = hash64(packed[8:24], self.output_hash)
+        packed = _pack_output(content_hash, entity, kind)
+        self.output_hash = hash64(packed, self.output_hash)
         self._add_output(packed)
+        self._add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
         return position

@@ -63,8 +63,9 @@ class TraceWriter:
 
     An event's outputs are added before the event itself; entities and payloads at any time before
     the event that refers to them. ``add_output`` takes an output of the event that is added next,
-    packed by ``format.OUTPUT``; it is the list's own method, since a run calls it for every
-    message. ``close`` ends the file; used as a context manager, leaving the
+    packed by ``format.OUTPUT_CONTENT``, and unless it is a draw, ``add_sequence`` takes the
+    sequence of its payload (or NO_SEQUENCE); they are lists' own methods, since a run calls them
+    for every message. ``close`` ends the file; used as a context manager, leaving the
     block without ``close`` gives the file up as an interrupted run would (``abort``).
 
     Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no room,
@@ -89,9 +90,11 @@ class TraceWriter:
         self._chain_hashes = array("Q")
         self._outputs: list[bytes] = []
         self.add_output: Callable[[bytes], None] = self._outputs.append
-        self._payloads: list[chunks.Payload] = []
+        self._output_sequences: list[int] = []
+        self.add_sequence: Callable[[int], None] = self._output_sequences.append
+        self._payloads: chunks.Waiting = []
         self._payload_bytes = 0
-        self._entities: list[chunks.Payload] = []
+        self._entities: chunks.Waiting = []
         self._entity_bytes = 0
         self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
@@ -190,7 +193,7 @@ class TraceWriter:
     def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
         """Take a message (CDR with its 4-byte header). Returns its sequence in the channel."""
         sequence = self._sequences[channel_id]
-        self._payloads.append((channel_id, sequence, stamp_ns, data))
+        self._payloads.extend((channel_id, sequence, stamp_ns, data))
         self._sequences[channel_id] = sequence + 1
         self._payload_bytes += len(data) + _HEADER_BYTES
         if self._payload_bytes >= PAYLOAD_BYTES_PER_CHUNK:
@@ -208,7 +211,7 @@ class TraceWriter:
         """Take an entity; to be called before the first event that names it."""
         channel_id, data = self._entity_channel, pack_entity(entity)
         sequence = self._sequences[channel_id]
-        self._entities.append((channel_id, sequence, entity.created_ns, data))
+        self._entities.extend((channel_id, sequence, entity.created_ns, data))
         self._sequences[channel_id] = sequence + 1
         self._entity_bytes += len(data) + _HEADER_BYTES
         if self._entity_bytes >= PAYLOAD_BYTES_PER_CHUNK:
@@ -274,7 +277,7 @@ class TraceWriter:
         self._write_waiting(self._payloads)
         self._payload_bytes = 0
 
-    def _write_waiting(self, waiting: list[chunks.Payload]) -> None:
+    def _write_waiting(self, waiting: chunks.Waiting) -> None:
         try:
             self._stream.chunk(chunks.payloads_chunk(waiting))
             waiting.clear()
@@ -293,8 +296,8 @@ class TraceWriter:
 
     def _write_events_and_outputs(self) -> None:
         events = chunks.event_rows(self._rests, self._chain_hashes)
-        outputs = chunks.output_rows(self._outputs)
-        self._check(events, outputs)
+        self._check(events)
+        outputs = chunks.output_rows(self._outputs, self._output_sequences, events)
         outputs_at = (0, 0)
         if len(outputs):
             outputs_at = self._stream.chunk(
@@ -317,21 +320,21 @@ class TraceWriter:
         self._outputs_written += len(outputs)
         self._rests.clear()
         self._outputs.clear()
+        self._output_sequences.clear()
         del self._chain_hashes[:]
 
-    def _check(self, events: npt.NDArray[np.void], outputs: npt.NDArray[np.void]) -> None:
+    def _check(self, events: npt.NDArray[np.void]) -> None:
         """A recorder that miscounts would write a trace that misleads: stop at once instead."""
         first = self._events_written
         indexes = np.arange(first, first + len(events), dtype=np.uint64)
         assert np.array_equal(events["index"], indexes), "events are not numbered 0, 1, 2, …"
-        owners = np.repeat(indexes, events["outputs"])
-        assert np.array_equal(outputs["event"], owners), "outputs do not match their events"
 
     def _drop_unfinished_event(self) -> None:
-        del self._rests[len(self._chain_hashes) :]  # interrupted in the middle of add_event
-        outputs = chunks.output_rows(self._outputs)
-        finished = int(np.count_nonzero(outputs["event"] < self.event_count))
-        del self._outputs[finished:]
+        """Forget what came after the last whole event: an interrupt may have come anywhere."""
+        del self._rests[len(self._chain_hashes) :]
+        events = chunks.event_rows(self._rests, self._chain_hashes)
+        del self._outputs[int(events["outputs"].sum()) :]
+        del self._output_sequences[chunks.count_numbered(self._outputs) :]
 
     def _result(self, given: Mapping[str, str]) -> dict[str, str]:
         result = {

@@ -30,6 +30,7 @@ from rsltrace.trace.format import (
     METADATA_ENVIRONMENT,
     METADATA_JOB,
     OUTPUT,
+    OUTPUT_HASHED,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
     TOPIC_ROSOUT,
@@ -138,7 +139,9 @@ class Feeder:
     ) -> None:
         output = Output(len(self.events), entity, kind, hash64(content), sequence)
         self.pending.append(output)
-        self.writer.add_output(pack_output(output))
+        self.writer.add_output(pack_output(output)[OUTPUT_HASHED])
+        if kind is not OutputKind.DRAW:
+            self.writer.add_sequence(sequence)
 
     def detail(self, kind: OutputKind, entity: int, stamp_ns: int, text: str) -> None:
         event, nth = len(self.events), len(self.pending)

@@ -23,7 +23,7 @@ from rsltrace.trace import writer as writer_module
 from rsltrace.trace.format import (
     EVENT_REST,
     EVENTS_PER_SEGMENT,
-    OUTPUT,
+    OUTPUT_CONTENT,
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
 )
@@ -463,9 +463,15 @@ def test_a_recorder_that_miscounts_is_stopped(tmp_path: Path) -> None:
         with pytest.raises(AssertionError, match="not numbered"):
             writer.close(result={})
     with TraceWriter(tmp_path / "b.mcap", force=False) as writer:
-        writer.add_output(OUTPUT.pack(0, 0, 0, 1, 0))
-        writer.add_event(event[0], 0)
+        writer.add_output(OUTPUT_CONTENT.pack(0, 0, 1))
+        writer.add_sequence(0)
+        writer.add_event(EVENT_REST.pack(0, 0, 0, 0, 0, 0, 0, 0, 2, 2, 0), 0)
         with pytest.raises(AssertionError, match="do not match"):
+            writer.close(result={})
+    with TraceWriter(tmp_path / "c.mcap", force=False) as writer:
+        writer.add_output(OUTPUT_CONTENT.pack(0, 0, 1))  # and no sequence, as a draw has none
+        writer.add_event(EVENT_REST.pack(0, 0, 0, 0, 0, 0, 0, 0, 1, 2, 0), 0)
+        with pytest.raises(AssertionError, match="do not match their sequences"):
             writer.close(result={})
 
 
@@ -479,7 +485,8 @@ def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
             tracemalloc.start()
             for index in range(events):
                 sequence = writer.add_payload(channel, index, b"x" * 20)
-                writer.add_output(OUTPUT.pack(index, 1, 1, 1, sequence))
+                writer.add_output(OUTPUT_CONTENT.pack(1, 1, 1))
+                writer.add_sequence(sequence)
                 writer.add_event(rest_of(index, index, 0, 0, 0, 0, 0, 0, 1, 2, 0), index)
             writer.close(result={})
             _, highest = tracemalloc.get_traced_memory()
