@@ -18,7 +18,7 @@ import itertools
 from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
-from typing import Any, Protocol, TypeVar
+from typing import Any, Protocol
 
 from rsltrace.errors import LivelockError
 from rsltrace.loop.stop import Progress, Stop, StopCondition, quiet_until_ns
@@ -41,21 +41,27 @@ class TimerOwner(Dispatchable, Protocol):
     """What a due timer dispatches."""
 
 
-T = TypeVar("T")
-
 NOTHING_LEFT = "nothing left to do"
 END_OF_TIME = "what is due next is beyond 2**63 ns, where ROS's time ends"
 TIME_NS_MAX = 2**63 - 1
 ORDER_BAG = 0
 ORDER_RELEASE = 1
 
+Release = tuple[Any, ...]
+"""What is scheduled: when (ns), its order (``ORDER_…``), its place in the order of scheduling, what
+is called with this very tuple, and whatever that needs. A message's is also what waits in the
+queue of its subscription: nearly every event of a run with delays is one, and makes one tuple."""
+
+
+def _act(release: Release) -> None:
+    release[4]()
+
 
 class EventLoop:
     """The state of a simulation in time: clock, ready queue, timers, scheduled releases.
 
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
-    (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases: time, order, place in
-    the order of scheduling, what to call, and with what (None: nothing).
+    (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases.
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -91,18 +97,20 @@ class EventLoop:
         self._pause_events = 0
         self._until_events = -1
         self._quiet_ns = -1
-        self.scheduled: list[tuple[int, int, int, Callable[..., None], Any]] = []
+        self.scheduled: list[Release] = []
         self.next_place = itertools.count().__next__
 
     def schedule(
         self, time_ns: int, action: Callable[[], None], *, order: int = ORDER_RELEASE
     ) -> None:
         """Run ``action`` when simulated time reaches ``time_ns`` (at once if that is past)."""
-        heappush(self.scheduled, (time_ns, order, self.next_place(), action, None))
+        heappush(self.scheduled, (time_ns, order, self.next_place(), _act, action))
 
-    def schedule_arrival(self, time_ns: int, receive: Callable[[T], None], what: T) -> None:
-        """Call ``receive(what)`` when simulated time reaches ``time_ns``; ``what`` is not None."""
-        heappush(self.scheduled, (time_ns, ORDER_RELEASE, self.next_place(), receive, what))
+    def schedule_release(
+        self, time_ns: int, release: Callable[[Release], None], *what: object
+    ) -> None:
+        """Call ``release`` when simulated time reaches ``time_ns``; from [4] on is ``what``."""
+        heappush(self.scheduled, (time_ns, ORDER_RELEASE, self.next_place(), release, *what))
 
     def stop(self, stop: Stop) -> None:
         """End the run after the present event. The first call wins."""
@@ -170,11 +178,9 @@ class EventLoop:
     def next_ns(self) -> int | None:
         """Return when the next timer or release is due, or None if there is neither."""
         timer = self.next_timer()
-        scheduled = self.scheduled
-        if timer is None:
-            return scheduled[0][0] if scheduled else None
-        if scheduled and scheduled[0][0] < timer.deadline_ns:
-            return scheduled[0][0]
+        release_ns: int | None = self.scheduled[0][0] if self.scheduled else None
+        if timer is None or (release_ns is not None and release_ns < timer.deadline_ns):
+            return release_ns
         return timer.deadline_ns
 
     def run_step(self) -> None:
@@ -204,11 +210,8 @@ class EventLoop:
                     break
                 self.now_ns = now_ns = next_ns
                 began = self.events
-                _, _, _, action, what = heappop(scheduled)
-                if what is None:
-                    action()
-                else:
-                    action(what)
+                release = heappop(scheduled)
+                release[3](release)
                 if scheduled and scheduled[0][0] <= now_ns:
                     break
                 if ready:
@@ -216,11 +219,8 @@ class EventLoop:
                 if self.now_ns is not now_ns or self.events >= self._until_events:
                     break
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
-                _, _, _, action, what = heappop(scheduled)
-                if what is None:
-                    action()
-                else:
-                    action(what)
+                release = heappop(scheduled)
+                release[3](release)
             limit = began + self._livelock_limit
             while not self._interrupt:
                 if tasks:

@@ -111,8 +111,8 @@ class OrderedLoop(EventLoop):
         scheduled = self.scheduled
         limit = self.events + self._livelock_limit
         while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
-            _, _, _, action, what = heappop(scheduled)
-            action() if what is None else action(what)
+            release = heappop(scheduled)
+            release[3](release)
         while not self._interrupt:
             place = self._next()
             if place is not None:

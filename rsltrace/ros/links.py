@@ -6,20 +6,27 @@ A graph without models has no links, and its publications go straight into the q
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
 from rsltrace.chance.network import NetworkPlan
+from rsltrace.loop.loop import ORDER_RELEASE
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.ros.qos import INFINITE_NS, Reliability
 from rsltrace.ros.qos_status import MESSAGE_LOST
 from rsltrace.ros.qos_time import RequestedLease, finite
-from rsltrace.ros.quick_link import Send, expects, quick_send
+from rsltrace.ros.quick_link import Send, quick_send
 
 if TYPE_CHECKING:
+    from rsltrace.loop.loop import Release
     from rsltrace.ros.core import Core
     from rsltrace.ros.pubsub import Delivery, PublisherHandle, SubscriptionHandle
     from rsltrace.ros.services import ClientHandle, Exchange, ServiceHandle
+
+# Canonical CDR, publishing event, which of its outputs, content hash, publication stamp (ns) and
+# number: what a Delivery has from [4] on.
+Message = tuple[bytes, int, int, int, int, int]
 
 _DELAY = encode_draw(Draw.DELAY)
 _LOST = {
@@ -131,7 +138,10 @@ class Exchanges:
         if arrival_ns == now_ns:
             self._arrive(exchange)
         else:
-            loop.schedule_arrival(arrival_ns, self._arrive, exchange)
+            loop.schedule_release(arrival_ns, self._released, exchange)
+
+    def _released(self, release: Release) -> None:
+        self._arrive(release[4])
 
     def _arrive(self, exchange: Exchange) -> None:
         if not self._receiver.destroyed:
@@ -157,7 +167,7 @@ class Link:
         self._core = core
         self._publisher = publisher
         self._channel = channel
-        self._held: deque[tuple[Delivery, list[int]]] = deque(maxlen=publisher.qos.keep)
+        self._held: deque[tuple[Message, list[int]]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
         self.last_ns = 0
         self.expected_ns = -1
@@ -194,7 +204,7 @@ class Link:
         loop = core.loop
         now_ns = loop.now_ns
         arrival_ns = now_ns + core.busy_ns
-        delivery = (data, event, position, digest, stamp_ns, count, now_ns)
+        message = (data, event, position, digest, stamp_ns, count)
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
@@ -210,23 +220,31 @@ class Link:
                 arrivals_ns.append(copy_ns)
             self.last_ns = max(self.last_ns, *arrivals_ns)
             if channel.held_until_ns >= 0:
-                self._hold(delivery, arrivals_ns, channel.held_until_ns)
+                self._hold(message, arrivals_ns, channel.held_until_ns)
                 return
             for arrival_ns in arrivals_ns:
-                self._bring(delivery, arrival_ns)
+                self._bring(message, arrival_ns)
             return
-        self._bring(delivery, arrival_ns)
+        self._bring(message, arrival_ns)
 
-    def _bring(self, delivery: Delivery, arrival_ns: int) -> None:
+    def _bring(self, message: Message, arrival_ns: int) -> None:
         loop = self._core.loop
         now_ns = loop.now_ns
-        if arrival_ns <= now_ns and (self.expected_ns != now_ns or not expects(loop, self._arrive)):
-            self._arrive(delivery)
+        if arrival_ns <= now_ns and not self.expects(self._arrive):
+            self._arrive((now_ns, ORDER_RELEASE, 0, self._arrive, *message))
         else:
             self.expected_ns = arrival_ns
-            loop.schedule_arrival(arrival_ns, self._arrive, delivery)
+            loop.schedule_release(arrival_ns, self._arrive, *message)
 
-    def _arrive(self, delivery: Delivery) -> None:
+    def expects(self, arrive: Callable[[Release], None]) -> bool:
+        """Whether a message is due now that has not arrived yet: none must overtake it."""
+        loop = self._core.loop
+        now_ns = loop.now_ns
+        return self.expected_ns == now_ns and any(
+            release[3] == arrive and release[0] <= now_ns for release in loop.scheduled
+        )
+
+    def _arrive(self, release: Release) -> None:
         subscription = self.subscription
         if subscription.destroyed:
             return
@@ -234,24 +252,24 @@ class Link:
             lost, self._lost = self._lost, 0
             subscription.events.add(MESSAGE_LOST, total=lost)
         loop = self._core.loop
-        arrived = (*delivery[:6], loop.now_ns)
+        arrived: Delivery = (loop.now_ns, *release[1:])
         if self._timed:
             if self._lease is not None:
                 self._lease.seen()
             if subscription.deadline is not None:
                 subscription.deadline.seen()
             if self._lifespan_ns != INFINITE_NS:
-                stale_ns = delivery[4] + self._lifespan_ns
+                stale_ns = arrived[8] + self._lifespan_ns
                 if stale_ns <= loop.now_ns:
                     return
-                loop.schedule_arrival(stale_ns, self._expire, arrived)
+                loop.schedule_release(stale_ns, self._expire, arrived)
         subscription.deliver(arrived)
 
-    def _expire(self, delivery: Delivery) -> None:
+    def _expire(self, release: Release) -> None:
         """Drop a message that nobody has taken within its lifespan."""
         queue = self.subscription.queue
         for place, waiting in enumerate(queue):
-            if waiting is delivery:
+            if waiting is release[4]:
                 del queue[place]
                 return
 
@@ -271,18 +289,18 @@ class Link:
         if self._lease is not None:
             self._lease.gone()
 
-    def _hold(self, delivery: Delivery, arrivals_ns: list[int], until_ns: int) -> None:
+    def _hold(self, message: Message, arrivals_ns: list[int], until_ns: int) -> None:
         if not self._held:
             self._core.loop.schedule(until_ns, self._release)
         elif len(self._held) == self._held.maxlen:
             self._lost += 1
-        self._held.append((delivery, arrivals_ns))
+        self._held.append((message, arrivals_ns))
 
     def _release(self) -> None:
         """Let go of what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
         loop = self._core.loop
-        for delivery, arrivals_ns in held:
+        for message, arrivals_ns in held:
             for arrival_ns in arrivals_ns:
-                loop.schedule_arrival(max(arrival_ns, loop.now_ns), self._arrive, delivery)
+                loop.schedule_release(max(arrival_ns, loop.now_ns), self._arrive, *message)

@@ -27,9 +27,10 @@ if TYPE_CHECKING:
 _SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
 _MESSAGE = int(OutputKind.MESSAGE)
 
-# A message on its way: canonical CDR, index of the publishing event, which of its outputs,
-# content hash, publication stamp (ns), publication number, reception stamp (ns).
-Delivery = tuple[bytes, int, int, int, int, int, int]
+# A message on its way, as the loop's releases are: reception stamp (ns), order and place in the
+# loop's queue, who is called; then canonical CDR, index of the publishing event, which of its
+# outputs, content hash, publication stamp (ns), publication number.
+Delivery = tuple[Any, ...]
 
 
 class PublisherHandle(EntityHandle):
@@ -103,7 +104,7 @@ class PublisherHandle(EntityHandle):
             for link in self.links:
                 link.send(data, event, position, digest, now_ns, count)
         else:
-            delivery = (data, event, position, digest, now_ns, count, now_ns)
+            delivery = (now_ns, 0, 0, None, data, event, position, digest, now_ns, count)
             ready = loop.ready
             for subscription in self.subscriptions:
                 subscription.queue.append(delivery)
@@ -112,7 +113,7 @@ class PublisherHandle(EntityHandle):
                 else:
                     subscription.find_wrapper()
         if self._history is not None:
-            self._history.append((data, event, position, digest, now_ns, count, now_ns))
+            self._history.append((now_ns, 0, 0, None, data, event, position, digest, now_ns, count))
         if self._offers is not None:
             self._offers.sent()
         if self._watcher is not None:
@@ -133,8 +134,8 @@ class PublisherHandle(EntityHandle):
                 subscription.deliver(delivery)
             return
         link = next(link for link in self.links if link.subscription is subscription)
-        for data, event, position, digest, stamp_ns, count, _ in wanted:
-            link.send(data, event, position, digest, stamp_ns, count)
+        for delivery in wanted:
+            link.send(*delivery[4:])
 
     def connect(self, subscription: SubscriptionHandle) -> None:
         """Send to this subscription, too; fan-out is in the creation order of subscriptions."""
@@ -254,7 +255,7 @@ class SubscriptionHandle(Receiver):
         if not self.may_run():
             return
         wrapper = self.wrapper
-        data, event, position, digest, _, _, _ = delivery = self.queue.popleft()
+        _, _, _, _, data, event, position, digest, _, _ = delivery = self.queue.popleft()
         callback = wrapper._callback
         if callback is not self._callback:
             self._learn(wrapper)
@@ -280,7 +281,7 @@ class SubscriptionHandle(Receiver):
         if not self.queue:
             return None
         delivery = self.queue.popleft()
-        data = delivery[0]
+        data = delivery[4]
         message = data if raw else codec_for(msg_type).deserialize(data)
         return message, _message_info(delivery)
 
@@ -332,8 +333,8 @@ def _by_age(endpoint: SubscriptionHandle) -> int:
 def _message_info(delivery: Delivery) -> dict[str, int | None]:
     """Return the MessageInfo dictionary that rclpy 7 passes to callbacks."""
     return {
-        "source_timestamp": delivery[4],
-        "received_timestamp": delivery[6],
-        "publication_sequence_number": delivery[5],
+        "source_timestamp": delivery[8],
+        "received_timestamp": delivery[0],
+        "publication_sequence_number": delivery[9],
         "reception_sequence_number": None,
     }

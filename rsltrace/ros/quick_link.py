@@ -11,23 +11,17 @@ from heapq import heappush
 from typing import TYPE_CHECKING
 
 from rsltrace.chance.distribution import Sampler
-from rsltrace.loop.loop import ORDER_RELEASE, EventLoop
+from rsltrace.loop.loop import ORDER_RELEASE, Release
 from rsltrace.model.draw import Draw, encode_draw
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
     from rsltrace.ros.links import Link
-    from rsltrace.ros.pubsub import Delivery
 
 Send = Callable[[bytes, int, int, int, int, int], None]
-"""Sends a message on its way: the fields of a ``Delivery`` up to the publication number."""
+"""Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
 _DELAY = encode_draw(Draw.DELAY)
-
-
-def expects(loop: EventLoop, arrive: Callable[[Delivery], None]) -> bool:
-    """Whether something is due now that has not arrived yet: a bag's message must not overtake."""
-    return any(entry[3] == arrive and entry[0] <= loop.now_ns for entry in loop.scheduled)
 
 
 def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
@@ -37,10 +31,10 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     entity = subscription.entity_id
     ready, scheduled, next_place = loop.ready, loop.scheduled, loop.next_place
 
-    def arrive(delivery: Delivery) -> None:
+    def arrive(release: Release) -> None:
         if subscription.destroyed:
             return
-        subscription.queue.append(delivery)
+        subscription.queue.append(release)
         if subscription.wrapper is not None:
             ready.append(subscription)
         else:
@@ -49,8 +43,7 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     def send(
         data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
     ) -> None:
-        now_ns = loop.now_ns
-        leaves_ns = now_ns + core.busy_ns
+        leaves_ns = loop.now_ns + core.busy_ns
         delay_ns = delay(leaves_ns)
         arrival_ns = leaves_ns + delay_ns
         if arrival_ns < link.last_ns:
@@ -60,15 +53,14 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
         recorder = core.recorder
         if recorder is not None:
             recorder.draw(entity, _DELAY | delay_ns)
-        delivery = (data, event, position, digest, stamp_ns, count, arrival_ns)
-        if (
-            not delay_ns
-            and arrival_ns == now_ns
-            and (link.expected_ns != now_ns or not expects(loop, arrive))
-        ):
-            arrive(delivery)
-        else:
+        place = next_place()
+        release = (
+            arrival_ns, ORDER_RELEASE, place, arrive, data, event, position, digest, stamp_ns, count
+        )  # fmt: skip
+        if delay_ns or arrival_ns != loop.now_ns or link.expects(arrive):
             link.expected_ns = arrival_ns
-            heappush(scheduled, (arrival_ns, ORDER_RELEASE, next_place(), arrive, delivery))
+            heappush(scheduled, release)
+        else:
+            arrive(release)
 
     return send

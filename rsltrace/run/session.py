@@ -37,7 +37,7 @@ from rsltrace.run.executables import why_not
 from rsltrace.run.guarding import Guarding, entry_key, guarding
 from rsltrace.run.inputs import check_output
 from rsltrace.run.network import network_plan
-from rsltrace.run.process import Observer, housekeeping, quiet_gc, search_path
+from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
 from rsltrace.run.recorded_order import following, keep_choices, note_choices
 from rsltrace.run.scheduling import is_ordered, scheduling_plan
@@ -165,6 +165,7 @@ class Session:
         if self._observer.interrupt is not None:
             self._observer.interrupt(self._interrupt)
         stack.enter_context(quiet_gc())
+        keep_heap()
         stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:

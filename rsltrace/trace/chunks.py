@@ -77,7 +77,7 @@ def event_rows(rests: Sequence[bytes], chain_hashes: array[int]) -> npt.NDArray[
 
 
 def output_rows(
-    contents: Sequence[bytes], sequences: Sequence[int], events: npt.NDArray[np.void]
+    contents: Sequence[bytes], sequences: array[int], events: npt.NDArray[np.void]
 ) -> npt.NDArray[np.void]:
     """Return the outputs of ``events`` as an array of OUTPUT_DTYPE, shape (n,).
 
@@ -90,8 +90,9 @@ def output_rows(
     rows = np.empty(len(packed), dtype=_NUMBERED_DTYPE)
     rows["event"] = owners
     rows["content"] = packed.view(_NUMBERED_DTYPE["content"])
-    rows["sequence"] = NO_SEQUENCE
-    rows["sequence"][numbered] = sequences
+    sequence = np.full(len(packed), NO_SEQUENCE, dtype="<u4")
+    sequence[numbered] = sequences
+    rows["sequence"] = sequence
     return rows.view(OUTPUT_DTYPE)
 
 

