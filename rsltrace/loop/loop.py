@@ -190,7 +190,6 @@ class EventLoop:
         delays on every link nearly every event is a time step of its own.
         """
         now_ns = self.now_ns
-        began = self.events
         scheduled = self.scheduled
         tasks = self.tasks
         ready = self.ready
@@ -209,7 +208,6 @@ class EventLoop:
                 if next_ns <= now_ns or next_ns >= horizon_ns:
                     break
                 self.now_ns = now_ns = next_ns
-                began = self.events
                 release = heappop(scheduled)
                 release[3](release)
                 if scheduled and scheduled[0][0] <= now_ns:
@@ -221,7 +219,7 @@ class EventLoop:
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
                 release = heappop(scheduled)
                 release[3](release)
-            limit = began + self._livelock_limit
+            limit = self.events + self._livelock_limit
             while not self._interrupt:
                 if tasks:
                     tasks.popleft().dispatch()
@@ -251,7 +249,6 @@ class EventLoop:
             if next_ns >= quiet_ns or next_ns <= now_ns or next_ns == NEVER_NS:
                 return
             self.now_ns = now_ns = next_ns
-            began = self.events
 
     def _run_idle(self) -> bool:
         """Let those who poll have a look, now that nothing else is ready. True: go on."""

@@ -153,7 +153,7 @@ class Link:
 
     What a reliable publisher cannot send during an outage waits in ``_held``, which holds as many
     messages as its history: later ones push the oldest out, as in DDS. ``last_ns`` is when the last
-    message in order arrives, ``expected_ns`` is the last arrival that was left to the loop.
+    message in order arrives.
     """
 
     def __init__(
@@ -170,7 +170,6 @@ class Link:
         self._held: deque[tuple[Message, list[int]]] = deque(maxlen=publisher.qos.keep)
         self._lost = 0
         self.last_ns = 0
-        self.expected_ns = -1
         self._receiver = subscription.entity_id
         self._lifespan_ns = min(
             limit if finite(limit) else INFINITE_NS
@@ -233,15 +232,13 @@ class Link:
         if arrival_ns <= now_ns and not self.expects(self._arrive):
             self._arrive((now_ns, ORDER_RELEASE, 0, self._arrive, *message))
         else:
-            self.expected_ns = arrival_ns
             loop.schedule_release(arrival_ns, self._arrive, *message)
 
     def expects(self, arrive: Callable[[Release], None]) -> bool:
         """Whether a message is due now that has not arrived yet: none must overtake it."""
-        loop = self._core.loop
-        now_ns = loop.now_ns
-        return self.expected_ns == now_ns and any(
-            release[3] == arrive and release[0] <= now_ns for release in loop.scheduled
+        scheduled, now_ns = self._core.loop.scheduled, self._core.loop.now_ns
+        return bool(scheduled and scheduled[0][0] <= now_ns) and any(
+            release[3] == arrive and release[0] <= now_ns for release in scheduled
         )
 
     def _arrive(self, release: Release) -> None:

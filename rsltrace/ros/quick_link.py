@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING
 from rsltrace.chance.distribution import Sampler
 from rsltrace.loop.loop import ORDER_RELEASE, Release
 from rsltrace.model.draw import Draw, encode_draw
+from rsltrace.model.event import OutputKind
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.format import OUTPUT_CONTENT
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
@@ -22,6 +25,8 @@ Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
 
 _DELAY = encode_draw(Draw.DELAY)
+_DRAW = int(OutputKind.DRAW)
+_pack_output = OUTPUT_CONTENT.pack
 
 
 def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
@@ -43,7 +48,9 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     def send(
         data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
     ) -> None:
-        leaves_ns = loop.now_ns + core.busy_ns
+        leaves_ns = loop.now_ns
+        if core.busy_ns:
+            leaves_ns += core.busy_ns
         delay_ns = delay(leaves_ns)
         arrival_ns = leaves_ns + delay_ns
         if arrival_ns < link.last_ns:
@@ -51,14 +58,16 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
             delay_ns = arrival_ns - leaves_ns
         link.last_ns = arrival_ns
         recorder = core.recorder
-        if recorder is not None:
-            recorder.draw(entity, _DELAY | delay_ns)
+        if recorder is not None:  # what Recorder.draw does
+            packed = _pack_output(_DELAY | delay_ns, entity, _DRAW)
+            recorder.output_hash = hash64(packed, recorder.output_hash)
+            recorder.add_output(packed)
+            recorder.outputs += 1
         place = next_place()
         release = (
             arrival_ns, ORDER_RELEASE, place, arrive, data, event, position, digest, stamp_ns, count
         )  # fmt: skip
         if delay_ns or arrival_ns != loop.now_ns or link.expects(arrive):
-            link.expected_ns = arrival_ns
             heappush(scheduled, release)
         else:
             arrive(release)

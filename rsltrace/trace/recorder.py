@@ -24,6 +24,7 @@ class Recorder:
     """The event under way, and the hash chain so far.
 
     ``outputs`` and ``output_hash`` belong to the event under way; ``end_event`` closes it.
+    ``add_output`` is the writer's.
     """
 
     def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
@@ -34,7 +35,7 @@ class Recorder:
         self.outputs = 0
         self.output_hash = 0
         self._add_event = writer.add_event
-        self._add_output = writer.add_output
+        self.add_output = writer.add_output
         self._add_sequence = writer.add_sequence
         self._add_payload = writer.add_payload
 
@@ -47,7 +48,7 @@ class Recorder:
         """Add an output to the event under way; return which of its outputs it is."""
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        self._add_output(packed)
+        self.add_output(packed)
         self._add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
@@ -57,7 +58,7 @@ class Recorder:
         """Add what chance has decided to the event under way: it has no payload."""
         packed = _pack_output(draw, entity, _DRAW)
         self.output_hash = hash64(packed, self.output_hash)
-        self._add_output(packed)
+        self.add_output(packed)
         self.outputs += 1
 
     def message(
@@ -70,7 +71,7 @@ class Recorder:
             sequence = NO_SEQUENCE
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        self._add_output(packed)
+        self.add_output(packed)
         self._add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
