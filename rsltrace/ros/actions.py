@@ -44,11 +44,9 @@ class Part(Receiver):
         """Let rclpy take the oldest arrival and execute it, as one event."""
         if not self.may_run():
             return
-        _, event, position, digest, *_ = self.queue[0]
         begin(self.wrapper.callback_group, self.wrapper)
-        start_coroutine(
-            self.core, self, ACTION, self.owner.execute, (self,), event, position, digest
-        )
+        origin = self.queue[0][self.origin]
+        start_coroutine(self.core, self, ACTION, self.owner.execute, (self,), *origin)
 
     def trace_detail(self) -> dict[str, object]:
         return {"action": self.owner.name}

@@ -115,6 +115,8 @@ class Receiver(EntityHandle):
     """
 
     queue: deque[Any]
+    origin = slice(1, 4)
+    """Where an arrival says what it is: publishing event, which of its outputs, content hash."""
 
     def deliver(self, arrival: Any) -> None:
         """Queue an arrival; it is dispatched once the node is being run."""

@@ -30,7 +30,7 @@ _MESSAGE = int(OutputKind.MESSAGE)
 # A message on its way, as the loop's releases are: reception stamp (ns), order and place in the
 # loop's queue, who is called; then canonical CDR, index of the publishing event, which of its
 # outputs, content hash, publication stamp (ns), publication number.
-Delivery = tuple[Any, ...]
+Delivery = tuple[int, int, int, Any, bytes, int, int, int, int, int]
 
 
 class PublisherHandle(EntityHandle):
@@ -217,6 +217,7 @@ class SubscriptionHandle(Receiver):
 
     kind = EntityKind.SUBSCRIPTION
     lists = "subscriptions"
+    origin = slice(5, 8)
 
     def __init__(
         self,

@@ -87,8 +87,7 @@ class UserWaitable:
         self.entity_id = handle.entity_id
         cause, digest = self._cause, 0
         if getattr(handle, "queue", None):
-            _, event, position, digest, *_ = handle.queue[0]
-            cause = (event, position)
+            *cause, digest = handle.queue[0][handle.origin]
         begin(self.wrapper.callback_group, self.wrapper)
         here: Any = self  # has what start_coroutine needs
         start_coroutine(core, here, int(_KINDS[name]), self._execute, (), *cause, digest)

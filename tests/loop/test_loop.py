@@ -171,7 +171,9 @@ def test_a_livelock_names_those_who_keep_it_going() -> None:
     ping = Item(loop, log, "ping", lambda: loop.ready.append(pong))
     pong = Item(loop, log, "pong", lambda: loop.ready.append(ping))
     loop.schedule(7, lambda: loop.ready.append(ping))
-    with pytest.raises(LivelockError, match=r"0\.000000007 s after 50 events.*(ping; pong|pong; ping)"):
+    with pytest.raises(
+        LivelockError, match=r"0\.000000007 s after 50 events.*(ping; pong|pong; ping)"
+    ):
         loop.run()
 
 
