@@ -151,7 +151,8 @@ def work_rsltrace(graph: Graph, mode: str, events: int, folder: Path) -> dict[st
     )
     figures = {key: long[key] - short[key] for key in MEASURED}
     each_s = figures["wall_s"] / figures["callbacks"]
-    return figures | {"start_up_s": runs[0][0]["wall_s"] - short["callbacks"] * each_s}
+    start_up_s = runs[0][0]["wall_s"] - short["callbacks"] * each_s
+    return runs[0][1] | figures | {"start_up_s": start_up_s}
 
 
 def measure(case: Case, amount: float) -> None:

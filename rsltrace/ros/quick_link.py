@@ -1,7 +1,8 @@
 """The usual link in a hurry: every message takes some time and arrives, in the order of sending.
 
 With a delay on every link, most events of a run are messages that come this way. What a link has to
-look up is therefore bound once, in a closure, and its arrivals go straight into the loop's queue.
+look up is therefore bound once, in a closure, its arrivals go straight into the loop's queue, and
+its draws to the recorder without a call.
 """
 
 from __future__ import annotations
