@@ -27,14 +27,15 @@ def has_remappings(job: Job) -> bool:
 
 def unused_remappings(job: Job, met: Met) -> Iterator[str]:
     """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do."""
+    everybody: list[Asker] = []
     for index, spec in enumerate(job.nodes):
         key = entry_key(spec, job.nodes[:index])
         own = [asker for asker in met.asked if asker.entry_key == key]
+        everybody += own  # nodes of hooks, of callbacks and the bag player get no arguments
         for old in spec.remappings:
             loc: Loc = ("nodes", index, "remappings", old)
             if own and not _is_used(old, own, met):
                 yield f"{spec.origin or locate(job, loc)}: {_note(old, own, met)}"
-    everybody = list(met.asked)
     for index, old in _rules(job.ros_arguments):
         if not _is_used(old, everybody, met):
             yield f"{locate(job, ('ros_arguments', index))}: {_note(old, everybody, met)}"

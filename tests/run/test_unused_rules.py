@@ -31,6 +31,16 @@ class Free(Node):
     def __init__(self):
         super().__init__('free', allow_undeclared_parameters=True)
 
+class Parent(Node):
+    def __init__(self):
+        super().__init__('parent')
+        self.timer = self.create_timer(0.5, self.tick)
+
+    def tick(self):
+        self.timer.cancel()
+        self.child = Node('child')  # gets no arguments: they are those of the job's nodes
+        self.child.create_publisher(UInt64, 'toy', 10)
+
 class Late(Node):
     def __init__(self):
         super().__init__('late')
@@ -305,3 +315,9 @@ def test_topics_to_keep_in_a_file_that_jobs_share_are_not_named(
     assert record_job("include: common.yaml\n" + yaml, output=None).notes == ()
     (note,) = record_job(yaml + "record: {exclude: [/camera/*]}\n", output=None).notes
     assert "job.yaml:3:20: no topic or service fits '/camera/*'" in note
+
+
+def test_what_is_remapped_for_no_node_of_the_job_is_named(record_job: Callable[..., Any]) -> None:
+    yaml = "nodes: [{node: nodes_under_test:Parent}]\nros_arguments: [-r, 'toy:=/toys']\n"
+    (note,) = record_job(yaml, NODES, output=None).notes
+    assert "job.yaml:2:21: nothing of /parent is called 'toy', so nothing is remapped" in note
