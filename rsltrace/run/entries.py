@@ -8,12 +8,13 @@ from functools import partial
 from inspect import Parameter
 from typing import Any
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, RunError
 from rsltrace.job import Job, locate, policy_of, showing_line
 from rsltrace.job.node import Target, target_text
 from rsltrace.job.problems import Loc, nearest
 from rsltrace.ros.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.ros.entry import Entry, ros_arguments
+from rsltrace.ros.hints import parameter_in
 from rsltrace.run.executables import Mains
 from rsltrace.run.guarding import entry_key
 from rsltrace.run.target import load_target
@@ -108,6 +109,21 @@ def _shown(job: Job, loc: Loc, message: str) -> JobError:
             raise JobError(message, where=locate(job, loc))
     except JobError as error:
         return error
+
+
+def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
+    """Add to the error of a constructor the line of the job at which the parameter stands that it
+    refused, or the node, if there are several that are made in the same way."""
+    for index, spec in enumerate(job.nodes):
+        if error is None or entry_key(spec, job.nodes[:index]) != entry.key:
+            continue
+        name = parameter_in(error.__cause__)
+        if name in spec.parameters:
+            place = spec.origin or locate(job, ("nodes", index, "parameters", name or ""))
+            error.args = (f"{error}\n  the job gives it at {place}",)
+        elif sum(other.target == spec.target for other in job.nodes) > 1:
+            place = spec.origin or locate(job, ("nodes", index))
+            error.args = (f"{error}\n  the job names it at {place}",)
 
 
 def hook_entries(

@@ -32,9 +32,9 @@ from rsltrace.run.bags import (
     start_players,
 )
 from rsltrace.run.clocks import clock_notes, clocks_of
-from rsltrace.run.entries import hook_entries, node_entries
+from rsltrace.run.entries import hook_entries, node_entries, say_where
 from rsltrace.run.executables import why_not
-from rsltrace.run.guarding import Guarding, entry_key, guarding
+from rsltrace.run.guarding import Guarding, guarding
 from rsltrace.run.inputs import check_output
 from rsltrace.run.network import network_plan
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
@@ -278,29 +278,12 @@ class Session:
             core.fed = bool(self._bags)
             for entry in self._entries:
                 if not self.world.construct(entry):
-                    self._say_where(entry)
+                    say_where(self.job, entry, self.world.error)
                     break
             if not self.ended:
                 start_players(self.world, self.job, self._bags)
             if not self.ended:
                 self.world.jump(self.start_ns)
-
-    def _say_where(self, entry: Entry) -> None:
-        """Add to the error of a constructor the line of the job at which the parameter stands that
-        it refused, or the node, if there are several that are made in the same way."""
-        from rsltrace.ros.hints import parameter_in
-
-        job, error = self.job, self.world.error
-        for index, spec in enumerate(job.nodes):
-            if error is None or entry_key(spec, job.nodes[:index]) != entry.key:
-                continue
-            name = parameter_in(error.__cause__)
-            if name in spec.parameters:
-                place = spec.origin or locate(job, ("nodes", index, "parameters", name or ""))
-                error.args = (f"{error}\n  the job gives it at {place}",)
-            elif sum(other.target == spec.target for other in job.nodes) > 1:
-                place = spec.origin or locate(job, ("nodes", index))
-                error.args = (f"{error}\n  the job names it at {place}",)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
