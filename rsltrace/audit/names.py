@@ -23,19 +23,23 @@ class Names:
     def __init__(self, modules: Mapping[str, Module]) -> None:
         self._modules = modules
         self.passed: set[ast.AST] = set()
+        self._asked: set[tuple[Scope, str]] = set()
+        """Names that are being resolved. What ``line = line.strip()`` says of ``line`` is nothing;
+        without this, a dozen such lines would take for ever."""
 
     def of(self, node: ast.expr, scope: Scope, depth: int = 0) -> str | None:
         """Return the full name of what ``node`` stands for, or None if that is not known."""
         if depth > _DEPTH_MAX:
             return None
         if isinstance(node, ast.Name):
-            return self._first(self.bindings(node, scope), node.id, depth)
+            return self._first(self.bindings(node, scope), node.id, depth, _place(node.id, scope))
         if isinstance(node, ast.Attribute):
             owner = scope.own_class
             if owner is not None and _is_self(node.value):
                 found = owner.attributes.get(node.attr) or owner.names.get(node.attr)
                 if found:
-                    return self._first(((one, owner) for one in found), node.attr, depth)
+                    bound = ((one, owner) for one in found)
+                    return self._first(bound, f"self.{node.attr}", depth, owner)
             base = self.of(node.value, scope, depth + 1)
             return None if base is None else self._canonical(f"{base}.{node.attr}", depth + 1)
         if isinstance(node, ast.Call):
@@ -51,14 +55,11 @@ class Names:
 
     def bindings(self, node: ast.Name, scope: Scope) -> Iterator[tuple[Binding, Scope]]:
         """Yield what a name is bound to, innermost scope that knows it."""
-        place: Scope | None = scope
-        while place is not None:
-            if (place is scope or place.kind != "class") and node.id in place.names:
-                inner = place.names[node.id]
-                for binding in inner:
-                    yield binding, _evaluated_in(binding, place)
-                return
-            place = place.parent
+        place = _place(node.id, scope)
+        if place is not None:
+            for binding in place.names[node.id]:
+                yield binding, _evaluated_in(binding, place)
+            return
         for star in scope.module.stars:
             if f"{star}.{node.id}" in RULES or self._has(star, node.id):
                 yield Imported(f"{star}.{node.id}"), scope
@@ -71,15 +72,29 @@ class Names:
         return loaded is not None and name in loaded.top.names
 
     def _first(
-        self, bindings: Iterator[tuple[Binding, Scope]], name: str, depth: int
+        self,
+        bindings: Iterator[tuple[Binding, Scope]],
+        name: str,
+        depth: int,
+        place: Scope | None,
     ) -> str | None:
-        for binding, scope in bindings:
-            found = self._bound(binding, scope, name, depth)
-            if found is not None:
-                return found
-        return None
+        """Return what a name of ``place`` (None: Python's own) stands for, as far as known."""
+        key = None if place is None else (place, name)
+        if key in self._asked:
+            return None
+        if key is not None:
+            self._asked.add(key)
+        try:
+            for binding, scope in bindings:
+                found = self._bound(binding, scope, depth)
+                if found is not None:
+                    return found
+            return None
+        finally:
+            if key is not None:
+                self._asked.remove(key)
 
-    def _bound(self, binding: Binding, scope: Scope, name: str, depth: int) -> str | None:
+    def _bound(self, binding: Binding, scope: Scope, depth: int) -> str | None:
         if isinstance(binding, Imported):
             return self._canonical(binding.name, depth + 1)
         if isinstance(binding, ast.ClassDef):
@@ -135,11 +150,11 @@ class Names:
             if classes:
                 scope = module.scopes[classes[0]]
                 continue
-            for binding in found:
-                name = self._bound(binding, _evaluated_in(binding, scope), part, depth + 1)
-                if name is not None:
-                    return self._canonical(".".join([name, *rest[position + 1 :]]), depth + 1)
-            return None
+            bound = ((one, _evaluated_in(one, scope)) for one in found)
+            name = self._first(bound, part, depth + 1, scope)
+            if name is None:
+                return None
+            return self._canonical(".".join([name, *rest[position + 1 :]]), depth + 1)
         return full
 
     def _inherited(self, scope: Scope, rest: list[str], depth: int) -> str | None:
@@ -161,6 +176,16 @@ def _path(node: ast.ClassDef, module: Module) -> str:
             parts.insert(0, place.name)
         place = module.parents.get(place)
     return ".".join(parts)
+
+
+def _place(name: str, scope: Scope) -> Scope | None:
+    """Return the innermost scope around an expression that knows a name."""
+    place: Scope | None = scope
+    while place is not None:
+        if (place is scope or place.kind != "class") and name in place.names:
+            return place
+        place = place.parent
+    return None
 
 
 def _evaluated_in(binding: Binding, scope: Scope) -> Scope:

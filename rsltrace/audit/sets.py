@@ -19,7 +19,6 @@ _TYPES = _MAKERS | {
 }
 _METHODS = {"union", "intersection", "difference", "symmetric_difference", "copy"}
 _OPERATORS = (ast.BitOr, ast.BitAnd, ast.BitXor, ast.Sub)
-_DEPTH_MAX = 8
 
 _UNORDERED = {
     *(f"builtins.{name}" for name in "sorted min max len any all set frozenset bool".split()),
@@ -55,26 +54,32 @@ _KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
 
-def is_set(node: ast.expr, scope: Scope, names: Names, depth: int = 0) -> bool:
+def is_set(node: ast.expr, scope: Scope, names: Names) -> bool:
     """Return whether an expression is a set whose order is not known."""
-    if depth > _DEPTH_MAX:
-        return False
+    return _is_set(node, scope, names, frozenset()) is True
+
+
+def _is_set(node: ast.expr, scope: Scope, names: Names, asked: frozenset[object]) -> bool | None:
+    """Do ``is_set``; None says nothing either way: ``s = s | more`` leaves ``s`` what it is.
+
+    ``asked`` are the bindings in question.
+    """
     if isinstance(node, ast.Set):
         return not all(isinstance(x, ast.Constant) and type(x.value) is int for x in node.elts)
     if isinstance(node, ast.SetComp):
         return True
     if isinstance(node, ast.BinOp) and isinstance(node.op, _OPERATORS):
-        return is_set(node.left, scope, names, depth + 1) or (
-            not isinstance(node.op, ast.Sub) and is_set(node.right, scope, names, depth + 1)
-        )
+        left = _is_set(node.left, scope, names, asked)
+        if left or isinstance(node.op, ast.Sub):
+            return left
+        return _is_set(node.right, scope, names, asked) or left
     if isinstance(node, ast.IfExp):
-        return is_set(node.body, scope, names, depth + 1) or is_set(
-            node.orelse, scope, names, depth + 1
-        )
+        body = _is_set(node.body, scope, names, asked)
+        return body or _is_set(node.orelse, scope, names, asked) or body
     if isinstance(node, ast.Call):
         function = node.func
         if isinstance(function, ast.Attribute) and function.attr in _METHODS:
-            return is_set(function.value, scope, names, depth + 1)
+            return _is_set(function.value, scope, names, asked)
         made = names.of(function, scope) in _MAKERS
         return made and not (node.args and _is_range(node.args[0], scope, names))
     bindings: list[tuple[Binding, Scope]] = []
@@ -85,17 +90,26 @@ def is_set(node: ast.expr, scope: Scope, names: Names, depth: int = 0) -> bool:
         if owner is not None and isinstance(node.value, ast.Name) and node.value.id == "self":
             bindings = [(one, scope) for one in owner.attributes.get(node.attr, [])]
             bindings = bindings or [(one, owner) for one in owner.names.get(node.attr, [])]
-    return bool(bindings) and all(
-        _binds_set(binding, place, names, depth) for binding, place in bindings
-    )
+    if not bindings:
+        return False
+    others = [pair for pair in bindings if pair[0] not in asked]
+    asked = asked.union(binding for binding, _ in others if isinstance(binding, ast.expr))
+    answer: bool | None = None
+    for binding, place in others:
+        one = _binds_set(binding, place, names, asked)
+        if one is False:
+            return False
+        answer = answer or one
+    return answer
 
 
-def _binds_set(binding: Binding, scope: Scope, names: Names, depth: int) -> bool:
+def _binds_set(
+    binding: Binding, scope: Scope, names: Names, asked: frozenset[object]
+) -> bool | None:
     if isinstance(binding, Annotated):
         return _annotates_set(binding.type, scope, names)
     if isinstance(binding, ast.expr):
-        place = scope.module.scope_of(binding)
-        return is_set(binding, place, names, depth + 1)
+        return _is_set(binding, scope.module.scope_of(binding), names, asked)
     return False
 
 

@@ -125,6 +125,8 @@ FOUND = [
      "order of the set self.s", "virtual"),
     ("f(*{g(), h()})", "order of the set {g(), h()}", "virtual"),
     ("next(iter(set(a)))", "order of the set set(a)", "virtual"),
+    ("s = set(a)\ns = s - b\nlist(s)", "order of the set s", "virtual"),
+    ("import time\nnow = now if now else time.time\nnow()", "time.time()", "virtual"),
 ]  # fmt: skip
 
 NOT_FOUND = [
@@ -159,6 +161,8 @@ NOT_FOUND = [
     "s = set(a)\nd = {*s, 1}\nfor x in sorted(s): f(x)",
     "s = {}\nfor x in s: f(x)",
     "s = set(a)\ns = sorted(s)\nfor x in s: f(x)",
+    "class A(B):\n  def f(self):\n    self.p = self.p - 1\n    list(self.p)",
+    "def f(a, b):\n  a = a | 1\n  b = b | a\n  a = b & a\n  list(a)\n  list(b)",
     "if __name__ == '__main__':\n  pass",
 ]
 
@@ -168,6 +172,19 @@ def test_found(
     found_in: Callable[[str], list[Found]], code: str, call: str, treatment: str
 ) -> None:
     assert [(one.call, one.treatment.value) for one in found_in(code)] == [(call, treatment)]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["text = text.replace(text, 'x')", "s = s | {text, 'x'}", "self.a = self.a.b(self.a)"],
+)
+def test_a_name_that_is_bound_to_itself_again_and_again(
+    found_in: Callable[[str], list[Found]], line: str
+) -> None:
+    # Each way through these lines was looked at once: of 50 there is no end.
+    lines = "".join(f"    {line}\n" for _ in range(50))
+    code = f"class A:\n  def f(self, text, s):\n{lines}    text.now(s)\n    self.a.now(list(s))\n"
+    assert found_in(code) == []
 
 
 @pytest.mark.parametrize("code", NOT_FOUND)
