@@ -7,6 +7,7 @@ what others draw.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from rsltrace.chance.distribution import Constant, Distribution
@@ -85,7 +86,7 @@ class Channel:
         self.held_until_ns = -1
         self._model = model
         self._reliable = reliable
-        self.outages = tuple(sorted(outages, key=lambda outage: outage.from_ns))
+        self.outages = _joined(outages)
         self._delay = delay.sampler(Stream(seed, f"{name}\0delay"), start_ns)
         self._copy = delay.sampler(Stream(seed, f"{name}\0copy"), start_ns)
         self._drop = Stream(seed, f"{name}\0drop").uniform
@@ -164,10 +165,19 @@ class Channel:
         return 0
 
     def _cut_off_until(self, now_ns: int) -> int | None:
-        """Return the end of the outage at ``now_ns``; outages that touch count as one."""
-        end_ns = None
+        """Return the end of the outage at ``now_ns``, or None."""
         for outage in self.outages:
-            at_ns = now_ns if end_ns is None else end_ns
-            if outage.from_ns <= at_ns < outage.to_ns:
-                end_ns = outage.to_ns
-        return end_ns
+            if outage.from_ns <= now_ns < outage.to_ns:
+                return outage.to_ns
+        return None
+
+
+def _joined(outages: Sequence[Outage]) -> tuple[Outage, ...]:
+    """Return outages in order, those that overlap or touch as one."""
+    found: list[Outage] = []
+    for outage in sorted(outages, key=lambda outage: outage.from_ns):
+        if found and outage.from_ns <= found[-1].to_ns:
+            found[-1] = Outage(found[-1].from_ns, max(found[-1].to_ns, outage.to_ns))
+        else:
+            found.append(outage)
+    return tuple(found)

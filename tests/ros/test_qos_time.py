@@ -201,17 +201,33 @@ def test_manual_liveliness_is_asserted_by_messages_and_by_hand(run: Any) -> None
     assert receiver.told == [("alive", 50, 1, 0), ("alive", 270, 0, 1), ("alive", 500, 1, 0)]
 
 
-def test_automatic_liveliness_ends_with_the_publisher_and_in_an_outage(run: Any) -> None:
+@pytest.mark.parametrize(
+    "outages",
+    [
+        [("node", "/sender", "0.2s", "0.5s")],
+        [("topic", "/*", "0.3s", "0.5s"), ("node", "/sender", "0.2s", "0.35s")],
+        [
+            ("node", "*", "0.4s", "0.5s"),
+            ("node", "*", "0.2s", "0.4s"),
+            ("node", "*", "0.3s", "0.35s"),
+        ],
+    ],
+)
+def test_automatic_liveliness_ends_with_the_publisher_and_in_an_outage(
+    run: Any, outages: list[tuple[str, str, str, str]]
+) -> None:
+    """Outages that overlap or touch are one."""
+
     class Leaver(Sender):
         def __init__(self) -> None:
             super().__init__(qos(liveliness_lease_duration=100), [])
             self.once(800, lambda: self.destroy_publisher(self.publisher))
 
-    outage = {"node": "/sender", "from": "0.2s", "to": "0.5s"}
+    cut_off = [{what: name, "from": begin, "to": end} for what, name, begin, end in outages]
     _, _, receiver = run(
         Leaver,
         lambda: Receiver(qos(liveliness_lease_duration=100)),
-        delay={"outages": [outage]},
+        delay={"outages": cut_off},
     )
     assert receiver.told == [
         ("alive", 0, 1, 0),
