@@ -29,7 +29,8 @@ _HEAD = """\
 A job file is YAML. It says which nodes run, what plays in, what ends the run and what is kept.
 `rsltrace init` writes a first one, `rsltrace check job.yaml` shows what it means without running
 it, and a mistake is an error with file, line, column and what was expected. What names a topic,
-service, node or parameter that is not there is no error: `check` lists it, and `record` at the end.
+service, node or parameter that is not there (in a rule, a remapping, a glob without `*` in front, a
+row of a delay file) is no error: `check` lists it, and `record` at the end.
 
 - **Times** are a number of seconds (`0.5`) or a number with a unit: `5ms`, `0.2s`, `2min`. Units
   are `ns`, `us` (`µs`), `ms`, `s`, `min` and `h`. They are read exactly, never through a float.
