@@ -26,16 +26,23 @@ def has_remappings(job: Job) -> bool:
 
 
 def unused_remappings(job: Job, met: Met) -> Iterator[str]:
-    """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do."""
+    """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do.
+
+    What several nodes are given alike (``<set_remap>`` of a launch file, an anchor of YAML) has
+    something to do if one of them uses it.
+    """
     everybody: list[Asker] = []
+    given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
     for index, spec in enumerate(job.nodes):
         key = entry_key(spec, job.nodes[:index])
         own = [asker for asker in met.asked if asker.entry_key == key]
         everybody += own  # nodes of hooks, of callbacks and the bag player get no arguments
-        for old in spec.remappings:
+        for old, new in spec.remappings.items() if own else ():
             loc: Loc = ("nodes", index, "remappings", old)
-            if own and not _is_used(old, own, met):
-                yield f"{spec.origin or locate(job, loc)}: {_note(old, own, met)}"
+            given.setdefault((old, new), (spec.origin or locate(job, loc), []))[1].extend(own)
+    for (old, _), (place, askers) in given.items():
+        if not _is_used(old, askers, met):
+            yield f"{place}: {_note(old, askers, met)}"
     for index, old in _rules(job.ros_arguments):
         if not _is_used(old, everybody, met):
             yield f"{locate(job, ('ros_arguments', index))}: {_note(old, everybody, met)}"

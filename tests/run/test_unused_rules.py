@@ -321,3 +321,16 @@ def test_what_is_remapped_for_no_node_of_the_job_is_named(record_job: Callable[.
     yaml = "nodes: [{node: nodes_under_test:Parent}]\nros_arguments: [-r, 'toy:=/toys']\n"
     (note,) = record_job(yaml, NODES, output=None).notes
     assert "job.yaml:2:21: nothing of /parent is called 'toy', so nothing is remapped" in note
+
+
+def test_a_remapping_that_several_nodes_share_is_used_if_one_uses_it(
+    record_job: Callable[..., Any],
+) -> None:
+    yaml = """\
+nodes:
+  - {node: nodes_under_test:Talker, remappings: &all {numbers: /n, late_topic: /l, nobody: /x}}
+  - {node: nodes_under_test:Listener, remappings: *all}
+  - {node: nodes_under_test:Late, remappings: *all}
+"""
+    (note,) = record_job(yaml + "stop: {duration: 1s}\n", NODES, output=None).notes
+    assert "job.yaml:2:92: nothing of /talker, /listener, /late is called 'nobody', so n" in note
