@@ -67,13 +67,27 @@ def unused_rules(
 
 
 def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
-    """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared."""
+    """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared.
+
+    What a launch file gives several nodes alike (``<set_parameter>``) is meant for who has it.
+    """
+    entries = []
+    used_alike: set[tuple[str, str]] = set()
     for index, spec in enumerate(job.nodes):
         key = entry_key(spec, job.nodes[:index])
         made = {node: found for node, found in nodes.items() if found.entry_key == key}
-        for name in spec.parameters:
+        entries.append((index, spec, made))
+        if spec.origin:
+            declared_ones = {name for found in made.values() for name in found.declared}
+            used_alike.update(
+                (name, repr(v)) for name, v in spec.parameters.items() if name in declared_ones
+            )
+    for index, spec, made in entries:
+        for name, value in spec.parameters.items():
             given = {node: found for node, found in made.items() if name in found.unused}
             if not given or any(name in found.declared for found in made.values()):
+                continue
+            if spec.origin and (name, repr(value)) in used_alike:
                 continue
             declared = [other for found in given.values() for other in found.declared]
             where = spec.origin or locate(job, ("nodes", index, "parameters", name))

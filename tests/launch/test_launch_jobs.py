@@ -13,6 +13,7 @@ import pytest
 from rsltrace import Job, Trace
 from rsltrace.errors import JobError
 from rsltrace.job import LaunchSpec, load_job
+from rsltrace.run import run
 
 pytestmark = pytest.mark.ros
 
@@ -290,3 +291,31 @@ def test_installed_executables_run_with_what_the_launch_file_gives_them(
     assert one.returncode == 0, one.stderr
     with Trace.open("one.mcap") as trace:
         assert len(list(trace.messages("/two/chatter"))) == 4
+
+
+def test_parameters_that_a_launch_file_gives_all_nodes_are_meant_for_who_has_them(
+    folder: Path,
+) -> None:
+    (folder / "demo_nodes.py").write_text(
+        NODES
+        + """
+class Mute(Node):
+    def __init__(self):
+        super().__init__('mute')
+"""
+    )
+    (folder / "all.launch.xml").write_text(
+        """<launch>
+  <set_parameter name="rate" value="4.0"/>
+  <set_parameter name="nobody" value="1"/>
+  <node_container pkg="rclpy_components" exec="container" name="c" namespace="">
+    <composable_node pkg="demo" plugin="demo_nodes.Talker" name="talk"/>
+    <composable_node pkg="demo" plugin="demo_nodes.Mute" name="mute"/>
+  </node_container>
+</launch>
+"""
+    )
+    (folder / "job.yaml").write_text("launch: [all.launch.xml]\nstop: {duration: 1s}\n")
+    notes = run(load_job("job.yaml"), None).notes
+    assert [note.partition(": ")[2][:5] for note in notes] == ["/talk", "/mute"]
+    assert all("has not declared the parameter 'nobody'" in note for note in notes)
