@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000
+_FIRST_GC_EVENTS = 1_000
+"""What construction has left behind is looked at once, and early: it is the most there ever is."""
 
 _M_TRIM_THRESHOLD = -1
 _M_MMAP_THRESHOLD = -3
@@ -49,7 +51,7 @@ def housekeeping(
     Python's collector would otherwise run finalizers in the middle of some callback; here they run
     between steps, after the same events in every run.
     """
-    collect_at = _GC_EVERY_EVENTS
+    collect_at = _FIRST_GC_EVENTS
 
     def between_steps() -> int:
         nonlocal collect_at
