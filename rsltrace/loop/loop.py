@@ -49,8 +49,9 @@ ORDER_RELEASE = 1
 
 Release = tuple[Any, ...]
 """What is scheduled: when (ns), its order (``ORDER_…``), its place in the order of scheduling, what
-is called with this very tuple, and whatever that needs. A message's is also what waits in the
-queue of its subscription: nearly every event of a run with delays is one, and makes one tuple."""
+is called with this very tuple, and whatever that needs. The call returns who is ready now, or None
+if it has seen to that itself. A message's is also what waits in the queue of its subscription:
+nearly every event of a run with delays is one, and makes one tuple."""
 
 
 def _act(release: Release) -> None:
@@ -107,7 +108,7 @@ class EventLoop:
         heappush(self.scheduled, (time_ns, order, self.next_place(), _act, action))
 
     def schedule_release(
-        self, time_ns: int, release: Callable[[Release], None], *what: object
+        self, time_ns: int, release: Callable[[Release], Dispatchable | None], *what: object
     ) -> None:
         """Call ``release`` when simulated time reaches ``time_ns``; from [4] on is ``what``."""
         heappush(self.scheduled, (time_ns, ORDER_RELEASE, self.next_place(), release, *what))
@@ -209,16 +210,22 @@ class EventLoop:
                     break
                 self.now_ns = now_ns = next_ns
                 release = heappop(scheduled)
-                release[3](release)
+                receiver = release[3](release)
                 if scheduled and scheduled[0][0] <= now_ns:
+                    if receiver is not None:
+                        ready.append(receiver)
                     break
-                if ready:
+                if receiver is not None:
+                    receiver.dispatch()
+                elif ready:
                     ready.popleft().dispatch()
                 if self.now_ns is not now_ns or self.events >= self._until_events:
                     break
             while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
                 release = heappop(scheduled)
-                release[3](release)
+                receiver = release[3](release)
+                if receiver is not None:
+                    ready.append(receiver)
             limit = self.events + self._livelock_limit
             while not self._interrupt:
                 if tasks:

@@ -112,7 +112,9 @@ class OrderedLoop(EventLoop):
         limit = self.events + self._livelock_limit
         while scheduled and scheduled[0][0] <= now_ns and not self._interrupt:
             release = heappop(scheduled)
-            release[3](release)
+            receiver = release[3](release)
+            if receiver is not None:
+                self.ready.append(receiver)
         while not self._interrupt:
             place = self._next()
             if place is not None:

@@ -120,11 +120,16 @@ class Receiver(EntityHandle):
 
     def deliver(self, arrival: Any) -> None:
         """Queue an arrival; it is dispatched once the node is being run."""
+        if self.arrived(arrival) is not None:
+            self.core.loop.ready.append(self)
+
+    def arrived(self, arrival: Any) -> Receiver | None:
+        """Queue an arrival; return this receiver if it is ready for it now."""
         self.queue.append(arrival)
         if self.wrapper is not None:
-            self.core.loop.ready.append(self)
-        else:
-            self.find_wrapper()
+            return self
+        self.find_wrapper()
+        return None
 
     def activate(self) -> None:
         self.core.loop.ready.extend([self] * len(self.queue))

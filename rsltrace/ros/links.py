@@ -16,7 +16,7 @@ from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.ros.qos import INFINITE_NS, Reliability
 from rsltrace.ros.qos_status import MESSAGE_LOST
 from rsltrace.ros.qos_time import RequestedLease, finite
-from rsltrace.ros.quick_link import Send, quick_send
+from rsltrace.ros.quick_link import Send, direct_send, quick_send
 
 if TYPE_CHECKING:
     from rsltrace.loop.loop import Release
@@ -140,8 +140,10 @@ class Exchanges:
         else:
             loop.schedule_release(arrival_ns, self._released, exchange)
 
-    def _released(self, release: Release) -> None:
-        self._arrive(release[4])
+    def _released(self, release: Release) -> Any:
+        if self._receiver.destroyed:
+            return None
+        return self._receiver.arrived(release[4])
 
     def _arrive(self, exchange: Exchange) -> None:
         if not self._receiver.destroyed:
@@ -184,7 +186,9 @@ class Link:
             for outage in channel.outages if channel is not None else ():
                 self._lease.cut_off(outage.from_ns, outage.to_ns)
         self.send: Send = self._send
-        if channel is not None and channel.plain and channel.keep_order and not self._timed:
+        if not self._timed and channel is None:
+            self.send = direct_send(core, self)
+        elif not self._timed and channel is not None and channel.plain and channel.keep_order:
             self.send = quick_send(core, self, channel.plain)
 
     @classmethod
@@ -234,7 +238,7 @@ class Link:
         else:
             loop.schedule_release(arrival_ns, self._arrive, *message)
 
-    def expects(self, arrive: Callable[[Release], None]) -> bool:
+    def expects(self, arrive: Callable[[Release], Any]) -> bool:
         """Whether a message is due now that has not arrived yet: none must overtake it."""
         scheduled, now_ns = self._core.loop.scheduled, self._core.loop.now_ns
         return bool(scheduled and scheduled[0][0] <= now_ns) and any(

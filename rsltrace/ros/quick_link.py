@@ -1,4 +1,4 @@
-"""The usual link in a hurry: every message takes some time and arrives, in the order of sending.
+"""The usual links in a hurry: every message arrives, in the order of sending, at once or later.
 
 With a delay on every link, most events of a run are messages that come this way. What a link has to
 look up is therefore bound once, in a closure, its arrivals go straight into the loop's queue, and
@@ -20,7 +20,9 @@ from rsltrace.trace.format import OUTPUT_CONTENT
 
 if TYPE_CHECKING:
     from rsltrace.ros.core import Core
+    from rsltrace.ros.entity_handle import Receiver
     from rsltrace.ros.links import Link
+    from rsltrace.ros.pubsub import SubscriptionHandle
 
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
@@ -35,16 +37,16 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     loop = core.loop
     subscription = link.subscription
     entity = subscription.entity_id
-    ready, scheduled, next_place = loop.ready, loop.scheduled, loop.next_place
+    scheduled, next_place = loop.scheduled, loop.next_place
 
-    def arrive(release: Release) -> None:
+    def arrive(release: Release) -> SubscriptionHandle | None:
         if subscription.destroyed:
-            return
+            return None
         subscription.queue.append(release)
         if subscription.wrapper is not None:
-            ready.append(subscription)
-        else:
-            subscription.find_wrapper()
+            return subscription
+        subscription.find_wrapper()
+        return None
 
     def send(
         data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
@@ -70,7 +72,37 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
         )  # fmt: skip
         if delay_ns or arrival_ns != loop.now_ns or link.expects(arrive):
             heappush(scheduled, release)
-        else:
-            arrive(release)
+        elif arrive(release) is not None:
+            loop.ready.append(subscription)
+
+    return send
+
+
+def direct_send(core: Core, link: Link) -> Send:
+    """Return how ``link`` sends, if there is nothing the matter with it.
+
+    Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
+    """
+    loop = core.loop
+    scheduled = loop.scheduled
+    subscription = link.subscription
+    arrived = subscription.arrived
+
+    def arrive(release: Release) -> Receiver | None:
+        return None if subscription.destroyed else arrived(release)
+
+    def send(
+        data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
+    ) -> None:
+        now_ns = loop.now_ns
+        late_ns = core.busy_ns
+        if late_ns or (scheduled and scheduled[0][0] <= now_ns and link.expects(arrive)):
+            what = (data, event, position, digest, stamp_ns, count)
+            loop.schedule_release(now_ns + late_ns, arrive, *what)
+        elif (
+            arrived((now_ns, 0, 0, None, data, event, position, digest, stamp_ns, count))
+            is not None
+        ):
+            loop.ready.append(subscription)
 
     return send
