@@ -141,7 +141,7 @@ def work_rsltrace(graph: Graph, mode: str, events: int, folder: Path) -> dict[st
     """Measure a graph under rsltrace: what a long run takes longer than a short one."""
     record, delayed = RSLTRACE_MODES[mode]
     # Short enough to be start-up, long enough to have met every kind of callback.
-    lengths = (events // 20, events)
+    lengths = (events // 20, events * graph.longer)
     runs = [
         [run_rsltrace(graph, length, folder, record=record, delayed=delayed) for length in lengths]
         for _ in range(ROUNDS)

@@ -237,6 +237,18 @@ def test_automatic_liveliness_ends_with_the_publisher_and_in_an_outage(
     ]
 
 
+def test_an_outage_hides_that_a_publisher_says_it_is_alive(run: Any) -> None:
+    class Manual(Sender):
+        def __init__(self) -> None:
+            super().__init__(manual(110), [])
+            for at_ms in (50, 150, 250, 350):
+                self.once(at_ms, self.publisher.assert_liveliness)
+
+    cut_off = [{"node": "/sender", "from": "0.14s", "to": "0.26s"}]
+    _, _, receiver = run(Manual, lambda: Receiver(manual(120)), ms=400, delay={"outages": cut_off})
+    assert receiver.told == [("alive", 50, 1, 0), ("alive", 170, 0, 1), ("alive", 350, 1, 0)]
+
+
 def test_waiting_for_acknowledgements_takes_the_time_that_messages_take(run: Any) -> None:
     waited: list[tuple[int, bool]] = []
 
