@@ -34,7 +34,8 @@ class Graph:
 
     ``native_args`` are given to ``rclpy.init``; ``make_native`` returns the nodes, each with a
     ``callbacks`` counter. ``job`` returns a job of about so many callbacks, as job.yaml has it. A
-    graph that takes long to construct is run ``longer`` times as long.
+    graph that takes long to construct is run ``longer`` times as long; one whose callbacks take
+    long, less.
     """
 
     name: str
@@ -42,7 +43,7 @@ class Graph:
     native_args: tuple[str, ...]
     make_native: Callable[[], list[Any]] | None
     job: Callable[[int], dict[str, Any]]
-    longer: int = 1
+    longer: float = 1
 
 
 def _from_example(folder: str, module: str) -> Any:
@@ -156,9 +157,10 @@ GRAPHS = {
             (),
             _action_nodes,
             _action_job,
+            longer=0.25,
         ),
-        Graph("mains", "ping-pong of two mains that spin", (), None, _mains_job),
-        Graph("calls", "blocking calls of a main", (), None, _calls_job),
+        Graph("mains", "ping-pong of two mains that spin", (), None, _mains_job, longer=0.5),
+        Graph("calls", "blocking calls of a main", (), None, _calls_job, longer=0.5),
     )
 }
 

@@ -1,6 +1,6 @@
 """What a callback costs: the same node graphs on rclpy's executors over DDS, and under rsltrace.
 
-    python benchmarks/throughput.py                     everything, about five minutes
+    python benchmarks/throughput.py                     everything, about seven minutes
     python benchmarks/throughput.py --only rsltrace     cases whose name contains "rsltrace"
     python benchmarks/throughput.py --json              the same figures for a machine
 
@@ -141,7 +141,7 @@ def work_rsltrace(graph: Graph, mode: str, events: int, folder: Path) -> dict[st
     """Measure a graph under rsltrace: what a long run takes longer than a short one."""
     record, delayed = RSLTRACE_MODES[mode]
     # Short enough to be start-up, long enough to have met every kind of callback.
-    lengths = (events // 20, events * graph.longer)
+    lengths = (events // 20, int(events * graph.longer))
     runs = [
         [run_rsltrace(graph, length, folder, record=record, delayed=delayed) for length in lengths]
         for _ in range(ROUNDS)
