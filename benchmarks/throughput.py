@@ -1,6 +1,6 @@
 """What a callback costs: the same node graphs on rclpy's executors over DDS, and under rsltrace.
 
-    python benchmarks/throughput.py                     everything, about seven minutes
+    python benchmarks/throughput.py                     everything, about ten minutes
     python benchmarks/throughput.py --only rsltrace     cases whose name contains "rsltrace"
     python benchmarks/throughput.py --json              the same figures for a machine
 
@@ -12,8 +12,8 @@ Wall time is what counts; CPU time (of all threads) is shown beside it, since it
 others use the machine: where the two are far apart, repeat on a quiet one.
 
 Over DDS the graphs are saturated and callbacks are counted for some seconds of wall time. Under
-rsltrace the same process does a short and a long run in turns, and the difference of the best is
-taken, so that start-up counts for neither; the native figures do not contain it either.
+rsltrace a process does the same run some times, and of the best the loop is timed, with closing the
+trace; start-up is not in it, nor in the native figures.
 """
 
 from __future__ import annotations
@@ -54,11 +54,10 @@ AIMS = (
     ("events_executor", "rsltrace_recorded", 1.2),
     ("events_executor", "rsltrace", 2.0),
 )
-ROUNDS = 4
-"""How often one process does the short and the long run."""
+ROUNDS = 3
+"""How often one process does the same run."""
 
 WORKER_S_MAX = 180
-MEASURED = ("callbacks", "wall_s", "cpu_s")
 UNAVAILABLE = "unavailable"
 
 
@@ -138,21 +137,14 @@ def work(name: str, amount: float, folder: Path) -> dict[str, Any]:
 
 
 def work_rsltrace(graph: Graph, mode: str, events: int, folder: Path) -> dict[str, Any]:
-    """Measure a graph under rsltrace: what a long run takes longer than a short one."""
+    """Measure a graph under rsltrace some times; return the best, and the first one's start-up."""
     record, delayed = RSLTRACE_MODES[mode]
-    # Short enough to be start-up, long enough to have met every kind of callback.
-    lengths = (events // 20, int(events * graph.longer))
+    length = int(events * graph.longer)
     runs = [
-        [run_rsltrace(graph, length, folder, record=record, delayed=delayed) for length in lengths]
-        for _ in range(ROUNDS)
+        run_rsltrace(graph, length, folder, record=record, delayed=delayed) for _ in range(ROUNDS)
     ]
-    short, long = (
-        {key: min(run[key] for run in each) for key in MEASURED} for each in zip(*runs, strict=True)
-    )
-    figures = {key: long[key] - short[key] for key in MEASURED}
-    each_s = figures["wall_s"] / figures["callbacks"]
-    start_up_s = runs[0][0]["wall_s"] - short["callbacks"] * each_s
-    return runs[0][1] | figures | {"start_up_s": start_up_s}
+    best = {key: min(run[key] for run in runs) for key in ("wall_s", "cpu_s")}
+    return runs[0] | best
 
 
 def measure(case: Case, amount: float) -> None:
@@ -245,7 +237,7 @@ def print_table(cases: list[Case]) -> None:
 def main() -> int:
     """Measure and print. Returns the exit status: 1 if a case failed that could have run."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
-    parser.add_argument("--repeat", type=int, default=3, help="how often each case is measured")
+    parser.add_argument("--repeat", type=int, default=4, help="how often each case is measured")
     parser.add_argument("--seconds", type=float, default=3.0, help="wall time of a native case")
     parser.add_argument("--events", type=int, default=60_000, help="events of an rsltrace run")
     parser.add_argument("--only", action="append", help="cases whose name contains this")
