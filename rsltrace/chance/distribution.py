@@ -12,11 +12,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from math import sqrt
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from rsltrace.chance.exact import exp, log
 from rsltrace.chance.normal import quantile
-from rsltrace.chance.stream import Stream
+
+if TYPE_CHECKING:
+    from rsltrace.chance.stream import Stream
 
 Sampler = Callable[[int], int]
 

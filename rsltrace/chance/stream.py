@@ -6,18 +6,19 @@ one leaves all others as they were, which a generator shared by all cannot promi
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from hashlib import blake2b, shake_128
 from itertools import chain
-from math import floor
 
-_BLOCK = 64
-_BYTES = 8 * _BLOCK
-_unpack = struct.Struct(f"<{_BLOCK}d").unpack
-_LOW_52_BITS = int.from_bytes(((1 << 52) - 1).to_bytes(8, "little") * _BLOCK, "little")
-_ONES = int.from_bytes(struct.pack("<d", 1.0) * _BLOCK, "little")
-_HALF_BELOW_ONE = 1.0 - 2.0**-53
+import numpy as np
+import numpy.typing as npt
+
+_BLOCK_BYTES = 8 * 64
+_BLOCKS_MAX = 8
+"""How many blocks are made at a time, at most: a link that is hardly used has only its first."""
+
+_ONE = np.float64(1.0).view(np.uint64)
+_LESS = np.float64(1.0 - 2.0**-53)
 
 
 class Stream:
@@ -43,23 +44,26 @@ class Stream:
         return chain.from_iterable(self._whole_numbers(low, float(count)))
 
     def _uniforms(self) -> Iterator[list[float]]:
-        for block in self._blocks():
-            yield [number - _HALF_BELOW_ONE for number in block]
+        for numbers in self._numbers():
+            yield numbers.tolist()
 
     def _whole_numbers(self, low: int, count: float) -> Iterator[list[int]]:
-        less = _HALF_BELOW_ONE
-        for block in self._blocks():
-            yield [low + floor((number - less) * count) for number in block]
+        for numbers in self._numbers():
+            yield (np.floor(numbers * count).astype(np.int64) + low).tolist()
 
-    def _blocks(self) -> Iterator[tuple[float, ...]]:
-        """Yield many numbers at a time, each too large by ``_HALF_BELOW_ONE``.
+    def _numbers(self) -> Iterator[npt.NDArray[np.float64]]:
+        """Yield many numbers at a time, and more the more are asked for.
 
-        A whole block is made by a few operations on one large integer: 52 random bits below the
-        exponent of 1.0 are a double in [1, 2). Making it one in (0, 1) by subtraction is exact.
+        52 random bits below the exponent of 1.0 are a double in [1, 2). Making it one in (0, 1) by
+        subtraction is exact, so this is the same everywhere.
         """
-        number = 0
+        first, blocks = 0, 1
         while True:
-            digest = shake_128(self._key + number.to_bytes(8, "little")).digest(_BYTES)
-            lanes = int.from_bytes(digest, "little") >> 12 & _LOW_52_BITS | _ONES
-            yield _unpack(lanes.to_bytes(_BYTES, "little"))
-            number += 1
+            digests = [
+                shake_128(self._key + number.to_bytes(8, "little")).digest(_BLOCK_BYTES)
+                for number in range(first, first + blocks)
+            ]
+            first += blocks
+            blocks = min(2 * blocks, _BLOCKS_MAX)
+            bits = np.frombuffer(b"".join(digests), dtype="<u8").astype(np.uint64)
+            yield (bits >> np.uint64(12) | _ONE).view(np.float64) - _LESS
