@@ -124,7 +124,7 @@ class Channel:
         waited_ns = 0
         for _ in range(_ATTEMPTS_MAX):
             sent_ns = now_ns + waited_ns
-            end_ns = self._cut_off_until(sent_ns)
+            end_ns = self.cut_off_until(sent_ns)
             if end_ns is not None:
                 if not self._reliable:
                     self._delay(sent_ns)
@@ -164,7 +164,7 @@ class Channel:
             return LOST_DROP
         return 0
 
-    def _cut_off_until(self, now_ns: int) -> int | None:
+    def cut_off_until(self, now_ns: int) -> int | None:
         """Return the end of the outage at ``now_ns``, or None."""
         for outage in self.outages:
             if outage.from_ns <= now_ns < outage.to_ns:

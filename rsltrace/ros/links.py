@@ -276,13 +276,10 @@ class Link:
 
     def sign_of_life(self) -> None:
         """Tell the subscription that its publisher is alive; takes no time, outages hide it."""
-        if self._lease is not None and not self._is_cut_off():
+        channel, now_ns = self._channel, self._core.loop.now_ns
+        hidden = channel is not None and channel.cut_off_until(now_ns) is not None
+        if self._lease is not None and not hidden:
             self._lease.seen()
-
-    def _is_cut_off(self) -> bool:
-        now_ns = self._core.loop.now_ns
-        outages = self._channel.outages if self._channel is not None else ()
-        return any(outage.from_ns <= now_ns < outage.to_ns for outage in outages)
 
     def acked_ns(self) -> int:
         """Return when all that was sent so far has arrived, where that is acknowledged."""

@@ -59,12 +59,14 @@ class ChunkBody:
 
     ``start_ns`` and ``end_ns`` are the smallest and largest log times. ``indexes`` holds, by
     ascending channel id, the channel, its number of messages and its MessageIndex record.
+    ``rows`` says that all messages have one size.
     """
 
     records: bytes
     start_ns: int
     end_ns: int
     indexes: tuple[tuple[int, int, bytes], ...]
+    rows: bool = False
 
 
 def event_rows(rests: Sequence[bytes], chain_hashes: array[int]) -> npt.NDArray[np.void]:
@@ -184,7 +186,7 @@ def _fixed_size_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkB
     times = messages["log_time"]
     offsets = np.arange(0, len(messages) * size, size, dtype=np.uint64)
     index = _message_index(channel_id, times, offsets)
-    return ChunkBody(messages.tobytes(), int(times.min()), int(times.max()), (index,))
+    return ChunkBody(messages.tobytes(), int(times.min()), int(times.max()), (index,), rows=True)
 
 
 def _message_index(

@@ -126,14 +126,11 @@ class McapStream:
         )
         self._write(record)
 
-    def chunk(self, body: ChunkBody, *, rows: bool = False) -> tuple[int, int]:
-        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length).
-
-        ``rows`` says that all its messages have one size.
-        """
+    def chunk(self, body: ChunkBody) -> tuple[int, int]:
+        """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
         data = body.records
         if self._compression:
-            data = (self._row_compressor if rows else self._compressor).compress(data)
+            data = (self._row_compressor if body.rows else self._compressor).compress(data)
         record = record_bytes(
             Chunk(
                 compression=self._compression,

@@ -64,8 +64,8 @@ class TraceWriter:
     An event's outputs are added before the event itself; entities and payloads at any time before
     the event that refers to them. ``add_output`` takes an output of the event that is added next,
     packed by ``format.OUTPUT_CONTENT``, and unless it is a draw, ``add_sequence`` takes the
-    sequence of its payload (or NO_SEQUENCE); they are lists' own methods, since a run calls them
-    for every message. ``close`` ends the file; used as a context manager, leaving the
+    sequence of its payload (or NO_SEQUENCE). Both are methods of what collects them, since a run
+    calls them for every message. ``close`` ends the file; used as a context manager, leaving the
     block without ``close`` gives the file up as an interrupted run would (``abort``).
 
     Times are simulated nanoseconds, unsigned 64-bit. Every method may raise OutputError: no room,
@@ -301,10 +301,9 @@ class TraceWriter:
         outputs_at = (0, 0)
         if len(outputs):
             outputs_at = self._stream.chunk(
-                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel),
-                rows=True,
+                chunks.outputs_chunk(outputs, events, self._outputs_written, self._output_channel)
             )
-        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel), rows=True)
+        events_at = self._stream.chunk(chunks.events_chunk(events, self._event_channel))
         row = np.zeros(1, dtype=SEGMENT_DTYPE)
         row["first_event"] = self._events_written
         row["events"] = len(events)
