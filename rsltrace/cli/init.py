@@ -44,6 +44,11 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     parameters that its source declares. Nothing is imported or run. A file that exists is left
     alone.
     """
+    if ":" in job.name and job.suffix not in (".yaml", ".yml"):
+        raise click.UsageError(
+            f"{job} names a node, not a job file: each node has a --from of its own, "
+            f"as in: rsltrace init {' '.join(f'--from {s}' for s in (*sources, job))}"
+        )
     if job.exists():
         raise OutputError(f"{job} exists; name another file, or remove it")
     folder = job.parent

@@ -144,6 +144,13 @@ def test_what_is_not_there(rsltrace: Any, folder: Path, source: str, expected: s
     assert not (folder / "job.yaml").exists()
 
 
+def test_a_second_node_without_its_option_is_no_job_file(rsltrace: Any, folder: Path) -> None:
+    done = rsltrace("init", "--from", "hearer:Hearer", "mains:One")
+    assert done.returncode == 2
+    assert "rsltrace init --from hearer:Hearer --from mains:One" in " ".join(done.stderr.split())
+    assert not list(folder.glob("*:*"))
+
+
 def test_a_module_on_pythons_own_path(folder: Path) -> None:
     found = look_up("rclpy.node:Node", [folder])
     assert found.folder is None
