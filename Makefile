@@ -61,7 +61,7 @@ test-kilted:
 
 # docs/jobs.md is made from the models of rsltrace.job; a test fails when it is stale.
 docs: $(INSTALLED)
-	$(BIN)/python -m rsltrace.job.reference > docs/jobs.md
+	$(BIN)/python -m rsltrace.job.documents.reference > docs/jobs.md
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py

@@ -25,7 +25,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from synthetic import Shape, write_trace
 
-from rsltrace.diff.engine import diff_traces
+from rsltrace.diff.traces.engine import diff_traces
 from rsltrace.trace.format import TOPIC_EVENTS
 from rsltrace.trace.reader import Trace
 

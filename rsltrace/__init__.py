@@ -18,10 +18,10 @@ from rsltrace._version import __version__
 
 if TYPE_CHECKING:
     from rsltrace.diff import diff_files as diff
-    from rsltrace.diff.bag_model import BagDiff
-    from rsltrace.diff.bags import diff_bags
-    from rsltrace.diff.model import Diff, Verdict
+    from rsltrace.diff.bags.comparison import diff_bags
+    from rsltrace.diff.bags.model import BagDiff
     from rsltrace.diff.options import DiffOptions
+    from rsltrace.diff.traces.model import Diff, Verdict
     from rsltrace.errors import RsltraceError
     from rsltrace.job import (
         BagSpec,
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _HOMES = {
-    "BagDiff": "rsltrace.diff.bag_model",
+    "BagDiff": "rsltrace.diff.bags.model",
     "BagSpec": "rsltrace.job",
-    "Diff": "rsltrace.diff.model",
+    "Diff": "rsltrace.diff.traces.model",
     "DiffOptions": "rsltrace.diff.options",
     "HooksSpec": "rsltrace.job",
     "Job": "rsltrace.job",
@@ -53,8 +53,8 @@ _HOMES = {
     "StopSpec": "rsltrace.job",
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
-    "Verdict": "rsltrace.diff.model",
-    "diff_bags": "rsltrace.diff.bags",
+    "Verdict": "rsltrace.diff.traces.model",
+    "diff_bags": "rsltrace.diff.bags.comparison",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",
 }

@@ -91,7 +91,7 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
             raise click.UsageError(f"--set changes a job, and {only} is none")
         return audit_path(only)
     from rsltrace.launch import expand
-    from rsltrace.run.executables import source_of, why_not
+    from rsltrace.run.plans.executables import source_of, why_not
 
     job, _ = job_of(words, launch, skip, overrides)
     expanded = expand(job, why_not=why_not)

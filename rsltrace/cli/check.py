@@ -18,7 +18,7 @@ from rsltrace.model.stamp import format_duration, format_seconds
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
-    from rsltrace.ros.overview import Link
+    from rsltrace.middleware.overview import Link
     from rsltrace.run.checking import Checked
 
 

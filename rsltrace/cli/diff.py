@@ -15,9 +15,9 @@ from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 
 if TYPE_CHECKING:
-    from rsltrace.diff.bag_model import BagDiff
-    from rsltrace.diff.model import Diff
+    from rsltrace.diff.bags.model import BagDiff
     from rsltrace.diff.report.line import Line
+    from rsltrace.diff.traces.model import Diff
     from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
@@ -189,25 +189,25 @@ def _diff(
             trouble = True
     if done:
         _print(done, form, options, output)
-    from rsltrace.diff.model import exit_code_of_several
+    from rsltrace.diff.traces.model import exit_code_of_several
 
     return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
 
 
 def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool) -> Diff | BagDiff:
-    from rsltrace.diff.kinds import is_recording
+    from rsltrace.diff.file_kind import is_recording
 
     if is_recording(a) or is_recording(b):
         if options.nodes:
             raise click.UsageError("--node needs two traces; a recording does not know the nodes")
         if check:
             raise click.UsageError("--check needs two traces; a recording has no hashes")
-        from rsltrace.diff.bags import diff_bags
+        from rsltrace.diff.bags.comparison import diff_bags
 
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
-    from rsltrace.diff.engine import diff_traces
+    from rsltrace.diff.traces.engine import diff_traces
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
         if check_a:

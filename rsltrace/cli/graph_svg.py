@@ -14,8 +14,8 @@ from typing import Literal
 from xml.sax.saxutils import escape
 
 from rsltrace.errors import SetupError
+from rsltrace.middleware.overview import End, Link, Overview
 from rsltrace.model.printable import printable
-from rsltrace.ros.overview import End, Link, Overview
 
 _CHARACTER = 7.3
 _ROW = 54.0

@@ -13,7 +13,7 @@ from rsltrace.errors import BagError, OutputError
 from rsltrace.model.stamp import format_duration, format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.job.look import Found
+    from rsltrace.job.reading.node_source import Found
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
@@ -76,7 +76,7 @@ def _is_python(source: str) -> bool:
 
 
 def _look(target: str, folder: Path) -> Found:
-    from rsltrace.job.look import look_up, look_up_file
+    from rsltrace.job.reading.node_source import look_up, look_up_file
 
     if _is_python(target):
         return look_up_file(target)
@@ -132,14 +132,14 @@ def _node_text(node: Found) -> Iterator[str]:
 
 
 def _yaml(value: Any) -> str:
-    from rsltrace.job.reference import flow
+    from rsltrace.job.documents.reference import flow
 
     return flow(list(value) if isinstance(value, tuple) else value)
 
 
 def _bag_text(source: str, folder: Path) -> str:
     from rsltrace.bag import open_bag
-    from rsltrace.run.bags import never_plays
+    from rsltrace.run.plans.bags import never_plays
 
     try:
         with open_bag(source, recover=True, skip=never_plays) as bag:

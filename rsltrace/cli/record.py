@@ -143,7 +143,7 @@ def _say_that_it_has_no_end(job: Job) -> None:
 
 def _print_job(job: Job) -> None:
     from rsltrace.launch import expand
-    from rsltrace.run.executables import why_not
+    from rsltrace.run.plans.executables import why_not
 
     expanded = expand(job, why_not=why_not)
     for note in expanded.notes:

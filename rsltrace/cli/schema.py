@@ -17,6 +17,6 @@ def schema() -> None:
     and as the first line of the job file:
       # yaml-language-server: $schema=job.schema.json
     """
-    from rsltrace.job.schema import job_schema
+    from rsltrace.job.documents.schema import job_schema
 
     click.echo(json.dumps(job_schema(), indent=2))

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rsltrace.diff.model import Diff
+    from rsltrace.diff.traces.model import Diff
 
     Tolerances = Mapping[str, float] | Sequence[tuple[str, float]]
 
@@ -52,8 +52,8 @@ def diff_files(
     Raises TraceError if a file is missing, damaged or no trace, or if an option makes no sense,
     and SetupError for an address when fsspec is not installed.
     """
-    from rsltrace.diff.engine import diff_traces
     from rsltrace.diff.options import DiffOptions
+    from rsltrace.diff.traces.engine import diff_traces
     from rsltrace.trace.reader import Trace
 
     chosen = DiffOptions(

@@ -17,10 +17,11 @@ _MIDDLEWARE = ("rclpy", "rpyutils", "ament_index_python", "rosidl_parser", "rosi
 _LINES_MAX = 6
 
 _USER, _STANDARD, _LIBRARY, _OURS, _IMPORT = range(5)
-_CALLS_BACK = (os.path.join("ros", "core.py"), f"{os.sep}rclpy{os.sep}")
-"""Those of our files that call callbacks."""
-_THREADS = os.path.join(_HERE, "ros", "threads.py")
-_STANDS_IN = os.path.join(_HERE, "ros", "event_loops.py")
+_DOOR = os.path.join(_HERE, "doors", "rclpy")
+_CALLS_BACK = os.path.join(_DOOR, "core.py")
+"""The one of our files that calls callbacks; rclpy's own do, too."""
+_THREADS = os.path.join(_DOOR, "stacks", "threads.py")
+_STANDS_IN = os.path.join(_DOOR, "stacks", "asyncio_loops.py")
 """A part of asyncio, as far as it matters who called whom."""
 _kinds: dict[str, int] = {}
 
@@ -44,6 +45,12 @@ def _kind_of(file: str) -> int:
             kind = _USER
         _kinds[file] = kind
     return kind
+
+
+def _calls_back(file: str) -> bool:
+    if file.startswith(_HERE):
+        return file == _CALLS_BACK
+    return f"{os.sep}rclpy{os.sep}" in file
 
 
 def is_own(module: str) -> bool:
@@ -82,7 +89,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
         elif file == _THREADS:
             return library or standard
         elif kind == _OURS:
-            return library if any(part in file for part in _CALLS_BACK) else None
+            return library if _calls_back(file) else None
         elif kind == _IMPORT:
             return None
         frame = frame.f_back

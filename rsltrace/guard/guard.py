@@ -17,11 +17,11 @@ from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
-from rsltrace.guard.descriptors import Descriptors
-from rsltrace.guard.outside import Outside, answered, decoded, numbered
-from rsltrace.guard.pace import Pace
+from rsltrace.guard.recorded.answers import Outside, answered, decoded, numbered
+from rsltrace.guard.recorded.numbering import Descriptors
 from rsltrace.guard.redirect import copy_of
-from rsltrace.guard.streams import Streams
+from rsltrace.guard.virtual.real_time_pace import Pace
+from rsltrace.guard.virtual.streams import Streams
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]

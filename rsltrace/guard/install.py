@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 
-from rsltrace.guard.clocks import clocks
-from rsltrace.guard.folders import folders
-from rsltrace.guard.memories import memories
-from rsltrace.guard.randomness import randomness
-from rsltrace.guard.recorded_descriptors import recorded_descriptors
-from rsltrace.guard.recorded_files import recorded_files
-from rsltrace.guard.recorded_polls import recorded_polls
-from rsltrace.guard.recorded_processes import recorded_processes
-from rsltrace.guard.recorded_sockets import recorded_sockets
+from rsltrace.guard.recorded.descriptors import recorded_descriptors
+from rsltrace.guard.recorded.files import recorded_files
+from rsltrace.guard.recorded.polls import recorded_polls
+from rsltrace.guard.recorded.processes import recorded_processes
+from rsltrace.guard.recorded.sockets import recorded_sockets
+from rsltrace.guard.virtual.clocks import clocks
+from rsltrace.guard.virtual.folders import folders
+from rsltrace.guard.virtual.module_caches import memories
+from rsltrace.guard.virtual.randomness import randomness
 from rsltrace.guard.watch import watching
 
 _REPLACEMENTS = (

@@ -21,9 +21,9 @@ from types import BuiltinFunctionType, FrameType
 from typing import Any
 
 from rsltrace.guard.callers import user_frame
-from rsltrace.guard.environment import environment_watched
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.virtual.environment import environment_watched
 from rsltrace.model.finding import Mode, Source
 
 _HASHED_BYTES_MAX = 64 << 20

@@ -1,6 +1,6 @@
 """What a run is to do: job files and jobs built in Python, strictly validated, never executed.
 
-The names are loaded when first used: ``rsltrace.job.times`` serves those who need no pydantic.
+The names are loaded when first used: ``parts.times`` serves those who need no pydantic.
 """
 
 from __future__ import annotations
@@ -8,32 +8,32 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rsltrace.job.bag import BagSpec, QosSpec
-    from rsltrace.job.guard import GuardSpec, SourceSpec, policy_of
-    from rsltrace.job.hooks import HooksSpec
     from rsltrace.job.job import Job
-    from rsltrace.job.launch_spec import LaunchSpec
-    from rsltrace.job.load import job_from_text, load_job, locate, showing_line
-    from rsltrace.job.node import NodeSpec
-    from rsltrace.job.spec import RecordSpec, StopSpec, TopicStop
+    from rsltrace.job.parts.bag import BagSpec, QosSpec
+    from rsltrace.job.parts.guard import GuardSpec, SourceSpec, policy_of
+    from rsltrace.job.parts.hooks import HooksSpec
+    from rsltrace.job.parts.launch import LaunchSpec
+    from rsltrace.job.parts.node import NodeSpec
+    from rsltrace.job.parts.run import RecordSpec, StopSpec, TopicStop
+    from rsltrace.job.reading.load import job_from_text, load_job, locate, showing_line
 
 _HOMES = {
-    "BagSpec": "bag",
-    "GuardSpec": "guard",
-    "HooksSpec": "hooks",
+    "BagSpec": "parts.bag",
+    "GuardSpec": "parts.guard",
+    "HooksSpec": "parts.hooks",
     "Job": "job",
-    "LaunchSpec": "launch_spec",
-    "NodeSpec": "node",
-    "QosSpec": "bag",
-    "RecordSpec": "spec",
-    "SourceSpec": "guard",
-    "StopSpec": "spec",
-    "TopicStop": "spec",
-    "job_from_text": "load",
-    "load_job": "load",
-    "locate": "load",
-    "showing_line": "load",
-    "policy_of": "guard",
+    "LaunchSpec": "parts.launch",
+    "NodeSpec": "parts.node",
+    "QosSpec": "parts.bag",
+    "RecordSpec": "parts.run",
+    "SourceSpec": "parts.guard",
+    "StopSpec": "parts.run",
+    "TopicStop": "parts.run",
+    "job_from_text": "reading.load",
+    "load_job": "reading.load",
+    "locate": "reading.load",
+    "showing_line": "reading.load",
+    "policy_of": "parts.guard",
 }
 
 __all__ = [

@@ -9,26 +9,26 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.bag import BagSpec
-from rsltrace.job.clocks import ClockSpec
-from rsltrace.job.delay import DelaysSpec
-from rsltrace.job.distribution import files_of
-from rsltrace.job.guard import GuardSpec, guard_part
-from rsltrace.job.hooks import HooksSpec
-from rsltrace.job.launch_spec import LaunchSpec
-from rsltrace.job.names import check_topic
-from rsltrace.job.node import NodeSpec, check_path
-from rsltrace.job.part import Part, attach, check, given, items, one_of, parts, text, whole
-from rsltrace.job.problems import Loc, Problem, Problems, describe
-from rsltrace.job.scheduling import (
+from rsltrace.job.parts.bag import BagSpec
+from rsltrace.job.parts.clocks import ClockSpec
+from rsltrace.job.parts.delay import DelaysSpec
+from rsltrace.job.parts.distribution import files_of
+from rsltrace.job.parts.guard import GuardSpec, guard_part
+from rsltrace.job.parts.hooks import HooksSpec
+from rsltrace.job.parts.launch import LaunchSpec
+from rsltrace.job.parts.names import check_topic
+from rsltrace.job.parts.node import NodeSpec, check_path
+from rsltrace.job.parts.part import Part, attach, check, given, items, one_of, parts, text, whole
+from rsltrace.job.parts.run import RecordSpec, StopSpec, TimeLike
+from rsltrace.job.parts.scheduling import (
     ExecutionSpec,
     ExecutorSpec,
     PolicySpec,
     executors_part,
     policy_part,
 )
-from rsltrace.job.spec import RecordSpec, StopSpec, TimeLike
-from rsltrace.job.times import parse_time
+from rsltrace.job.parts.times import parse_time
+from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
 from rsltrace.job.whole import problems_of
 
 SEED_MAX = 2**64 - 1
@@ -256,7 +256,7 @@ class Job(Part):
         Classes and functions appear as ``module:qualname``, other Python objects among
         ``arguments`` by the name of their class; a job with local ones does not load again.
         """
-        from rsltrace.job.dump import job_yaml
+        from rsltrace.job.documents.dump import job_yaml
 
         return job_yaml(self)
 
@@ -266,7 +266,7 @@ class Job(Part):
         Times are in nanoseconds under the fields' names, paths relative to ``base_dir``, so that
         the result is the same on every machine.
         """
-        from rsltrace.job.dump import job_resolved
+        from rsltrace.job.documents.dump import job_resolved
 
         return job_resolved(self)
 

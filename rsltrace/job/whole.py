@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from rsltrace.job.paths import near_path
-from rsltrace.job.problems import Problem
-from rsltrace.job.spec import StopSpec
-from rsltrace.job.times import format_time
+from rsltrace.job.parts.run import StopSpec
+from rsltrace.job.parts.times import format_time
+from rsltrace.job.reading.paths import near_path
+from rsltrace.job.reading.problems import Problem
 
 if TYPE_CHECKING:
     from rsltrace.job.job import Job

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.job.yaml_source import Place
+from rsltrace.job.reading.yaml_source import Place
 
 Scalar = str | int | float | bool
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.job.yaml_source import Place
+from rsltrace.job.reading.yaml_source import Place
 from rsltrace.launch.element import Attribute, Element
 from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, Unsupported
 from rsltrace.launch.nodes import Nodes

@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from rsltrace.job.substitute import package_prefix
+from rsltrace.job.reading.substitute import package_prefix
 from rsltrace.launch.expression import evaluate
 from rsltrace.launch.scope import Values
 from rsltrace.launch.template import Call, Template, parse_template

@@ -6,7 +6,7 @@ from typing import Any
 from xml.parsers import expat
 
 from rsltrace.errors import JobError
-from rsltrace.job.yaml_source import Mark, Place, YamlSource
+from rsltrace.job.reading.yaml_source import Mark, Place, YamlSource
 from rsltrace.launch.element import Attribute, Element, not_a_launch_file
 
 _DEPTH_MAX = 100

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
-from rsltrace.run.bags import PLAYER
+from rsltrace.run.plans.bags import PLAYER
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
 
 if TYPE_CHECKING:
-    from rsltrace.ros.overview import Overview
+    from rsltrace.middleware.overview import Overview
 
 
 _OF_MANY = frozenset(("tf", "tf_static", "diagnostics", "rosout", "parameter_events"))
@@ -43,7 +43,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     :raises JobError, SetupError, BagError: the job cannot run.
     :raises RunError: a constructor raised.
     """
-    from rsltrace.ros.overview import overview
+    from rsltrace.middleware.overview import overview
 
     notes: list[str] = []
     observer = Observer(note=notes.append)

@@ -19,7 +19,7 @@ from rsltrace.loop.stop import quiet_until_ns
 from rsltrace.run.session import Session
 
 if TYPE_CHECKING:
-    from rsltrace.ros.outside import Outside
+    from rsltrace.doors.driver import Outside
 
 _INTERRUPTED = 130
 
@@ -39,7 +39,7 @@ class Driver:
     """
 
     def __init__(self, session: Session) -> None:
-        from rsltrace.ros.outside import Outside
+        from rsltrace.doors.driver import Outside
 
         self.session = session
         self.loop = session.loop

@@ -18,7 +18,7 @@ from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 
 if TYPE_CHECKING:
-    from rsltrace.ros.core import Core
+    from rsltrace.doors.rclpy.core import Core
 
 _PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000

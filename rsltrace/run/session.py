@@ -20,10 +20,11 @@ from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
+from rsltrace.middleware.census import Met, parameters_of
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
-from rsltrace.ros.met import Met, parameters_of
-from rsltrace.run.bags import (
+from rsltrace.run.inputs import check_output
+from rsltrace.run.plans.bags import (
     BagInput,
     check_bag_types,
     notes_of,
@@ -31,17 +32,16 @@ from rsltrace.run.bags import (
     start_ns_of,
     start_players,
 )
-from rsltrace.run.clocks import clock_notes, clocks_of
-from rsltrace.run.entries import hook_entries, node_entries, say_where
-from rsltrace.run.executables import why_not
-from rsltrace.run.guarding import Guarding, guarding
-from rsltrace.run.inputs import check_output
-from rsltrace.run.network import network_plan
+from rsltrace.run.plans.clocks import clock_notes, clocks_of
+from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.executables import why_not
+from rsltrace.run.plans.guarding import Guarding, guarding
+from rsltrace.run.plans.network import network_plan
+from rsltrace.run.plans.recorded_order import following, keep_choices, note_choices
+from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
+from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
-from rsltrace.run.recorded_order import following, keep_choices, note_choices
-from rsltrace.run.scheduling import is_ordered, scheduling_plan
-from rsltrace.run.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.unused import (
     has_rules,
     unused_parameters,
@@ -55,9 +55,9 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.chance.network import NetworkPlan
-    from rsltrace.ros.entry import Entry
-    from rsltrace.ros.following import Following
-    from rsltrace.ros.world import World
+    from rsltrace.doors.rclpy.entry import Entry
+    from rsltrace.doors.rclpy.world import World
+    from rsltrace.middleware.recorded_run import Following
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
-        from rsltrace.ros.installing import check_free
+        from rsltrace.doors.rclpy.installation import check_free
 
         check_free()
         expanded = expand(self.job, why_not=why_not)
@@ -183,7 +183,7 @@ class Session:
 
     def _make_world(self, stack: ExitStack) -> None:
         """Make the loop and the world that the job describes, still without nodes."""
-        from rsltrace.ros.world import World
+        from rsltrace.doors.rclpy.world import World
 
         job = self.job
         kind = OrderedLoop if is_ordered(job) else EventLoop
@@ -267,7 +267,7 @@ class Session:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
         core = self.world.core
         if self.job.stop.topic is not None:
-            from rsltrace.ros.watch import watch_exit_code
+            from rsltrace.doors.rclpy.exit_code_topic import watch_exit_code
 
             watch = watch_exit_code(
                 core, self.job.stop.topic, where=locate(self.job, ("stop", "topic", "exit_code"))

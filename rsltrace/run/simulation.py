@@ -11,8 +11,8 @@ from typing import Any
 
 from rsltrace.errors import DeadlockError, RunError
 from rsltrace.job import Job, load_job
-from rsltrace.job.names import check_topic
-from rsltrace.job.times import parse_time
+from rsltrace.job.parts.names import check_topic
+from rsltrace.job.parts.times import parse_time
 from rsltrace.loop.loop import NOTHING_LEFT
 from rsltrace.loop.stop import Stop
 from rsltrace.model.stamp import format_seconds
@@ -311,7 +311,7 @@ class Simulation:
             taps.remove(tap)
 
     def _watcher(self, taps: list[Tap]) -> Callable[[Any, bytes], None]:
-        from rsltrace.ros.codec import codec_for
+        from rsltrace.doors.rclpy.wire.codec import codec_for
 
         driver = self._driver
 

@@ -11,13 +11,13 @@ from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 
 from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
+from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.job import Job, locate
-from rsltrace.job.problems import Loc
+from rsltrace.job.reading.problems import Loc
+from rsltrace.middleware.census import Met, Parameters
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
-from rsltrace.ros.arguments import RosArguments
-from rsltrace.ros.met import Met, Parameters
-from rsltrace.run.guarding import entry_key
+from rsltrace.run.plans.guarding import entry_key
 from rsltrace.run.unused_remappings import has_remappings, unused_remappings
 
 

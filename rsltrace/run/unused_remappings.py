@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.job import Job, locate
-from rsltrace.job.problems import Loc, nearest
-from rsltrace.ros.arguments import RosArguments
-from rsltrace.ros.met import Asker, Met
-from rsltrace.run.guarding import entry_key
+from rsltrace.job.reading.problems import Loc, nearest
+from rsltrace.middleware.census import Asker, Met
+from rsltrace.run.plans.guarding import entry_key
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""

@@ -24,7 +24,7 @@ from rsltrace.guard.callers import is_user_file
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.ros.core import Core
+    from rsltrace.doors.rclpy.core import Core
 
 LOOK_EVERY_S = 2.0
 _LOOKS_BEFORE_NOTE = 5

@@ -97,9 +97,9 @@ def _trace_of(given: Job | RunResult | str | os.PathLike[str]) -> Path | None:
 
 def _report(golden: Path, run: Path, options: DiffOptions | None) -> str | None:
     """Return what differs, or None if nothing does."""
-    from rsltrace.diff.engine import diff_traces
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.report import render
+    from rsltrace.diff.traces.engine import diff_traces
     from rsltrace.trace.reader import Trace
 
     options = options or DiffOptions()

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from diff_simulator import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
 
-from rsltrace.diff.model import Diff, Divergence, Root, Verdict
+from rsltrace.diff.traces.model import Diff, Divergence, Root, Verdict
 from rsltrace.model.event import EventKind
 
 EVENTS_MAX = 1500

@@ -7,8 +7,8 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.align import Past
-from rsltrace.diff.match import NO_CAUSE, UNKNOWN, Strand, match
+from rsltrace.diff.traces.align import Past
+from rsltrace.diff.traces.match import NO_CAUSE, UNKNOWN, Strand, match
 
 # (stamp, input, cause, nth)
 Row = tuple[int, int, int, int]

@@ -13,16 +13,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.bag_model import BagDiff, BagVerdict, Presence
-from rsltrace.diff.bags import diff_bags
-from rsltrace.diff.kinds import is_recording, is_trace
+from rsltrace.diff.bags.comparison import diff_bags
+from rsltrace.diff.bags.model import BagDiff, BagVerdict, Presence
+from rsltrace.diff.bags.sequences import Gap, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.sequences import Gap, gaps_by_order, gaps_by_stamp
 from rsltrace.errors import BagError, TraceError
 
 POINT = "geometry_msgs/msg/PointStamped"
 UINT64 = "std_msgs/msg/UInt64"
 SECOND = 10**9
+
+KEYS = "rsltrace.diff.bags.comparison.ContentKeys"
 
 
 def point(stamp: int, x: float, *, padding: int = 0, frame: str = "ab") -> bytes:
@@ -368,11 +370,11 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
 def test_many_topics_and_messages_take_one_pass_where_nothing_differs(tmp_path: Path) -> None:
     samples = [(i + 1, f"/n{i % 20}", uint64(i)) for i in range(20_000)]
     a, b = write(tmp_path / "a", samples), write(tmp_path / "b", samples)
-    with mock.patch("rsltrace.diff.bags.ContentKeys", side_effect=AssertionError("decoded")):
+    with mock.patch(KEYS, side_effect=AssertionError("decoded")):
         assert diff_bags(a, b).identical
     other = write(tmp_path / "c", [*samples[:-1], (20_000, "/n19", uint64(7))])
     with (
-        mock.patch("rsltrace.diff.bags.ContentKeys", side_effect=AssertionError("decoded")),
+        mock.patch(KEYS, side_effect=AssertionError("decoded")),
         pytest.raises(AssertionError, match="decoded"),
     ):
         diff_bags(a, other)

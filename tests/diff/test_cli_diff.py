@@ -377,13 +377,13 @@ def test_a_bug_is_trouble_and_not_a_divergence(
 ) -> None:
     from click.testing import CliRunner
 
-    import rsltrace.diff.engine
+    import rsltrace.diff.traces.engine
     from rsltrace.cli.main import cli
 
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a bug")
 
-    monkeypatch.setattr(rsltrace.diff.engine, "diff_traces", broken)
+    monkeypatch.setattr(rsltrace.diff.traces.engine, "diff_traces", broken)
     result = CliRunner().invoke(cli, ["diff", str(A), str(B)])
     assert result.exit_code == 2
     assert "ZeroDivisionError: a bug" in result.output + capsys.readouterr().err

@@ -12,8 +12,8 @@ import pytest
 from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
 
 import rsltrace
-from rsltrace.diff.comparison import DIVERGENCES_MAX
-from rsltrace.diff.model import Diff, Root, Verdict
+from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
+from rsltrace.diff.traces.model import Diff, Root, Verdict
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventKind, OutputKind
 
@@ -404,13 +404,13 @@ def test_the_same_swap_again_and_again_is_one_divergence(tmp_path: Path) -> None
 
 def test_the_function_is_also_the_package(tmp_path: Path) -> None:
     import rsltrace.diff
-    import rsltrace.diff.engine
+    import rsltrace.diff.traces.engine
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)), context=2)
     assert isinstance(diff, rsltrace.Diff)
     assert len(diff.divergences[0].before_a) == 2
     assert diff.verdict is rsltrace.Verdict.SAME_INPUT_DIFFERENT_OUTPUT
-    assert rsltrace.diff.engine.diff_traces is not None
+    assert rsltrace.diff.traces.engine.diff_traces is not None
     assert list(inspect.signature(rsltrace.diff).parameters)[:3] == ["a", "b", "context"]
     with pytest.raises(AttributeError, match=r"rsltrace\.diff.*nothing_of_that_name"):
         _ = rsltrace.diff.nothing_of_that_name
@@ -434,7 +434,7 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:
-    from rsltrace.diff.views import at, phrase
+    from rsltrace.diff.traces.views import at, phrase
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)))
     view = diff.divergences[0].a
@@ -453,7 +453,7 @@ def test_a_diff_loads_only_what_it_needs(tmp_path: Path) -> None:
         "rsltrace.diff; assert 'numpy' not in sys.modules\n"
         "a, b = sys.argv[1:]\n"
         "assert rsltrace.diff(a, a).identical\n"
-        "assert 'rsltrace.diff.comparison' not in sys.modules\n"
+        "assert 'rsltrace.diff.traces.comparison' not in sys.modules\n"
         "assert not rsltrace.diff(a, b).identical\n"
         "names = 'pydantic ruamel rosbags rclpy fsspec rich mcap.reader'.split()\n"
         "assert not [n for n in names if n in sys.modules]\n"

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.content import ContentKeys
-from rsltrace.diff.fields import diff_messages, preview
-from rsltrace.diff.globs import FieldRules
-from rsltrace.diff.model import FieldDifference
-from rsltrace.diff.numbers import ulp_distance
+from rsltrace.diff.bags.content import ContentKeys
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.values.fields import diff_messages, preview
+from rsltrace.diff.values.globs import FieldRules
+from rsltrace.diff.values.numbers import ulp_distance
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo

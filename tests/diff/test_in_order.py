@@ -7,7 +7,7 @@ import itertools
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.diff.in_order import most_in_order
+from rsltrace.diff.traces.in_order import most_in_order
 
 
 def rises(values: list[int]) -> bool:

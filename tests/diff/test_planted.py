@@ -19,10 +19,10 @@ from diff_simulator import MS, Fault, Simulation
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.cause import Cone
-from rsltrace.diff.engine import diff_traces
-from rsltrace.diff.model import Diff, Verdict
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.traces.engine import diff_traces
+from rsltrace.diff.traces.model import Diff, Verdict
+from rsltrace.diff.why.cause import Cone
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 

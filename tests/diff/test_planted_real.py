@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 import rsltrace
-from rsltrace.diff.model import Diff, Root, Verdict
+from rsltrace.diff.traces.model import Diff, Root, Verdict
 
 pytestmark = pytest.mark.ros
 

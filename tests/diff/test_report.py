@@ -18,7 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.bag_model import (
+from rsltrace.diff.bags.model import (
     BagDiff,
     BagMessage,
     BagVerdict,
@@ -28,7 +28,10 @@ from rsltrace.diff.bag_model import (
     Recording,
     TopicDiff,
 )
-from rsltrace.diff.model import (
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import FORMATS, render
+from rsltrace.diff.report.words import sentence_text
+from rsltrace.diff.traces.model import (
     CauseStep,
     Diff,
     Divergence,
@@ -43,9 +46,6 @@ from rsltrace.diff.model import (
     Side,
     Verdict,
 )
-from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report import FORMATS, render
-from rsltrace.diff.report.words import sentence_text
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 

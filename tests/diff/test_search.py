@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, S
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.search import first_difference
+from rsltrace.diff.traces.search import first_difference
 from rsltrace.errors import TraceError
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.source import FileSource

@@ -18,7 +18,7 @@ COUNT = """
 import json, os, sys
 from collections import Counter
 from rsltrace import load_job, record
-from rsltrace.guard import ordering
+from rsltrace.guard.virtual import ordering
 from rsltrace.guard.redirect import copy_of
 
 GUARD = os.path.dirname(ordering.__file__)

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-import rsltrace.guard.snapshot
-from rsltrace.guard.snapshot import Snapshots
-from rsltrace.guard.state import StateHasher
+import rsltrace.guard.state.snapshot
+from rsltrace.guard.state.hashing import StateHasher
+from rsltrace.guard.state.snapshot import Snapshots
 from rsltrace.trace.cdr import pack_detail
 from rsltrace.trace.format import TOPIC_STATES
 from rsltrace.trace.reader import Trace
@@ -66,7 +66,7 @@ STATES = st.lists(st.dictionaries(st.sampled_from(["p", "q"]), VALUES), min_size
 @given(STATES)
 def test_each_state_is_read_as_if_it_were_the_only_one(states: list[dict[str, Any]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rsltrace.guard.snapshot, "LEAVES_MAX", 4)
+        patch.setattr(rsltrace.guard.state.snapshot, "LEAVES_MAX", 4)
         for event, state in enumerate(states):
             assert read(states, event) == read([state], 0)
 

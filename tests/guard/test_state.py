@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.guard.state import StateHasher
+from rsltrace.guard.state.hashing import StateHasher
 
 GOLDEN = {
     "plain": "8b37d7770a17ec3c",
@@ -407,10 +407,13 @@ def test_state_hashes_are_off_by_default_and_listed_in_info(tmp_path: Path) -> N
         assert len(set(hashes)) > 10
         assert (
             trace.metadata("rsltrace:guard")["left_out"]
-            == '{"/planted": {"lock": "rsltrace.ros.locks.SimLock"}}'
+            == '{"/planted": {"lock": "rsltrace.doors.rclpy.stacks.locks.SimLock"}}'
         )
     shown = CliRunner().invoke(info, [str(on)]).output
-    assert 'state hashes leave out: {"/planted": {"lock": "rsltrace.ros.locks.SimLock"}}' in shown
+    assert (
+        'state hashes leave out: {"/planted": {"lock": "rsltrace.doors.rclpy.stacks.locks.SimLock"}}'  # noqa: E501
+        in shown
+    )
 
 
 STEPS: list[Callable[[Any], object]] = [

@@ -216,8 +216,8 @@ import sys
 from rsltrace import Trace, load_job, record
 
 record(load_job(sys.argv[1]), sys.argv[2])
-core = sys.modules["rsltrace.ros.core"]  # was loaded in the run, and stays
-assert type(core.__loader__).__module__ != "rsltrace.guard.ordering", "it is not user code"
+core = sys.modules["rsltrace.doors.rclpy.core"]  # was loaded in the run, and stays
+assert type(core.__loader__).__module__ != "rsltrace.guard.virtual.ordering", "it is not user code"
 with Trace.open(sys.argv[2]) as trace:
     assert list(trace.metadata("rsltrace:sources")) == ["cold"], trace.metadata("rsltrace:sources")
 """

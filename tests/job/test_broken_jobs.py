@@ -17,7 +17,7 @@ from ruamel.yaml import YAML, YAMLError
 
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
-from rsltrace.job.schema import job_schema
+from rsltrace.job.documents.schema import job_schema
 
 GOLDEN = Path(__file__).parent / "golden"
 GOOD = (GOLDEN / "good.yaml").read_text("utf-8")

@@ -19,7 +19,7 @@ from rsltrace.chance.distribution import (
 )
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
-from rsltrace.run.network import network_plan
+from rsltrace.run.plans.network import network_plan
 
 MS = 1_000_000
 S = 1_000_000_000

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from ruamel.yaml import YAML
 
 from rsltrace.job import BagSpec, Job, NodeSpec, QosSpec, RecordSpec, StopSpec, TopicStop, load_job
-from rsltrace.job.clocks import ClockSpec, JumpSpec
-from rsltrace.job.distribution import SamplesSpec, SeriesSpec
-from rsltrace.job.schema import job_schema
+from rsltrace.job.documents.schema import job_schema
+from rsltrace.job.parts.clocks import ClockSpec, JumpSpec
+from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec
 
 SCHEMA = jsonschema.Draft202012Validator(job_schema())
 
@@ -210,7 +210,7 @@ def test_the_yaml_of_a_job_is_short_and_readable() -> None:
         "      nested.a: 1\n"
         "    arguments:\n"
         "      a:\n"
-        "      type: rsltrace.job.spec:StopSpec\n"
+        "      type: rsltrace.job.parts.run:StopSpec\n"
         "start: 1.5s\n"
         "stop:\n"
         "  duration: 120s\n"

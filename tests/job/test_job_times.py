@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.job import load_job
-from rsltrace.job.times import TIME_NS_MAX, UNITS_NS, Nanoseconds, format_time, parse_time
+from rsltrace.job.parts.times import TIME_NS_MAX, UNITS_NS, Nanoseconds, format_time, parse_time
 
 times_ns = st.integers(0, TIME_NS_MAX)
 
@@ -120,7 +120,7 @@ def test_a_number_in_a_job_file_is_taken_from_its_text(
 
 @given(times_ns)
 def test_any_number_of_seconds_with_nine_decimals_is_exact_in_a_job_file(time_ns: int) -> None:
-    from rsltrace.job.yaml_source import parse_yaml
+    from rsltrace.job.reading.yaml_source import parse_yaml
 
     text = format_time(time_ns).removesuffix("s")
     value = parse_yaml(f"start: {text}", "job.yaml").value

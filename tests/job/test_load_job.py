@@ -185,7 +185,7 @@ def test_loading_imports_no_ros_no_numpy_and_no_user_code(folder: Path) -> None:
 def test_times_are_read_without_pydantic() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from rsltrace.job.times import parse_time\n"
+        "from rsltrace.job.parts.times import parse_time\n"
         "sys.exit('pydantic' in sys.modules or parse_time('5ms') != 5_000_000)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,8 +11,8 @@ import pytest
 from rsltrace.chance.clock import ClockModel
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
-from rsltrace.run.clocks import clocks_of
-from rsltrace.run.scheduling import is_ordered, scheduling_plan
+from rsltrace.run.plans.clocks import clocks_of
+from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 
 MS = 1_000_000
 

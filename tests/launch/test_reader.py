@@ -11,7 +11,7 @@ from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
 from rsltrace.launch.model import Launched, LaunchedNode
 from rsltrace.launch.specs import node_specs as specs_of
-from rsltrace.run.executables import why_not
+from rsltrace.run.plans.executables import why_not
 
 
 def node_specs(launched: Launched, *, skip_unsupported: bool) -> list[NodeSpec]:

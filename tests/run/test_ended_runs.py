@@ -20,7 +20,7 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 
 import rsltrace
-from rsltrace.diff.model import Diff, Root, Verdict
+from rsltrace.diff.traces.model import Diff, Root, Verdict
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros

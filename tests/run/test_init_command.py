@@ -11,7 +11,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
-from rsltrace.job.look import look_up
+from rsltrace.job.reading.node_source import look_up
 
 NODE = """
 from rclpy.node import Node

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.diff.again import record_again
+from rsltrace.diff.why.record_again import record_again
 from rsltrace.trace.reader import Trace
 
 JOB = """\

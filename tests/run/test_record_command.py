@@ -144,7 +144,7 @@ def test_an_exception_shows_the_users_traceback_and_exits_3(
     assert done.returncode == 3
     assert "raise KeyError('wheel')" in done.stderr
     assert "/talker: timer Faulty.tick" in done.stderr
-    assert "rsltrace/ros" not in done.stderr
+    assert "rsltrace/doors" not in done.stderr
     assert LAST_LINE.fullmatch(done.stdout.splitlines()[-1])
 
 

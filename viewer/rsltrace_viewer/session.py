@@ -27,7 +27,7 @@ from rsltrace_viewer.model.timeline import Columns, EventText, EventTexts, Sign,
 from rsltrace_viewer.model.view import SingleView, View
 
 if TYPE_CHECKING:
-    from rsltrace.diff.stretches import Stretch
+    from rsltrace.diff.traces.stretches import Stretch
     from rsltrace_viewer.model.compare import Comparison  # the diff is loaded for two traces only
 
 SEEK: dict[str, tuple[Condition, str]] = {

@@ -9,13 +9,13 @@ import json
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import HEIGHT, Line, plain_text
+from rsltrace.diff.traces.model import Diff
 from rsltrace.errors import TraceError
 
 if TYPE_CHECKING:
-    from rsltrace.diff.bag_model import BagDiff
+    from rsltrace.diff.bags.model import BagDiff
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
 

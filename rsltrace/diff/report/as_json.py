@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
-from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import Diff, EntityKey, EventView, exit_code_of_several
+from rsltrace.diff.bags.model import BagDiff
+from rsltrace.diff.traces.model import Diff, EntityKey, EventView, exit_code_of_several
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 

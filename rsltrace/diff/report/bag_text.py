@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.bag_model import (
+from rsltrace.diff.bags.model import (
     BagDiff,
     BagMessage,
     BagVerdict,

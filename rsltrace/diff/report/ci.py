@@ -6,13 +6,13 @@ import re
 from collections.abc import Sequence
 from xml.sax.saxutils import escape, quoteattr
 
-from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import Diff
+from rsltrace.diff.bags.model import BagDiff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.text import trace_report
 from rsltrace.diff.report.words import sentence_text
+from rsltrace.diff.traces.model import Diff
 from rsltrace.model.printable import printable
 
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from difflib import SequenceMatcher
 from itertools import zip_longest
 
-from rsltrace.diff.model import CauseStep, Divergence, EventView, MessageDifference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import (
     BAD,
@@ -30,6 +29,7 @@ from rsltrace.diff.report.words import (
     hashes_text,
     message_title,
 )
+from rsltrace.diff.traces.model import CauseStep, Divergence, EventView, MessageDifference
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 

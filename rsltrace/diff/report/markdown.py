@@ -5,14 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import Diff, FieldDifference
+from rsltrace.diff.bags.model import BagDiff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, several_cells
 from rsltrace.diff.report.text import trace_report
 from rsltrace.diff.report.words import distance_text, message_title, sentence_text
+from rsltrace.diff.traces.model import Diff, FieldDifference
 from rsltrace.model.printable import printable, shortened
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~@])")

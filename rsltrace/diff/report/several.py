@@ -5,10 +5,10 @@ from __future__ import annotations
 import shlex
 from collections.abc import Sequence
 
-from rsltrace.diff.bag_model import BagDiff
-from rsltrace.diff.model import ENDED_BY_EXCEPTION, Diff
+from rsltrace.diff.bags.model import BagDiff
 from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
 from rsltrace.diff.report.words import event_text
+from rsltrace.diff.traces.model import ENDED_BY_EXCEPTION, Diff
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import takewhile
 
-from rsltrace.diff.model import Diff, Divergence, Setting, Side
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 from rsltrace.diff.report.line import (
@@ -29,6 +28,7 @@ from rsltrace.diff.report.line import (
     wrapped,
 )
 from rsltrace.diff.report.words import sentence_text
+from rsltrace.diff.traces.model import Diff, Divergence, Setting, Side
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.model import (
+from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, cut, in_columns
+from rsltrace.diff.traces.model import (
     ULP_TOLD_MAX,
     EntityKey,
     EventView,
     FieldDifference,
     MessageDifference,
 )
-from rsltrace.diff.report.line import FAINT, SIDE_A, SIDE_B, Line, Piece, cut, in_columns
 from rsltrace.model.event import EventFlag, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds

@@ -11,13 +11,13 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
-from rsltrace.diff.engine import diff_traces
-from rsltrace.diff.identity import identify
-from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.rows import Run as DiffRun
-from rsltrace.diff.search import first_difference
-from rsltrace.diff.stretches import Item, Stretch, Stretches
+from rsltrace.diff.traces.engine import diff_traces
+from rsltrace.diff.traces.identity import identify
+from rsltrace.diff.traces.model import Diff
+from rsltrace.diff.traces.rows import Run as DiffRun
+from rsltrace.diff.traces.search import first_difference
+from rsltrace.diff.traces.stretches import Item, Stretch, Stretches
 from rsltrace_viewer.model.lanes import Window
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline import Sign

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.diff.evidence import message_differences
-from rsltrace.diff.model import (
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.traces.model import (
     ENDED_BY_EXCEPTION,
     ULP_TOLD_MAX,
     Divergence,
@@ -13,8 +13,8 @@ from rsltrace.diff.model import (
     FieldDifference,
     MessageDifference,
 )
-from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.views import Viewer
+from rsltrace.diff.traces.views import Viewer
+from rsltrace.diff.why.evidence import message_differences
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds

@@ -9,9 +9,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rsltrace.diff.model import CallDifference, Divergence, EventView, StateDifference
-from rsltrace.diff.rows import Run as DiffRun
-from rsltrace.diff.states import state_differences
+from rsltrace.diff.traces.model import CallDifference, Divergence, EventView, StateDifference
+from rsltrace.diff.traces.rows import Run as DiffRun
+from rsltrace.diff.why.states import state_differences
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import Event

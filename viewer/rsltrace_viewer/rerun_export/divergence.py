@@ -17,7 +17,7 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.diff.model import (
+from rsltrace.diff.traces.model import (
     CallDifference,
     CauseStep,
     Diff,

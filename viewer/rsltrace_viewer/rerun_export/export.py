@@ -9,8 +9,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from rsltrace.diff.engine import diff_traces
-from rsltrace.diff.model import Diff
+from rsltrace.diff.traces.engine import diff_traces
+from rsltrace.diff.traces.model import Diff
 from rsltrace.errors import OutputError
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import clock_for

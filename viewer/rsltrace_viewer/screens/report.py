@@ -11,10 +11,10 @@ from textual.content import Content
 from textual.screen import ModalScreen
 from textual.widgets import Static
 
-from rsltrace.diff.model import Diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
+from rsltrace.diff.traces.model import Diff
 
 _STYLES = {
     TITLE: "bold $text-primary",

@@ -1,0 +1,303 @@
+"""Two recordings, topic by topic: which message first differs, is missing or extra, and how.
+
+Three passes, each reading a file once from front to end: hash every message as it was recorded;
+where these hashes differ, hash what the messages say (recorders leave garbage in CDR padding); and
+fetch the few messages that are shown. With tolerances the last pass looks at every difference.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+from array import array
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import numpy.typing as npt
+import xxhash
+
+from rsltrace.diff.bags.content import ContentKeys
+from rsltrace.diff.bags.messages import Fetched, TopicPair, compare_topic
+from rsltrace.diff.bags.model import (
+    BagDiff,
+    BagVerdict,
+    LoneTopic,
+    MessageDivergence,
+    Presence,
+    Recording,
+    TopicDiff,
+)
+from rsltrace.diff.bags.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.bags.source import Source, SourceTopic, open_source, source_of
+from rsltrace.diff.options import BY_STAMP, DiffOptions
+from rsltrace.diff.values.globs import FieldRules
+from rsltrace.errors import TraceError
+from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.reader import Trace
+
+
+@dataclass(slots=True)
+class _Scan:
+    """The messages of one topic: hashes of their bytes and log times, in order."""
+
+    hashes: array[int] = field(default_factory=lambda: array("Q"))
+    stamps: array[int] = field(default_factory=lambda: array("q"))
+
+
+def diff_bags(
+    a: str | os.PathLike[str], b: str | os.PathLike[str], options: DiffOptions | None = None
+) -> BagDiff:
+    """Compare two recordings (bags, or a trace's messages) topic by topic.
+
+    ``a`` and ``b`` are folders with metadata.yaml, single ``.mcap`` or ``.db3`` files, or traces.
+    Messages are matched in the order of their topic, or by log time; log times themselves are not
+    compared when matching by order. Memory: 32 bytes per message, and a few messages.
+
+    :raises BagError, TraceError: a file cannot be read, or no topic is left to compare.
+    """
+    options = options or DiffOptions()
+    with open_source(a) as source_a, open_source(b) as source_b:
+        return _Comparison(source_a, source_b, options).run()
+
+
+def compare_messages(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
+    """Compare all messages, requests and responses of two traces; those of one time belong
+    together. Reads all of both. Raises TraceError where they are damaged."""
+    options = replace(options, by=BY_STAMP, topics=(), nodes=())
+    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+
+
+class _Comparison:
+    def __init__(self, a: Source, b: Source, options: DiffOptions) -> None:
+        self._a, self._b = a, b
+        self._options = options
+        self._pairs, self._lone_a, self._lone_b = _paired(a, b, options)
+        self._notes = [*a.notes, *b.notes]
+
+    def run(self) -> BagDiff:
+        scans_a, scans_b = self._scan(self._a, 0), self._scan(self._b, 1)
+        recording_a = _recording(self._a, scans_a)
+        recording_b = _recording(self._b, scans_b)
+        starts = (recording_a.start_ns, recording_b.start_ns)
+        if self._options.by == BY_STAMP:
+            starts = (min(starts), min(starts))
+        pairs = []
+        for i, j in self._pairs:
+            keys = (_keys(scans_a[i]), _keys(scans_b[j]))
+            stamps = (_times(scans_a[i]), _times(scans_b[j]))
+            gaps = self._gaps(keys, stamps)
+            pairs.append(
+                TopicPair(i, j, self._a.topics[i], self._b.topics[j], *keys, *stamps, gaps)
+            )
+        self._make_canonical(pairs)
+        for pair in pairs:
+            keys = (pair.keys_a, pair.keys_b)
+            pair.gaps[:] = self._gaps(keys, (pair.stamps_a, pair.stamps_b), list(pair.gaps))
+        topics = tuple(self._compare(pairs, starts))
+        lone_a = tuple(_lone(self._a.topics[i], scans_a[i]) for i in self._lone_a)
+        lone_b = tuple(_lone(self._b.topics[j], scans_b[j]) for j in self._lone_b)
+        return self._result(recording_a, recording_b, topics, lone_a, lone_b)
+
+    def _scan(self, source: Source, side: int) -> dict[int, _Scan]:
+        lone = (self._lone_a, self._lone_b)[side]
+        wanted = {pair[side] for pair in self._pairs} | set(lone)
+        scans = {number: _Scan() for number in sorted(wanted)}
+        digest = xxhash.xxh3_64_intdigest
+        for stamp_ns, number, data in source.read(wanted):
+            scan = scans[number]
+            scan.hashes.append(digest(data))
+            scan.stamps.append(stamp_ns)
+        return scans
+
+    def _gaps(
+        self, keys: tuple[Keys, Keys], stamps: tuple[Keys, Keys], within: list[Gap] | None = None
+    ) -> list[Gap]:
+        if self._options.by == BY_STAMP:
+            return gaps_by_stamp(*keys, *stamps)
+        return gaps_by_order(*keys, within)
+
+    def _make_canonical(self, pairs: list[TopicPair]) -> None:
+        """Where bytes differ, replace the keys by keys of what the messages say."""
+        for side, source in ((0, self._a), (1, self._b)):
+            wanted: dict[int, tuple[Keys, npt.NDArray[np.bool_], ContentKeys]] = {}
+            for pair in pairs:
+                number, keys, name = (
+                    (pair.number_a, pair.keys_a, pair.a.name)
+                    if side == 0
+                    else (pair.number_b, pair.keys_b, pair.b.name)
+                )
+                in_gap = np.zeros(len(keys), dtype=bool)
+                for gap in pair.gaps:
+                    start, end = gap[:2] if side == 0 else gap[2:]
+                    in_gap[start:end] = True
+                if in_gap.any():
+                    rules = FieldRules(self._options.for_topic(name))
+                    wanted[number] = (keys, in_gap, ContentKeys(rules))
+            if not wanted:
+                continue
+            seen = dict.fromkeys(wanted, 0)
+            for _, number, data in source.read(set(wanted)):
+                place = seen[number]
+                seen[number] = place + 1
+                keys, in_gap, maker = wanted[number]
+                if not in_gap[place]:
+                    continue
+                try:
+                    keys[place] = maker.key(source.decode(number, data))
+                except TraceError as error:
+                    self._note(f"{error}; compared byte by byte, padding included")
+
+    def _compare(self, pairs: list[TopicPair], starts: tuple[int, int]) -> list[TopicDiff]:
+        fetched = Fetched(self._a, self._b, pairs, self._options)
+        return [compare_topic(pair, fetched, starts, self._options) for pair in pairs]
+
+    def _note(self, text: str) -> None:
+        if text not in self._notes and len(self._notes) < 10:
+            self._notes.append(text)
+
+    def _result(
+        self,
+        a: Recording,
+        b: Recording,
+        topics: tuple[TopicDiff, ...],
+        lone_a: tuple[LoneTopic, ...],
+        lone_b: tuple[LoneTopic, ...],
+    ) -> BagDiff:
+        firsts = [topic.first for topic in topics if topic.first is not None]
+        first = min(firsts, key=lambda found: found.after_ns, default=None)
+        tolerated = sum(topic.tolerated for topic in topics)
+        if first is not None or lone_a or lone_b:
+            verdict = BagVerdict.DIFFERENT
+        else:
+            verdict = BagVerdict.WITHIN_TOLERANCE if tolerated else BagVerdict.EQUAL
+        if self._options.by != BY_STAMP and topics:
+            self._note("log times are not compared (--by stamp matches messages by them)")
+        for topic in topics:
+            if topic.type_a != topic.type_b:
+                self._note(
+                    f"{topic.topic} is {topic.type_a or 'of unknown type'} in a, "
+                    f"{topic.type_b or 'of unknown type'} in b"
+                )
+        return BagDiff(
+            a=a,
+            b=b,
+            verdict=verdict,
+            sentence=_sentence(verdict, first, topics, lone_a, lone_b),
+            by=self._options.by,
+            topics=topics,
+            topics_only_a=lone_a,
+            topics_only_b=lone_b,
+            first=first,
+            next_step=_next_step(a, b, first, self._options),
+            notes=tuple(self._notes),
+        )
+
+
+def _paired(
+    a: Source, b: Source, options: DiffOptions
+) -> tuple[list[tuple[int, int]], list[int], list[int]]:
+    """Return the pairs of topics to compare, and those that only one side has."""
+    in_a = [i for i, topic in enumerate(a.topics) if options.wants_topic(topic.name)]
+    in_b = [j for j, topic in enumerate(b.topics) if options.wants_topic(topic.name)]
+    if not in_a and not in_b:
+        names = sorted({topic.name for topic in (*a.topics, *b.topics)})
+        raise TraceError(
+            f"{a.path} and {b.path} have no topic that matches {' or '.join(options.topics)}; "
+            f"they have {', '.join(names[:12]) or 'none'}"
+        )
+    pairs = []
+    # The same type first; a topic whose only types differ is compared all the same, and says so.
+    for same_type in (True, False):
+        for i in list(in_a):
+            for j in in_b:
+                one, other = a.topics[i], b.topics[j]
+                if one.name == other.name and (one.type == other.type or not same_type):
+                    pairs.append((i, j))
+                    in_a.remove(i)
+                    in_b.remove(j)
+                    break
+    return sorted(pairs), in_a, in_b
+
+
+def _keys(scan: _Scan) -> Keys:
+    return np.array(scan.hashes, dtype=np.uint64)
+
+
+def _times(scan: _Scan) -> Keys:
+    # Bags before 1970 are refused when they are opened.
+    return np.array(scan.stamps, dtype=np.uint64)
+
+
+def _recording(source: Source, scans: dict[int, _Scan]) -> Recording:
+    filled = [scan.stamps for scan in scans.values() if scan.stamps]
+    return Recording(
+        path=source.path,
+        kind=source.kind,
+        topics=len(source.topics),
+        messages=sum(map(len, filled)),
+        start_ns=min((min(stamps) for stamps in filled), default=0),
+        end_ns=max((max(stamps) for stamps in filled), default=0),
+        complete=source.complete,
+    )
+
+
+def _lone(topic: SourceTopic, scan: _Scan) -> LoneTopic:
+    return LoneTopic(topic.name, topic.type, len(scan.hashes))
+
+
+def _sentence(
+    verdict: BagVerdict,
+    first: MessageDivergence | None,
+    topics: tuple[TopicDiff, ...],
+    lone_a: tuple[LoneTopic, ...],
+    lone_b: tuple[LoneTopic, ...],
+) -> str:
+    messages = sum(topic.equal + topic.tolerated for topic in topics)
+    counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
+    if verdict is BagVerdict.EQUAL:
+        return f"The recordings are equal: {counted} say the same."
+    if verdict is BagVerdict.WITHIN_TOLERANCE:
+        tolerated = sum(topic.tolerated for topic in topics)
+        return (
+            f"The recordings are equal within tolerance, not identical: {tolerated} of {counted} "
+            "differ, none by more than is tolerated."
+        )
+    if first is None:
+        lone = [f"{topic.topic} is only in a" for topic in lone_a]
+        lone += [f"{topic.topic} is only in b" for topic in lone_b]
+        more = f" and {len(lone) - 3} more" if len(lone) > 3 else ""
+        same = f"{counted} in both agree, but " if messages else ""
+        text = f"{same}{', '.join(lone[:3])}{more}."
+        return text[0].upper() + text[1:]
+    at = f"on {first.topic}, {format_seconds(first.after_ns)} s after the start"
+    if first.presence is Presence.ONLY_A:
+        assert first.a is not None
+        return f"The recordings first part {at}: message {first.a.index} of a is missing in b."
+    if first.presence is Presence.ONLY_B:
+        assert first.b is not None
+        return f"The recordings first part {at}: message {first.b.index} of b is extra, not in a."
+    assert first.a is not None
+    differing = len(first.fields) + first.more_fields
+    if not first.fields:
+        what = "differs"
+    elif differing == 1:
+        what = f"has another {first.fields[0].path}"
+    else:
+        others = _number(differing - 1, "other field")
+        what = f"has another {first.fields[0].path} (and {others})"
+    return f"The recordings first part {at}: message {first.a.index} {what}."
+
+
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def _next_step(
+    a: Recording, b: Recording, first: MessageDivergence | None, options: DiffOptions
+) -> str:
+    if first is None or options.topics == (first.topic,):
+        return ""
+    command = ["rsltrace", "diff", a.path, b.path, "--topic", first.topic, "--context", "20"]
+    if options.by == BY_STAMP:
+        command += ["--by", BY_STAMP]
+    return shlex.join(command)

@@ -1,0 +1,318 @@
+"""One topic of two recordings: which messages belong together where they are not the same.
+
+Gaps come from keys; here the messages themselves are looked at, to tell a changed message from a
+missing one, to apply tolerances and to say what differs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from rsltrace.diff.bags.model import BagMessage, MessageDivergence, Presence, TopicDiff
+from rsltrace.diff.bags.sequences import Gap, Keys
+from rsltrace.diff.bags.source import Source, SourceTopic
+from rsltrace.diff.options import BY_STAMP, DiffOptions
+from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.values.fields import diff_messages, field_differences, preview
+from rsltrace.diff.values.globs import FieldRules
+from rsltrace.errors import TraceError
+
+_LOOKAHEAD = 16
+"""How many surplus messages in a row are looked past for the counterpart of one."""
+_PREVIEW = 160
+
+
+@dataclass(frozen=True, slots=True)
+class TopicPair:
+    """A topic in both recordings: its numbers there, keys and log times, and where they part."""
+
+    number_a: int
+    number_b: int
+    a: SourceTopic
+    b: SourceTopic
+    keys_a: Keys
+    keys_b: Keys
+    stamps_a: Keys
+    stamps_b: Keys
+    gaps: list[Gap]
+
+
+class _Pair(NamedTuple):
+    """Messages that belong together; -1 where there is none."""
+
+    a: int
+    b: int
+
+
+class Fetched:
+    """Gives the messages of the gaps, by topic and index, decoded.
+
+    Without tolerances only what is shown is needed: one pass per file collects it for all topics.
+    With tolerances every gap is looked at: each topic is then read by itself, in step.
+    """
+
+    def __init__(self, a: Source, b: Source, pairs: list[TopicPair], options: DiffOptions) -> None:
+        self._a, self._b = a, b
+        self._context = options.context
+        self._collected: tuple[dict[int, dict[int, bytes]], ...] = ({}, {})
+        if not options.tolerant:
+            for side, source in ((0, a), (1, b)):
+                self._collect(source, side, pairs)
+
+    def _collect(self, source: Source, side: int, pairs: list[TopicPair]) -> None:
+        ranges: dict[int, tuple[int, int]] = {}
+        for pair in pairs:
+            if pair.gaps:
+                gap = pair.gaps[0]
+                start, end = (gap[2:], gap[:2])[side == 0]
+                number = (pair.number_a, pair.number_b)[side]
+                ranges[number] = (start - self._context, min(end, start + 4 * _LOOKAHEAD))
+        if not ranges:
+            return
+        found = self._collected[side]
+        seen = dict.fromkeys(ranges, 0)
+        for _, number, data in source.read(set(ranges)):
+            place = seen[number]
+            seen[number] = place + 1
+            first, last = ranges[number]
+            if first <= place < last:
+                found.setdefault(number, {})[place] = data
+            elif place >= last and all(seen[n] >= end for n, (_, end) in ranges.items()):
+                return
+
+    def sides(self, pair: TopicPair) -> tuple[_Side, _Side]:
+        """Return access to the messages of a topic in a and in b."""
+        made = []
+        for side, source, number in ((0, self._a, pair.number_a), (1, self._b, pair.number_b)):
+            collected = self._collected[side].get(number)
+            if collected is not None:
+                made.append(_Side(source, number, known=collected))
+            else:
+                stream = (data for _, _, data in source.read({number}))
+                made.append(_Side(source, number, stream=stream, keep=self._context))
+        return made[0], made[1]
+
+
+class _Side:
+    """The messages of one topic of one recording, asked for in about their order."""
+
+    def __init__(
+        self,
+        source: Source,
+        number: int,
+        *,
+        known: dict[int, bytes] | None = None,
+        stream: Iterator[bytes] | None = None,
+        keep: int = 0,
+    ) -> None:
+        self._source = source
+        self._number = number
+        self._known = known if known is not None else {}
+        self._stream = stream
+        self._order: deque[int] = deque()
+        self._keep = keep + 2 * _LOOKAHEAD
+        self._next = 0
+
+    def get(self, index: int) -> object | None:
+        """Return a decoded message, or None if it is not at hand. Raises TraceError."""
+        while self._stream is not None and self._next <= index:
+            data = next(self._stream, None)
+            if data is None:
+                return None
+            self._known[self._next] = data
+            self._order.append(self._next)
+            self._next += 1
+            if len(self._order) > self._keep:
+                del self._known[self._order.popleft()]
+        found = self._known.get(index)
+        return None if found is None else self._source.decode(self._number, found)
+
+    def view(self, index: int, stamps: Keys) -> BagMessage:
+        """Return a message for printing."""
+        try:
+            message = self.get(index)
+            text = "" if message is None else preview(message, _PREVIEW)
+        except TraceError:
+            text = "(cannot be decoded)"
+        return BagMessage(index, int(stamps[index]), text)
+
+
+def compare_topic(
+    pair: TopicPair, fetched: Fetched, starts: tuple[int, int], options: DiffOptions
+) -> TopicDiff:
+    """Return how the messages of one topic compare. Raises BagError or TraceError."""
+    own = options.for_topic(pair.a.name)
+    counts = _counted(pair)
+    first = None
+    if pair.gaps:
+        rules = FieldRules(own)
+        side_a, side_b = fetched.sides(pair)
+        if own.tolerant:
+            counts = _Counts(equal=len(pair.keys_a))
+        gaps = pair.gaps if own.tolerant else pair.gaps[:1]
+        for one in _pairs(pair, gaps, side_a, side_b, rules, options):
+            covered = own.tolerant and _covered(side_a, side_b, one, rules)
+            if first is None and not covered:
+                first = _divergence(pair, one, side_a, side_b, starts, own)
+            if not own.tolerant:
+                break
+            counts.add(one, covered=covered)
+    return TopicDiff(
+        topic=pair.a.name,
+        type_a=pair.a.type,
+        type_b=pair.b.type,
+        equal=counts.equal,
+        tolerated=counts.tolerated,
+        differing=counts.differing,
+        only_a=counts.only_a,
+        only_b=counts.only_b,
+        first=first,
+    )
+
+
+@dataclass(slots=True)
+class _Counts:
+    equal: int = 0
+    tolerated: int = 0
+    differing: int = 0
+    only_a: int = 0
+    only_b: int = 0
+
+    def add(self, one: _Pair, *, covered: bool) -> None:
+        """Count what is not the same; ``equal`` begins as all of a."""
+        self.equal -= one.a >= 0
+        if one.b < 0:
+            self.only_a += 1
+        elif one.a < 0:
+            self.only_b += 1
+        elif covered:
+            self.tolerated += 1
+        else:
+            self.differing += 1
+
+
+def _counted(pair: TopicPair) -> _Counts:
+    """Count by keys alone, as if what is surplus in a gap stood at its end."""
+    counts = _Counts()
+    for gap in pair.gaps:
+        size = min(gap.a_end - gap.a_start, gap.b_end - gap.b_start)
+        left = pair.keys_a[gap.a_start : gap.a_start + size]
+        right = pair.keys_b[gap.b_start : gap.b_start + size]
+        counts.differing += int((left != right).sum())
+        counts.only_a += max(gap.surplus, 0)
+        counts.only_b += max(-gap.surplus, 0)
+    counts.equal = len(pair.keys_a) - counts.differing - counts.only_a
+    return counts
+
+
+def _pairs(
+    pair: TopicPair,
+    gaps: list[Gap],
+    a: _Side,
+    b: _Side,
+    rules: FieldRules,
+    options: DiffOptions,
+) -> Iterator[_Pair]:
+    """Yield what is not the same, in order: messages that belong together, and single ones."""
+    for gap in gaps:
+        i, j, surplus = gap.a_start, gap.b_start, gap.surplus
+        while i < gap.a_end or j < gap.b_end:
+            if surplus > 0 and (j >= gap.b_end or _is_surplus(a, i, surplus, b, j, rules, options)):
+                yield _Pair(i, -1)
+                i, surplus = i + 1, surplus - 1
+            elif surplus < 0 and (
+                i >= gap.a_end or _is_surplus(b, j, -surplus, a, i, rules, options)
+            ):
+                yield _Pair(-1, j)
+                j, surplus = j + 1, surplus + 1
+            else:
+                if pair.keys_a[i] != pair.keys_b[j]:
+                    yield _Pair(i, j)
+                i, j = i + 1, j + 1
+
+
+def _is_surplus(
+    longer: _Side,
+    at: int,
+    surplus: int,
+    shorter: _Side,
+    other: int,
+    rules: FieldRules,
+    options: DiffOptions,
+) -> bool:
+    """Whether a message of the longer side has no counterpart: a later one fits better."""
+    if options.by == BY_STAMP:
+        return False
+    try:
+        wanted = shorter.get(other)
+        if wanted is None or _alike(longer.get(at), wanted, rules):
+            return False
+        later = range(at + 1, at + 1 + min(surplus, _LOOKAHEAD))
+        return any(_alike(longer.get(place), wanted, rules) for place in later)
+    except TraceError:
+        return False
+
+
+def _alike(one: object | None, other: object, rules: FieldRules) -> bool:
+    """Whether two messages are of one moment: equal within tolerance, or of one header stamp."""
+    if one is None:
+        return False
+    stamps = []
+    for message in (one, other):
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        if stamp is not None:
+            stamps.append((stamp.sec, stamp.nanosec))
+    if len(stamps) == 2 and stamps[0] == stamps[1] and any(stamps[0]):
+        return True
+    return all(found.within_tolerance for found in field_differences(one, other, rules))
+
+
+def _covered(a: _Side, b: _Side, one: _Pair, rules: FieldRules) -> bool:
+    if one.a < 0 or one.b < 0:
+        return False
+    try:
+        left, right = a.get(one.a), b.get(one.b)
+        return all(found.within_tolerance for found in field_differences(left, right, rules))
+    except TraceError:
+        return False
+
+
+def _divergence(
+    pair: TopicPair,
+    one: _Pair,
+    a: _Side,
+    b: _Side,
+    starts: tuple[int, int],
+    options: DiffOptions,
+) -> MessageDivergence:
+    in_a, in_b = one.a >= 0, one.b >= 0
+    view_a = a.view(one.a, pair.stamps_a) if in_a else None
+    view_b = b.view(one.b, pair.stamps_b) if in_b else None
+    shown = view_a or view_b
+    assert shown is not None
+    fields: tuple[FieldDifference, ...] = ()
+    more, reason = 0, ""
+    if in_a and in_b:
+        try:
+            fields, more = diff_messages(a.get(one.a), b.get(one.b), options)
+            if not fields:
+                reason = "the messages differ in bytes that their types do not describe"
+        except TraceError as error:
+            reason = str(error)
+    side, stamps, index = (a, pair.stamps_a, one.a) if in_a else (b, pair.stamps_b, one.b)
+    before = range(max(index - options.context, 0), index)
+    return MessageDivergence(
+        topic=pair.a.name,
+        type=pair.a.type,
+        presence=(Presence.BOTH if in_a and in_b else Presence.ONLY_A if in_a else Presence.ONLY_B),
+        a=view_a,
+        b=view_b,
+        after_ns=shown.stamp_ns - starts[0 if in_a else 1],
+        fields=fields,
+        more_fields=more,
+        reason=reason,
+        before=tuple(side.view(place, stamps) for place in before),
+    )

@@ -1,0 +1,1 @@
+"""Two decoded messages, field by field."""

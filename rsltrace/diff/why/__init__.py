@@ -1,0 +1,1 @@
+"""Why two traces diverge: causes, verdicts, evidence, settings."""

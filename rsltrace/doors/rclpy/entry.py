@@ -1,0 +1,104 @@
+"""What is constructed in a world, and the arguments that ``ros2 run`` would give it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.errors import JobError
+from rsltrace.model.finding import Policy
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One entry of a job, ready to be constructed.
+
+    ``make`` returns a node or a list of nodes; ``arguments`` are what ``ros2 run`` would give
+    them, in lists of which later ones have the last word on parameters. ``key`` is a name of its
+    own among the entries, whatever other entries there are.
+    """
+
+    name: str
+    make: Callable[[], Any]
+    arguments: list[RosArguments]
+    log_exceptions: bool = False
+    """Whether a callback of its nodes that raises is logged instead of ending the run."""
+    key: str = ""
+    policy: Policy | None = None
+    argv: list[str] | None = None
+    """The command line, if ``make`` is a main to be run in a program of its own."""
+
+
+def ros_arguments(
+    *,
+    name: str | None,
+    namespace: str | None,
+    parameters: dict[str, Any],
+    parameter_files: Sequence[Path],
+    remappings: dict[str, str],
+    where: str,
+    for_all: Sequence[str] = (),
+) -> list[RosArguments]:
+    """Return what ``ros2 run`` would be given for a node of a job, as lists of arguments.
+
+    The job's own parameters are a list of their own: rcl would let a file's entry for one node
+    win over a parameter given for all. ``for_all`` are the job's arguments for all nodes: their
+    names go before the node's own (the first rule counts), their parameters after.
+
+    :raises JobError: if rcl refuses them (a broken parameter file) or would cut a text off; it
+        begins with ``where``.
+    """
+    arguments = list(for_all)
+    if name is not None:
+        arguments += ["-r", f"__node:={name}"]
+    if namespace is not None:
+        arguments += ["-r", f"__ns:={namespace}"]
+    for old, new in remappings.items():
+        arguments += ["-r", f"{old}:={new}"]
+    for path in parameter_files:
+        arguments += ["--params-file", str(path)]
+    own: list[str] = []
+    for key, value in parameters.items():
+        own += ["-p", f"{key}:={_yaml_value(value, where)}"]
+    try:
+        lists = (arguments, own, for_all) if for_all else (arguments, own)
+        return [RosArguments(["--ros-args", *part]) for part in lists]
+    except InvalidArgumentsError as error:
+        raise JobError(str(error), where=where) from error
+
+
+def _yaml_value(value: Any, where: str) -> str:
+    """Write a parameter so that rcl's YAML parser reads the same value and type again."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, int):
+        return str(int(value))
+    if isinstance(value, float):
+        return {"inf": ".inf", "-inf": "-.inf", "nan": ".nan"}.get(
+            repr(float(value)), _float(value)
+        )
+    if isinstance(value, str):
+        if "\0" in value:
+            raise JobError(
+                f"the parameter {value!r} has a NUL character, where ROS ends a text: leave it out",
+                where=where,
+            )
+        return '"' + "".join(map(_escaped, value)) + '"'
+    return "[" + ", ".join(_yaml_value(item, where) for item in value) + "]"
+
+
+def _escaped(character: str) -> str:
+    if character in '"\\':
+        return "\\" + character
+    return character if character.isprintable() else f"\\U{ord(character):08x}"
+
+
+def _float(value: float) -> str:
+    text = repr(float(value))
+    mantissa, _, exponent = text.partition("e")
+    if "." not in mantissa:
+        mantissa += ".0"
+    return mantissa + (f"e{exponent}" if exponent else "")

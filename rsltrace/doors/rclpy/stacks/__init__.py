@@ -1,0 +1,1 @@
+"""Call stacks of user code: blocking calls, tasks, threads, locks, asyncio, mains."""

@@ -1,0 +1,246 @@
+"""Locks for threads that are none: who finds one taken waits in simulated time.
+
+``threading`` builds conditions, events, semaphores, barriers and queues on two kinds of locks;
+with these in their place all of them work. A lock that is free costs no more than a flag. Outside
+of a run, and in real threads, real locks are made.
+"""
+
+from __future__ import annotations
+
+import _thread
+import os
+import sys
+import threading
+import weakref
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.doors.rclpy.stacks.blocking_calls import Wait, wait
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core, world_exists
+from rsltrace.errors import UnsupportedError
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.core import Core
+
+_NS_PER_S = 1_000_000_000
+_real_rlock = _thread.RLock
+
+
+class SimLock:
+    """Stands in for ``threading.Lock``. A lock that is released goes to who has waited longest."""
+
+    __slots__ = ("__weakref__", "_owner", "_taken", "_waits")
+
+    def __new__(cls) -> Any:
+        return _thread.allocate_lock() if simulated_core() is None else object.__new__(cls)
+
+    def __init__(self) -> None:
+        self._taken = False
+        self._owner: greenlet | None = None
+        self._waits: deque[Wait] = deque()
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock, waiting for it if need be; return whether it is ours now."""
+        if not self._taken:
+            self._taken = True
+            self._owner = getcurrent()
+            return True
+        if not blocking:
+            if timeout != -1:
+                raise ValueError("can't specify a timeout for a non-blocking call")
+            return False
+        if timeout != -1 and timeout < 0:
+            raise ValueError("timeout value must be a non-negative number")
+        return self._wait(timeout)
+
+    def _wait(self, timeout: float) -> bool:
+        core = simulated_core()
+        if core is None:
+            raise UnsupportedError(
+                "a real thread, or code outside of a run, waits for a lock of the simulation"
+            )
+        for_ns = None if timeout == -1 else int(timeout * _NS_PER_S)
+        in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
+        what: Any = _Holder(core, self._owner, for_work=in_condition)
+        if wait(core, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
+            self._owner = getcurrent()  # whoever released it has left it taken, for us
+            return True
+        self._waits = deque(blocked for blocked in self._waits if blocked.waiting)
+        return False
+
+    def release(self) -> None:
+        """Give the lock up, to whoever waits for it."""
+        if not self._taken:
+            raise RuntimeError("release unlocked lock")
+        self._owner = None
+        while self._waits:
+            blocked = self._waits.popleft()
+            if blocked.waiting:
+                blocked.wake()
+                return
+        self._taken = False
+
+    def locked(self) -> bool:
+        """Return whether somebody has the lock."""
+        return self._taken
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *exc: object) -> None:
+        self.release()
+
+    def _at_fork_reinit(self) -> None:
+        self.__init__()  # type: ignore[misc]
+
+
+class SimRLock:
+    """Stands in for ``threading.RLock``: whoever has it may take it again."""
+
+    __slots__ = ("__weakref__", "_count", "_lock", "_owner")
+
+    def __new__(cls) -> Any:
+        return _real_rlock() if simulated_core() is None else object.__new__(cls)
+
+    def __init__(self) -> None:
+        self._lock = SimLock()
+        self._owner: greenlet | None = None
+        self._count = 0
+
+    def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
+        """Take the lock once more, waiting for it if somebody else has it."""
+        me = getcurrent()
+        if self._owner is me:
+            self._count += 1
+            return True
+        if not self._lock.acquire(blocking, timeout):
+            return False
+        self._owner = me
+        self._count = 1
+        return True
+
+    def release(self) -> None:
+        """Give the lock up once."""
+        if self._owner is not getcurrent():
+            raise RuntimeError("cannot release un-acquired lock")
+        self._count -= 1
+        if not self._count:
+            self._owner = None
+            self._lock.release()
+
+    def __enter__(self) -> bool:
+        return self.acquire()
+
+    def __exit__(self, *exc: object) -> None:
+        self.release()
+
+    # What Condition asks of a lock.
+
+    def _is_owned(self) -> bool:
+        return self._owner is getcurrent()
+
+    def _release_save(self) -> tuple[int, greenlet | None]:
+        state = self._count, self._owner
+        self._count, self._owner = 0, None
+        self._lock.release()
+        return state
+
+    def _acquire_restore(self, state: tuple[int, greenlet | None]) -> None:
+        self._lock.acquire()
+        self._count, self._owner = state
+
+    def _recursion_count(self) -> int:
+        return self._count if self._is_owned() else 0
+
+    def _at_fork_reinit(self) -> None:
+        self.__init__()  # type: ignore[misc]
+
+
+# -- in a forked process --------------------------------------------------------------------------
+
+_making = _thread.allocate_lock()
+_real: weakref.WeakKeyDictionary[SimLock, Any] = weakref.WeakKeyDictionary()
+
+
+def _real_of(lock: SimLock, *, anew: bool = False) -> Any:
+    with _making:
+        found = None if anew else _real.get(lock)
+        if found is None:
+            found = _real[lock] = _thread.allocate_lock()
+            if lock._taken and not anew:
+                found.acquire()
+        return found
+
+
+def _acquire(self: SimLock, blocking: bool = True, timeout: float = -1) -> bool:
+    return bool(_real_of(self).acquire(blocking, timeout))
+
+
+def _release(self: SimLock) -> None:
+    _real_of(self).release()
+
+
+def _locked(self: SimLock) -> bool:
+    return bool(_real_of(self).locked())
+
+
+def _reinit(self: SimLock) -> None:
+    _real_of(self, anew=True)
+
+
+def _become_real() -> None:
+    """Have the locks of the simulation lock real threads: a forked process has no others.
+
+    A condition keeps bound methods of its lock, so it is their code that is exchanged.
+    """
+    if world_exists():
+        kind: Any = SimLock
+        for name, real in (
+            ("acquire", _acquire),
+            ("release", _release),
+            ("locked", _locked),
+            ("_at_fork_reinit", _reinit),
+        ):
+            getattr(kind, name).__code__ = real.__code__
+
+
+os.register_at_fork(after_in_child=_become_real)
+
+
+class _Holder:
+    """Says who has a lock, when somebody asks: for the report of a deadlock."""
+
+    def __init__(self, core: Core, owner: greenlet | None, *, for_work: bool) -> None:
+        self._core = core
+        self._owner = owner
+        self._me = getcurrent()
+        self._for_work = for_work
+
+    def is_idle(self) -> bool:
+        """Say whether a thread waits for work (a queue, an event) that may never come.
+
+        So does a main that leaves the work to threads which spin.
+        """
+        core = self._core
+        if not self._for_work or core.is_thread(self._me):
+            return self._for_work
+        program = core.program_of(self._me)
+        return program is not None and any(
+            blocked.quiet and blocked.program is program and blocked.stack is not self._me
+            for blocked in core.blocked
+        )
+
+    def __str__(self) -> str:
+        if self._for_work:
+            return "somebody to wake it (an event, a condition, a queue, a future)"
+        if self._owner is self._me:
+            return "a lock that it holds itself"
+        for blocked in self._core.blocked:
+            if blocked.stack is self._owner:
+                return f"a lock that is held by {blocked.describe()}"
+        return "a lock that nobody will release"
+
+
+__all__ = ["SimLock", "SimRLock"]

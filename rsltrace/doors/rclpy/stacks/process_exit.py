@@ -1,0 +1,150 @@
+"""``os._exit``, signals to oneself and the like end the process of a node, which is everybody's.
+
+So for the time of a run they end what they would end natively: one main with its threads, or,
+called by a node that the job constructs, the run. As natively, no ``finally`` block and no exit
+handler runs: the stacks are left where they are. The trace is whole, and says who did it.
+"""
+
+from __future__ import annotations
+
+import _signal  # type: ignore[import-not-found]
+import os
+import signal
+import sys
+from asyncio import _get_running_loop, _set_running_loop
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from typing import TYPE_CHECKING, Any, NoReturn
+
+from greenlet import getcurrent
+
+from rsltrace.doors.rclpy.stacks.blocking_calls import RunEnded, abandon, getpid
+from rsltrace.doors.rclpy.stacks.program_end import end_program
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.errors import UnsupportedError
+from rsltrace.guard.redirect import Redirected
+from rsltrace.loop.stop import Stop
+from rsltrace.model.event import OutputKind
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.core import Core
+
+_DEADLY = (signal.SIGKILL, signal.SIGABRT)
+_real: dict[str, Callable[..., Any]] = {}
+"""What the functions did before the run, which may be the guard's doing."""
+
+
+@contextmanager
+def own_process_ends(core: Core) -> Iterator[None]:
+    """Let nodes end their process, and not ours, within the ``with`` block."""
+    targets: list[tuple[Any, Callable[..., Any]]] = [
+        (os._exit, _exit),
+        (os.abort, _abort),
+        (os.kill, _kill),
+        (os.execv, _execv),
+        (os.execve, _execve),
+        (_signal.raise_signal, _raise_signal),
+    ]
+    before = dict(_real)
+    with ExitStack() as stack:
+        stack.callback(_real.update, before)
+        stack.callback(_real.clear)
+        for function, target in targets:
+            redirected = Redirected(function, target)
+            stack.callback(redirected.restore)
+            _real[function.__name__] = redirected.real
+        yield
+
+
+def _exit(status: int) -> None:
+    core = _core()
+    if core is None:
+        _real["_exit"](status)
+    else:
+        _leave(core, f"os._exit({status})", status & 0xFF)
+
+
+def _abort() -> None:
+    core = _core()
+    if core is None:
+        _real["abort"]()
+    else:
+        _leave(core, "os.abort()", 128 + signal.SIGABRT)
+
+
+def _kill(pid: int, number: int, /) -> None:
+    core = _core()
+    if core is None or pid != getpid() or not _signalled(core, number, "os.kill"):
+        _real["kill"](pid, number)
+
+
+def _raise_signal(signalnum: int) -> None:
+    core = _core()
+    if core is None or not _signalled(core, signalnum, "signal.raise_signal"):
+        _real["raise_signal"](signalnum)
+
+
+def _signalled(core: Core, number: int, call: str) -> bool:
+    """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
+    handler = core.program.signal_handlers.get(number)
+    if number in _DEADLY or handler == signal.SIG_DFL:
+        _leave(core, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+    if handler is None:
+        return False
+    if callable(handler):
+        handler(number, sys._getframe(2))
+    return True
+
+
+def _execv(path: Any, argv: Any, /) -> None:
+    _refuse("os.execv")
+    _real["execv"](path, argv)
+
+
+def _execve(path: Any, argv: Any, env: Any) -> None:
+    _refuse("os.execve")
+    _real["execve"](path, argv, env)
+
+
+def _refuse(call: str) -> None:
+    if _core() is not None:
+        raise UnsupportedError(
+            f"{call} would put another program in the place of this process, in which all nodes of "
+            "the run are: end the node instead (sys.exit), or start the program with subprocess"
+        )
+
+
+def _core() -> Core | None:
+    """Return the world whose node calls, or None if the process is to do what it is told."""
+    core = simulated_core()
+    return core if core is not None and core.current_handle is not None else None
+
+
+def _leave(core: Core, call: str, status: int) -> NoReturn:
+    """End the process of the calling code: the program, or the run."""
+    handle = core.current_handle
+    assert handle is not None
+    if core.ending or core.closing or getcurrent() is core.main:
+        raise RunEnded  # it is ending anyway, and somebody needs this stack
+    program = core.program
+    if program is core.host:
+        core.note(OutputKind.SHUTDOWN, 0, 1, status)
+        core.loop.stop(Stop(f"{handle.describe()} called {call}", status))
+    else:
+        core.notes.append(f"{handle.describe()} called {call}")
+        for blocked in [one for one in core.blocked if one.program is program]:
+            del core.blocked[blocked]
+            abandon(blocked.stack)
+            blocked.stop_waiting()
+        for thread in [one for one in core.threads if one.program is program]:
+            thread.end()
+        end_program(program, SystemExit(status))
+    core.on_end = None
+    core.end_event()
+    if core.program is not core.host:
+        core.host.enter()
+    if _get_running_loop() is not None:
+        _set_running_loop(None)
+    abandon(getcurrent())
+    core.next_runner().switch()
+    raise AssertionError("nobody goes back to a stack that was left")

@@ -1,0 +1,352 @@
+"""Threads that user code starts run as cooperative ones, in the one thread of the simulation.
+
+A thread is a stack of its own that runs until it blocks or spins; then somebody else goes on. It
+begins right after the event that started it. ``threading``, ``queue`` and ``concurrent.futures``
+stay what they are: only ``Thread.start`` and its like, and the locks below everything, are
+exchanged while a run lasts. What real threads (of libraries in C) start or lock stays real.
+"""
+
+from __future__ import annotations
+
+import _thread
+import _threading_local
+import concurrent.futures
+import concurrent.futures._base as futures_base
+import concurrent.futures.thread as futures_thread
+import itertools
+import logging
+import queue
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
+
+from greenlet import getcurrent, greenlet
+
+from rsltrace.doors.rclpy.stacks.blocking_calls import RunEnded, Wait, wait
+from rsltrace.doors.rclpy.stacks.locks import SimLock, SimRLock
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.guard.callers import is_user_file
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.core import Core
+
+_NS_PER_S = 1_000_000_000
+_FIRST_IDENT = 1_000_001
+_real_get_ident = _thread.get_ident
+_real_start_new_thread = _thread.start_new_thread
+_Thread = threading.Thread
+_pool_worker = futures_thread._worker
+_WORKERS = 4
+"""Processors there are, for a pool that does not say how many workers it wants."""
+_real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
+
+
+class SimThread:
+    """One thread of the simulation. It is dispatched once, to begin."""
+
+    def __init__(
+        self,
+        core: Core,
+        body: Callable[[], object],
+        name: str,
+        *,
+        daemon: bool,
+        thread: threading.Thread | None = None,
+    ) -> None:
+        self.core = core
+        self.thread = thread
+        self.name = name
+        self.daemon = daemon
+        self.program = core.program
+        self.ident = _FIRST_IDENT + core.thread_count
+        core.thread_count += 1
+        self.stack: greenlet | None = None
+        self.ended = False
+        self.announced = True
+        self.mailbox = None
+        self.node = core.current_node
+        self.entity_id = core.new_entity_id()
+        core.pending.append(self)
+        self._body: Callable[[], object] | None = body
+        self._joining: list[Wait] = []
+        self._cause = (core.loop.events, core.note(OutputKind.TASK, self.entity_id, 3))
+        self._input_hash = core.input_hash
+        core.threads[self] = None
+        core.loop.tasks.append(self)
+
+    # -- the loop's view -------------------------------------------------------------------------
+
+    def dispatch(self) -> None:
+        """Run the thread until it ends or blocks for the first time, as one event."""
+        if self.ended or self.program.ended:
+            self.end()
+            return
+        core = self.core
+        core.runners.append(getcurrent())
+        self.stack = greenlet(self._run)
+        core.thread_stacks[self.stack] = self
+        self.stack.switch()
+
+    def _run(self) -> None:
+        core = self.core
+        if self.program is not core.program:
+            self.program.enter()
+        cause_event, cause_output = self._cause
+        core.execute(
+            core.outside(self.describe, self.program.entry),
+            self.entity_id,
+            self.node,
+            int(EventKind.TASK),
+            self._call,
+            (),
+            cause_event,
+            cause_output,
+            self._input_hash,
+        )
+        if core.program is not core.host:
+            core.host.enter()
+        getcurrent().parent = core.runners.pop()
+
+    def _call(self) -> None:
+        from rclpy.executors import ExternalShutdownException
+
+        body, self._body = self._body, None
+        assert body is not None
+        try:
+            body()
+        except (RunEnded, SystemExit, ExternalShutdownException):
+            pass
+        except KeyboardInterrupt:
+            if not self.core.closing:
+                raise
+        finally:
+            self.end()
+
+    def end(self) -> None:
+        """Take note that the thread has ended: whoever joins it goes on."""
+        self.ended = True
+        self._body = None
+        self.core.threads.pop(self, None)
+        if self.stack is not None:
+            self.core.thread_stacks.pop(self.stack, None)
+        for blocked in self._joining:
+            blocked.wake()
+
+    def dismiss(self) -> None:
+        """Let the worker of a pool end when it has done its work, as Python does at its end."""
+        if getattr(self.thread, "_target", None) is _pool_worker:
+            pool = self.thread._args[0]()  # type: ignore[union-attr]
+            if pool is not None:
+                pool.shutdown(wait=False)
+
+    def describe(self) -> str:
+        """Name the thread for people."""
+        where = self.program.name if self.node is None else self.node.fully_qualified_name
+        return f"{where}: thread {self.name}"
+
+    def join(self, timeout: float | None) -> None:
+        """Wait in simulated time until the thread has ended."""
+        if not self.ended:
+            for_ns = None if timeout is None else max(int(timeout * _NS_PER_S), 0)
+            what = f"thread {self.name} to end"
+            wait(
+                self.core,
+                what,
+                until=self._joining.append,
+                for_ns=for_ns,
+                patient=self.is_patient,
+            )
+            self._joining = [blocked for blocked in self._joining if blocked.waiting]
+
+    def is_patient(self) -> bool:
+        """Return whether the thread waits for what may never come, so that a join may, too."""
+        own = [blocked for blocked in self.core.blocked if blocked.stack is self.stack]
+        return any(blocked.is_patient() for blocked in own)
+
+    # -- the trace -------------------------------------------------------------------------------
+
+    def settle(self) -> bool:
+        """Return whether the owner is known."""
+        return True
+
+    def entity(self) -> Entity:
+        """Return the thread as the trace describes it."""
+        node = self.node.entity_id if self.node is not None else 0
+        now_ns = self.core.loop.now_ns
+        return Entity(self.entity_id, node, EntityKind.THREAD, self.name, "", now_ns, {})
+
+
+# -- what stands in for Python's own functions -------------------------------------------------
+
+
+def _start(self: Any) -> None:
+    core = simulated_core()
+    if core is None or not getattr(self, "_initialized", False):
+        _real["start"](self)
+        return
+    if self._started.is_set() or "_rsltrace" in self.__dict__:
+        raise RuntimeError("threads can only be started once")
+
+    def body() -> None:
+        try:
+            self.run()
+        except (RunEnded, SystemExit):
+            raise
+        except BaseException:
+            if threading.excepthook is not _default_hook:
+                _tell_hook(self)
+                return
+            raise
+        finally:
+            _mark_stopped(self)
+
+    thread = SimThread(core, body, self.name, daemon=self.daemon, thread=self)
+    self._rsltrace = thread
+    self._ident = self._native_id = thread.ident
+    threading._active[thread.ident] = self  # type: ignore[attr-defined]
+    self._started.set()
+
+
+_default_hook = threading.excepthook
+
+
+def _tell_hook(thread: Any) -> None:
+    threading.excepthook(threading.ExceptHookArgs((*sys.exc_info(), thread)))
+
+
+def _mark_stopped(thread: Any) -> None:
+    """Let the real ``Thread`` know, for whoever asks after the run."""
+    threading._active.pop(thread._ident, None)  # type: ignore[attr-defined]
+    if hasattr(thread, "_is_stopped"):
+        thread._is_stopped = True
+    make_handle = getattr(threading, "_make_thread_handle", None)  # from Python 3.13 on
+    if make_handle is not None:
+        thread._handle = make_handle(thread._ident)  # its own was never started
+        thread._handle._set_done()
+
+
+def _join(self: Any, timeout: float | None = None) -> None:
+    thread: SimThread | None = self.__dict__.get("_rsltrace")
+    if thread is None or simulated_core() is not thread.core:
+        if thread is None:
+            _real["join"](self, timeout)
+        return
+    if thread.stack is getcurrent():
+        raise RuntimeError("cannot join current thread")
+    thread.join(timeout)
+
+
+def _is_alive(self: Any) -> bool:
+    thread: SimThread | None = self.__dict__.get("_rsltrace")
+    return bool(_real["is_alive"](self)) if thread is None else not thread.ended
+
+
+def _get_ident() -> int:
+    core = simulated_core()
+    if core is not None and core.thread_stacks:
+        thread = core.thread_stacks.get(getcurrent())
+        if thread is not None:
+            return thread.ident
+    return _real_get_ident()
+
+
+def _start_new_thread(
+    function: Callable[..., object], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
+) -> int:
+    core = simulated_core()
+    if core is None:
+        return _real_start_new_thread(function, args, kwargs or {})
+    name = getattr(function, "__qualname__", "function")
+    thread = SimThread(core, lambda: function(*args, **(kwargs or {})), name, daemon=True)
+    return thread.ident
+
+
+@contextmanager
+def cooperative_threads(core: Core) -> Iterator[None]:
+    """Make the threads that user code starts cooperative ones within the ``with`` block."""
+
+    def now() -> float:
+        return core.loop.now_ns / _NS_PER_S
+
+    replaced: list[tuple[Any, str, Any]] = [
+        (_Thread, "start", _start),
+        (_Thread, "join", _join),
+        (_Thread, "is_alive", _is_alive),
+        (threading, "Lock", SimLock),
+        (threading, "_allocate_lock", SimLock),
+        (threading, "_CRLock", SimRLock),
+        (threading, "get_ident", _get_ident),
+        (threading, "local", _threading_local.local),
+        (threading, "_time", now),
+        (threading, "_counter", itertools.count(1).__next__),
+        (_thread, "start_new_thread", _start_new_thread),
+        (_thread, "start_new", _start_new_thread),
+        (queue, "SimpleQueue", queue._PySimpleQueue),  # type: ignore[attr-defined]
+        (queue, "time", now),
+        (futures_base, "time", SimpleNamespace(monotonic=now)),
+        (concurrent.futures.ThreadPoolExecutor, "_counter", itertools.count().__next__),
+        (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
+    ]
+    with ExitStack() as stack:
+        rebound = {id(getattr(place, name)): value for place, name, value in replaced[3:]}
+        for place, name, value in replaced:
+            stack.callback(setattr, place, name, getattr(place, name))
+            setattr(place, name, value)
+        _rebind(stack, rebound)
+        _number(stack, _Thread)
+        _number(stack, futures_base.Future)
+        futures_base.LOGGER.addFilter(_is_news)
+        stack.callback(futures_base.LOGGER.removeFilter, _is_news)
+        try:
+            yield
+        finally:
+            for thread in core.threads:
+                if thread.thread is not None:
+                    _mark_stopped(thread.thread)
+
+
+def _count() -> int:
+    return _WORKERS
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Say whether a log record of a thread pool is more than the end of a run in its workers."""
+    return not (record.exc_info and record.exc_info[0] is RunEnded)
+
+
+def _number(stack: ExitStack, cls: Any) -> None:
+    """Hash the objects of a class by the order of creation: the library keeps them in sets."""
+    numbers = itertools.count(1)
+    real_init = cls.__init__
+
+    def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
+        if simulated_core() is not None:
+            self._rsltrace_number = next(numbers)
+        real_init(self, *args, **kwargs)
+
+    def __hash__(self: Any) -> int:  # noqa: N807
+        return self.__dict__.get("_rsltrace_number") or object.__hash__(self)
+
+    cls.__init__, cls.__hash__ = __init__, __hash__
+    stack.callback(setattr, cls, "__init__", real_init)
+    stack.callback(delattr, cls, "__hash__")
+
+
+def _rebind(stack: ExitStack, values: dict[int, Any]) -> None:
+    """Exchange what users' modules have bound before the run: ``from threading import Lock``."""
+    for module in list(sys.modules.values()):
+        file = getattr(module, "__file__", None)
+        if not file or not is_user_file(file):
+            continue
+        for name, value in list(vars(module).items()):
+            if callable(value) and id(value) in values:
+                stack.callback(setattr, module, name, value)
+                setattr(module, name, values[id(value)])
+
+
+__all__ = ["SimThread", "cooperative_threads"]

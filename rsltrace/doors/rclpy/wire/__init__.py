@@ -1,0 +1,1 @@
+"""Message classes to canonical CDR and back, and what their interfaces are made of."""

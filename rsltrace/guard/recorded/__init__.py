@@ -1,0 +1,1 @@
+"""What comes from outside: recorded in a run, and given again in a re-run."""

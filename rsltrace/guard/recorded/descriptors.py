@@ -1,0 +1,370 @@
+"""File descriptors whose answers are recorded: ``os.open``, ``os.read``, terminals, devices.
+
+In a re-run such a descriptor leads nowhere: what is read from it comes from the trace, what is
+written to it is dropped.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import os
+import stat
+import sys
+import termios
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.callers import user_frame
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.recorded.numbering import Descriptor, number_of
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.virtual.waiting import awaited, is_patient, patiently, when_readable
+from rsltrace.model.finding import Mode, Source
+
+_MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)
+_PLAIN = (
+    *("write", "writev", "pread", "fsync", "fdatasync", "ftruncate", "lseek", "isatty"),
+    *("ttyname", "tcgetpgrp", "tcsetpgrp"),
+)
+_TERMINAL = (
+    *("tcgetattr", "tcsetattr", "tcsendbreak", "tcdrain", "tcflush", "tcflow"),
+    *("tcgetwinsize", "tcsetwinsize"),
+)
+_real_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
+_get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
+
+
+def recording(source: Source, frame: FrameType) -> Guard | None:
+    """Return the guard if user code asks and the job records this source."""
+    guard = engaged()
+    if guard is None or user_frame(frame, guard.packages) is None:
+        return None
+    return guard if guard.mode(source, frame) is Mode.RECORD else None
+
+
+def tracked(fd: object) -> tuple[Guard, Descriptor] | None:
+    """Return the guard and what it knows of a descriptor, if its answers are recorded."""
+    guard = engaged()
+    if guard is None:
+        return None
+    found = guard.descriptors.find(fd)
+    return None if found is None or found.is_folder else (guard, found)
+
+
+def stand_in(flags: int = 0) -> int:
+    """Return a descriptor for a re-run that leads nowhere, and that event loops accept."""
+    nonblocking = os.EFD_NONBLOCK if flags & os.O_NONBLOCK else 0
+    return os.eventfd(0, os.EFD_CLOEXEC | nonblocking)
+
+
+def _opening(real: Callable[..., int]) -> Any:
+    def open_(path: Any, flags: int, *more: Any, **options: Any) -> int:
+        frame = sys._getframe(1)
+        wanted = not flags & _MAKES_FILES and flags & os.O_ACCMODE != os.O_WRONLY
+        guard = recording(Source.FILE, frame) if wanted else None
+        if guard is None:
+            return real(path, flags, *more, **options)
+        opened: list[int] = []
+
+        def is_folder() -> bool:
+            opened.append(real(path, flags, *more, **options))
+            return stat.S_ISDIR(os.fstat(opened[0]).st_mode)
+
+        call = f"os.open({os.fsdecode(path)!r})"
+        folder = bool(guard.recorded(Source.FILE, call, is_folder, frame))
+        if not opened:  # a folder is the run's own, or its listing is not recorded anyway
+            opened.append(real(path, flags, *more, **options) if folder else stand_in(flags))
+        guard.descriptors.drop(opened[0])
+        guard.descriptors.add(opened[0], Source.FILE, is_folder=folder)
+        return opened[0]
+
+    return open_
+
+
+def _on(module: str, name: str, real: Callable[..., Any]) -> Any:
+    """Return the stand-in for a function of a descriptor and plain values."""
+    call = f"{module}.{name}()"
+
+    def function(fd: Any, *arguments: Any, **options: Any) -> Any:
+        found = tracked(fd)
+        if found is None:
+            return real(fd, *arguments, **options)
+        guard, known = found
+        return guard.recorded(
+            known.source,
+            call,
+            lambda: real(fd, *arguments, **options),
+            sys._getframe(1),
+            known.number,
+        )
+
+    return function
+
+
+def _looking(real: Callable[..., Any]) -> Any:
+    def fstat(fd: int) -> Any:
+        guard = engaged()
+        known = guard.descriptors.find(fd) if guard is not None else None
+        if guard is None or known is None:
+            return real(fd)
+        return recorded_stat(
+            guard, known.source, "os.fstat()", lambda: real(fd), sys._getframe(1), known.number
+        )
+
+    return fstat
+
+
+def recorded_stat(
+    guard: Guard,
+    source: Source,
+    call: str,
+    real: Callable[[], Any],
+    frame: FrameType,
+    of: int = 0,
+) -> os.stat_result:
+    """Return what ``os.stat`` and its like tell, from outside or from the trace."""
+
+    def fields() -> list[Any]:
+        found = real()
+        return [list(found), found.st_atime_ns, found.st_mtime_ns, found.st_ctime_ns]
+
+    values, *times = guard.recorded(source, call, fields, frame, of)
+    names = ("st_atime_ns", "st_mtime_ns", "st_ctime_ns")
+    return os.stat_result(tuple(values), dict(zip(names, times, strict=True)))
+
+
+def _reading(real: Callable[..., bytes]) -> Any:
+    def read(fd: int, size: int, /) -> Any:
+        found = tracked(fd)
+        if found is None:
+            patient = is_patient(sys._getframe(1))
+            if patient is not None and _blocks(fd):
+                return patiently(patient, when_readable(fd, lambda: real(fd, size)))
+            return real(fd, size)
+        return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
+
+    return read
+
+
+def _blocks(fd: int) -> bool:
+    """Return whether reading from a descriptor may have to wait for somebody."""
+    try:
+        kind = _real_fstat(fd).st_mode
+        return (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)) and _get_blocking(fd)
+    except OSError:
+        return False
+
+
+def _reading_into(real: Callable[..., int]) -> Any:
+    def readv(fd: int, buffers: Any, /) -> Any:
+        found = tracked(fd)
+        if found is None:
+            return real(fd, buffers)
+
+        def read() -> bytes:
+            return b"".join(map(bytes, buffers))[: real(fd, buffers)]
+
+        data = _read(*found, "os.readv()", fd, read, sys._getframe(1))
+        rest = data
+        for buffer in buffers:
+            view = memoryview(buffer).cast("B")
+            view[: len(rest[: len(view)])] = rest[: len(view)]
+            rest = rest[len(view) :]
+        return len(data)
+
+    return readv
+
+
+def _read(
+    guard: Guard,
+    known: Descriptor,
+    call: str,
+    fd: int,
+    real: Callable[[], bytes],
+    frame: FrameType,
+) -> Any:
+    if _get_blocking(fd) and guard.context.is_aside():
+        look = when_readable(fd, real)
+        return awaited(guard, known.source, call, look, frame, of=known.number)
+    return guard.recorded(known.source, call, real, frame, known.number)
+
+
+def _controlling(real: Callable[..., Any]) -> Any:
+    def ioctl(fd: Any, request: int, arg: Any = 0, mutate_flag: bool = True, /) -> Any:
+        found = tracked(fd)
+        if found is None:
+            return real(fd, request, arg, mutate_flag)
+        guard, known = found
+        fills = not isinstance(arg, (int, str, bytes)) and mutate_flag
+
+        def control() -> list[Any]:
+            value = real(fd, request, arg, mutate_flag)
+            return [value, bytes(arg) if fills else None]
+
+        frame = sys._getframe(1)
+        value, after = guard.recorded(
+            known.source, f"fcntl.ioctl({request:#x})", control, frame, known.number
+        )
+        if fills and after is not None:
+            memoryview(arg).cast("B")[:] = after
+        return value
+
+    return ioctl
+
+
+def _closing(real: Callable[[int], None]) -> Any:
+    def close(fd: int) -> None:
+        guard = engaged()
+        if guard is not None:
+            guard.descriptors.drop(fd)
+        real(fd)
+
+    return close
+
+
+def _duplicating(real: Callable[..., int]) -> Any:
+    def dup(fd: int, /) -> int:
+        found = tracked(fd)
+        copy = real(fd)
+        if found is not None:
+            found[0].descriptors.drop(copy)
+            found[0].descriptors.add(copy, found[1].source)
+        return copy
+
+    return dup
+
+
+def joining(real: Callable[..., Any]) -> Any:
+    """Return the stand-in for a function that makes two ends of something."""
+
+    def ends(*arguments: Any, **options: Any) -> Any:
+        made = real(*arguments, **options)
+        guard = engaged()
+        if guard is not None:
+            guard.descriptors.join(*map(number_of, made))
+        return made
+
+    return ends
+
+
+class RawDescriptor(io.RawIOBase):
+    """What ``open`` makes of a descriptor (or a device) whose answers are recorded."""
+
+    def __init__(self, fd: int, mode: str, *, name: object, closes: bool = True) -> None:
+        self._fd = fd
+        self._reads = "r" in mode or "+" in mode
+        self._writes = bool(set(mode) & set("wax+"))
+        self._closes = closes
+        self.name = name
+        self.mode = ("rb+" if self._writes else "rb") if self._reads else "wb"
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        if self.closed:
+            raise ValueError("I/O operation on closed file")
+        return self._fd
+
+    def readable(self) -> bool:
+        """Return whether it was opened for reading."""
+        return self._reads
+
+    def writable(self) -> bool:
+        """Return whether it was opened for writing."""
+        return self._writes
+
+    def seekable(self) -> bool:
+        """Return whether it has positions."""
+        try:
+            os.lseek(self.fileno(), 0, os.SEEK_CUR)
+        except OSError:
+            return False
+        return True
+
+    def seek(self, offset: int, whence: int = 0, /) -> int:
+        """Go to a position."""
+        return os.lseek(self.fileno(), offset, whence)
+
+    def isatty(self) -> bool:
+        """Return whether it is a terminal."""
+        return os.isatty(self.fileno())
+
+    def readinto(self, buffer: Any, /) -> int | None:
+        """Read what there is, at most as much as fits."""
+        view = memoryview(buffer).cast("B")
+        try:
+            data = os.read(self.fileno(), len(view))
+        except BlockingIOError:
+            return None
+        view[: len(data)] = data
+        return len(data)
+
+    def write(self, data: Any, /) -> int | None:
+        """Write as much as goes at once."""
+        try:
+            return os.write(self.fileno(), data)
+        except BlockingIOError:
+            return None
+
+    def close(self) -> None:
+        """Close the descriptor, unless it is somebody else's."""
+        if not self.closed:
+            try:
+                super().close()
+            finally:
+                if self._closes:
+                    os.close(self._fd)
+
+
+def opened(
+    raw: RawDescriptor,
+    mode: str,
+    buffering: int = -1,
+    encoding: str | None = None,
+    errors: str | None = None,
+    newline: str | None = None,
+) -> Any:
+    """Return the file object that ``open`` returns in a mode."""
+    if buffering == 0:
+        if "b" not in mode:
+            raise ValueError("can't have unbuffered text I/O")
+        return raw
+    size = buffering if buffering > 1 else io.DEFAULT_BUFFER_SIZE
+    if raw.readable() and raw.writable():
+        buffered: Any = io.BufferedRandom(raw, size)
+    else:
+        buffered = (io.BufferedReader if raw.readable() else io.BufferedWriter)(raw, size)
+    if "b" in mode:
+        return buffered
+    text = io.TextIOWrapper(buffered, encoding, errors, newline, line_buffering=buffering == 1)
+    text.mode = mode  # type: ignore[misc]
+    return text
+
+
+@contextmanager
+def recorded_descriptors() -> Iterator[None]:
+    """Let descriptors answer from the trace in a re-run."""
+    makers: list[tuple[Any, str, Callable[[Any], Any]]] = [
+        (os, "open", _opening),
+        (os, "read", _reading),
+        (os, "readv", _reading_into),
+        (os, "fstat", _looking),
+        (os, "close", _closing),
+        (os, "dup", _duplicating),
+        (os, "pipe", joining),
+        (os, "pipe2", joining),
+        (os, "openpty", joining),
+        (fcntl, "ioctl", _controlling),
+        *((os, name, partial(_on, "os", name)) for name in _PLAIN),
+        *((termios, name, partial(_on, "termios", name)) for name in _TERMINAL),
+        *((fcntl, name, partial(_on, "fcntl", name)) for name in ("flock", "lockf")),
+    ]
+    with ExitStack() as stack:
+        for module, name, make in makers:
+            function = getattr(module, name, None)  # some are of later versions of Python
+            if function is not None:
+                stack.callback(Redirected(function, make(copy_of(function))).restore)
+        yield

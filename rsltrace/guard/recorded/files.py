@@ -1,0 +1,133 @@
+"""Files whose content and times are recorded (mode ``record``), and given again."""
+
+from __future__ import annotations
+
+import io
+import os
+import stat
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from typing import Any
+
+from rsltrace.guard.guard import Guard
+from rsltrace.guard.recorded.descriptors import (
+    RawDescriptor,
+    opened,
+    recorded_stat,
+    recording,
+    stand_in,
+    tracked,
+)
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.model.finding import Source
+
+BYTES_MAX = 64 << 20
+
+
+class _Content(io.BytesIO):
+    """What a file held when it was opened."""
+
+    def __init__(self, content: bytes, name: str) -> None:
+        super().__init__(content)
+        self.name = name
+
+    def writable(self) -> bool:
+        """Return False, as a file opened for reading does."""
+        return False
+
+
+def _opening(real: Callable[..., Any]) -> Any:
+    def open_(
+        file: Any,
+        mode: str = "r",
+        buffering: int = -1,
+        encoding: str | None = None,
+        errors: str | None = None,
+        newline: str | None = None,
+        closefd: bool = True,
+        opener: Any = None,
+    ) -> Any:
+        frame = sys._getframe(1)
+        text = (buffering, encoding, errors, newline)
+        if isinstance(file, int):
+            if frame.f_globals.get("__name__") == "subprocess":  # a pipe to a program to be started
+                by_program = recording(Source.PROCESS, frame)
+                if by_program is not None:
+                    by_program.descriptors.add(file, Source.PROCESS)
+            if tracked(file) is not None:
+                raw = RawDescriptor(file, mode, name=file, closes=closefd)
+                return opened(raw, mode, *text)
+        elif opener is None and isinstance(mode, str) and not set(mode) & set("wax"):
+            guard = recording(Source.FILE, frame)
+            if guard is not None and ("+" not in mode or _is_device(file)):
+                return _recorded(guard, file, mode, text, real)
+        return real(file, mode, *text, closefd, opener)
+
+    return open_
+
+
+def _is_device(file: Any) -> bool:
+    try:
+        kind = _real_stat(file).st_mode
+    except OSError:
+        return True  # in a re-run it may be gone; a plain file cannot be opened in any case
+    return not (stat.S_ISREG(kind) or stat.S_ISDIR(kind))
+
+
+def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[..., Any]) -> Any:
+    """Return a file object of what is recorded: of a device piece by piece, of a file all of it."""
+    name = os.fsdecode(file)
+    fd: list[int] = []
+
+    def content() -> Any:
+        if _is_device(file) and os.path.exists(file):
+            flags = os.O_RDWR if "+" in mode else os.O_RDONLY
+            fd.append(os.open(file, flags | os.O_CLOEXEC))
+            return None
+        with real(file, "rb") as plain:
+            data: bytes = plain.read(BYTES_MAX + 1)
+        if len(data) > BYTES_MAX:
+            raise OSError(27, f"{name} is too large to be recorded")
+        return data
+
+    data = guard.recorded(Source.FILE, f"open({name!r})", content, sys._getframe(2))
+    if data is not None:
+        held = _Content(data, name)
+        _, encoding, errors, newline = text
+        return held if "b" in mode else io.TextIOWrapper(held, encoding, errors, newline)
+    number = fd[0] if fd else stand_in()
+    guard.descriptors.drop(number)
+    guard.descriptors.add(number, Source.FILE)
+    return opened(RawDescriptor(number, mode, name=file), mode, *text)
+
+
+_real_stat = copy_of(os.stat)  # type: ignore[arg-type]
+
+
+def _looking(name: str, real: Callable[..., Any]) -> Any:
+    def stat(path: Any, *more: Any, **options: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = None if isinstance(path, int) else recording(Source.FILE, frame)
+        if guard is None:
+            return real(path, *more, **options)
+        call = f"{name}({os.fsdecode(path)!r})"
+        return recorded_stat(guard, Source.FILE, call, lambda: real(path, *more, **options), frame)
+
+    return stat
+
+
+@contextmanager
+def recorded_files() -> Iterator[None]:
+    """Let files that are read, and their times, answer from the trace in a re-run."""
+    with ExitStack() as stack:
+
+        def redirect(function: Any, make: Callable[[Any], Any]) -> None:
+            stack.callback(Redirected(function, make(copy_of(function))).restore)
+
+        redirect(io.open, _opening)
+        for name in ("stat", "lstat"):
+            # Outermost: what is recorded here is no finding of the watch below.
+            redirect(getattr(os, name), partial(_looking, f"os.{name}"))
+        yield

@@ -1,0 +1,241 @@
+"""Waiting for several descriptors: ``select``, ``poll``, ``epoll``, and so ``selectors``, asyncio.
+
+What was ready is kept by its place among what was waited for: the descriptors of a re-run have
+other numbers. Where all of them are the run's own, nothing is recorded.
+"""
+
+from __future__ import annotations
+
+import select
+import selectors
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.recorded.descriptors import recording
+from rsltrace.guard.recorded.numbering import number_of
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.virtual.waiting import NOT_YET, awaited, is_patient, patiently
+from rsltrace.model.finding import Source
+
+_RECORDED = (Source.SOCKET, Source.PROCESS, Source.FILE)
+_NS_PER_S = 1_000_000_000
+_ALL_EVENTS = select.POLLIN | select.POLLPRI | select.POLLOUT
+_real_epoll = select.epoll
+
+
+def _recording(frame: FrameType) -> tuple[Guard, Source] | None:
+    for source in _RECORDED:
+        guard = recording(source, frame)
+        if guard is not None:
+            return guard, source
+    return None
+
+
+def _answer(
+    guard: Guard,
+    source: Source,
+    call: str,
+    real: Callable[[float | None], list[Any]],
+    frame: FrameType,
+    timeout_s: float | None,
+    of: int,
+    step: Callable[[int], object] | None = None,
+) -> list[Any]:
+    """Return what is ready; whoever can be set aside is, while nothing is."""
+    if timeout_s == 0 or (step is None and not guard.context.is_aside()):
+        return list(guard.recorded(source, call, lambda: real(timeout_s), frame, of) or ())
+    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
+
+    def look(seconds: float) -> Any:
+        return real(seconds) or NOT_YET
+
+    return awaited(guard, source, call, look, frame, of=of, for_ns=for_ns, step=step) or []
+
+
+class RecordedPoll:
+    """A ``select.poll`` or ``select.epoll`` object whose answers are recorded."""
+
+    def __init__(self, real: Any, source: Source | None, *, seconds: bool, mask: int) -> None:
+        self._real = real
+        self._source = source
+        self._seconds = seconds
+        self._mask = mask
+        self._registered: dict[int, int] = {}
+        self.step: Callable[[int], object] | None = None
+        """Lets time pass where an asyncio loop waits; True ends the wait."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._real, name)
+
+    def __enter__(self) -> RecordedPoll:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._real.close()
+
+    def register(self, fd: Any, eventmask: int | None = None) -> None:
+        """Wait for a descriptor, too."""
+        mask = self._mask if eventmask is None else eventmask
+        self._real.register(fd, mask)
+        self._registered[number_of(fd)] = mask
+
+    def modify(self, fd: Any, eventmask: int) -> None:
+        """Wait for other events of a descriptor."""
+        self._real.modify(fd, eventmask)
+        self._registered[number_of(fd)] = eventmask
+
+    def unregister(self, fd: Any) -> None:
+        """Wait for a descriptor no longer."""
+        self._registered.pop(number_of(fd), None)
+        self._real.unregister(fd)
+
+    def has_outside(self) -> bool:
+        """Return whether it waits for somebody who is not part of the run."""
+        guard = engaged()
+        if guard is None or self._source is None:
+            return False
+        return any(map(guard.descriptors.is_outside, self._registered))
+
+    def leads_out(self) -> bool:
+        """Return whether somebody else may make one of the descriptors ready, recorded or not."""
+        guard = engaged()
+        return guard is not None and any(map(guard.descriptors.leads_out, self._registered))
+
+    def poll(self, timeout: float | None = None, maxevents: int = -1) -> list[tuple[int, int]]:
+        """Return what is ready, in what was registered."""
+        limits = (maxevents,) if self._seconds else ()
+        guard = engaged()
+        frame = sys._getframe(1)
+        unit = 1 if self._seconds else 1000
+        timeout_s = None if timeout is None or timeout < 0 else timeout / unit
+        if guard is None or self._source is None or not self.has_outside():
+            patient = guard if self.step else is_patient(_past_selectors(frame))
+            if timeout_s == 0:
+                patient = None
+            if patient is None:
+                return self._real.poll(timeout, *limits)  # type: ignore[no-any-return]
+            return (
+                patiently(
+                    patient,
+                    lambda seconds: self._real.poll(seconds * unit, *limits) or NOT_YET,
+                    None if timeout_s is None else int(timeout_s * _NS_PER_S),
+                    self.step,
+                )
+                or []
+            )
+        places = list(self._registered)
+
+        def real(seconds: float | None) -> list[Any]:
+            ready = self._real.poll(None if seconds is None else seconds * unit, *limits)
+            return [[places.index(fd), events] for fd, events in ready if fd in places]
+
+        found = _answer(
+            guard,
+            self._source,
+            "select.poll()",
+            real,
+            frame,
+            timeout_s,
+            guard.descriptors.number(self),
+            self.step,
+        )
+        return [(places[place], events) for place, events in found if place < len(places)]
+
+
+def _past_selectors(frame: FrameType) -> FrameType:
+    """Return the frame of whoever uses a selector."""
+    while frame.f_back is not None and frame.f_globals.get("__name__") == "selectors":
+        frame = frame.f_back
+    return frame
+
+
+def _polling(real: Callable[[], Any]) -> Any:
+    def poll() -> Any:
+        if engaged() is None:
+            return real()
+        found = _recording(sys._getframe(1))
+        source = None if found is None else found[1]
+        return RecordedPoll(real(), source, seconds=False, mask=_ALL_EVENTS)
+
+    return poll
+
+
+def _epolling(sizehint: int = -1, flags: int = 0) -> Any:
+    if engaged() is None:
+        return _real_epoll(sizehint, flags)
+    found = _recording(sys._getframe(1))
+    source = None if found is None else found[1]
+    mask = select.EPOLLIN | select.EPOLLPRI | select.EPOLLOUT
+    return RecordedPoll(_real_epoll(sizehint, flags), source, seconds=True, mask=mask)
+
+
+def _selecting(real: Callable[..., Any]) -> Any:
+    def ready(reads: Any, writes: Any, others: Any, timeout: float | None = None, /) -> Any:
+        guard = engaged()
+        if guard is None:
+            return real(reads, writes, others, timeout)
+        kinds = [list(reads), list(writes), list(others)]
+        if timeout is not None and timeout > 0 and not any(kinds):
+            time.sleep(timeout)  # it is used like that
+            return [], [], []
+        frame = sys._getframe(1)
+        found = _recording(frame)
+        things = [thing for kind in kinds for thing in kind]
+        if found is None or not any(map(guard.descriptors.is_outside, things)):
+            patient = None if timeout == 0 else is_patient(frame)
+            if patient is None:
+                return real(*kinds, timeout)
+
+            def look(seconds: float) -> Any:
+                ready = real(*kinds, seconds)
+                return ready if any(ready) else NOT_YET
+
+            for_ns = None if timeout is None else int(timeout * _NS_PER_S)
+            return patiently(patient, look, for_ns) or ([], [], [])
+
+        def places(seconds: float | None) -> list[Any]:
+            chosen = real(*kinds, seconds)
+            one_by_one = [
+                [place for place, thing in enumerate(kind) if any(thing is c for c in some)]
+                for kind, some in zip(kinds, chosen, strict=True)
+            ]
+            return one_by_one if any(one_by_one) else []
+
+        of = _number(guard, things)
+        answer = _answer(guard, found[1], "select.select()", places, frame, timeout, of)
+        return tuple(
+            [kind[place] for place in some if place < len(kind)]
+            for kind, some in zip(kinds, answer or ([], [], []), strict=True)
+        )
+
+    return ready
+
+
+def _number(guard: Guard, things: list[Any]) -> int:
+    """Return the number of the first descriptor outside: two threads rarely wait for the same."""
+    for thing in things:
+        known = guard.descriptors.find(thing)
+        if known is not None:
+            return known.number
+        if guard.descriptors.is_outside(thing):
+            return 0 if isinstance(thing, int) else guard.descriptors.number(thing)
+    return 0
+
+
+@contextmanager
+def recorded_polls() -> Iterator[None]:
+    """Let waiting for descriptors be answered from the trace in a re-run."""
+    with ExitStack() as stack:
+        for function, make in ((select.poll, _polling), (select.select, _selecting)):
+            real: Any = function
+            stack.callback(Redirected(real, make(copy_of(real))).restore)
+        for place, name in ((select, "epoll"), (selectors.EpollSelector, "_selector_cls")):
+            stack.callback(setattr, place, name, getattr(place, name))
+            value = _epolling if place is select else staticmethod(_epolling)
+            setattr(place, name, value)
+        yield

@@ -1,0 +1,168 @@
+"""Processes that are recorded: their number, their output, how they end. A re-run starts none.
+
+``subprocess`` is Python but for a few functions below it. With those recorded, all of it (and
+``os.popen``, and asyncio's subprocesses) works in a re-run without the program being there.
+"""
+
+from __future__ import annotations
+
+import _multiprocessing  # type: ignore[import-not-found]
+import _posixsubprocess
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.guard import engaged
+from rsltrace.guard.recorded.descriptors import recording, stand_in
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.virtual.waiting import NOT_YET, again_and_again, awaited, is_patient, patiently
+from rsltrace.model.finding import Source
+
+_KEPT_OPEN = 3
+_CHILDS_ENDS = (6, 9, 11, 13)
+"""Arguments of ``fork_exec``: which descriptors stay open in the child; its standard streams, and
+the pipe through which it tells that it cannot start the program."""
+
+
+def _starting(real: Callable[..., int]) -> Any:
+    def fork_exec(*arguments: Any) -> int:
+        frame = sys._getframe(1)
+        # multiprocessing shares memory and locks with its processes: that cannot be recorded
+        by_subprocess = frame.f_globals.get("__name__") == "subprocess"
+        guard = recording(Source.PROCESS, frame) if by_subprocess else None
+        if guard is None:
+            return real(*arguments)
+        words = [os.fsdecode(word) for word in arguments[0]]
+        call = f"subprocess.Popen({' '.join(words)[:100]!r})"
+        descriptors = guard.descriptors
+        for fd in (*(arguments[place] for place in _CHILDS_ENDS), *arguments[_KEPT_OPEN]):
+            far = descriptors.far_end(fd)
+            if far is not None:
+                descriptors.add(far, Source.PROCESS)
+        process: int = guard.recorded(Source.PROCESS, call, lambda: real(*arguments), frame)
+        descriptors.processes.add(process)
+        return process
+
+    return fork_exec
+
+
+def _waiting(real: Callable[[int, int], Any]) -> Any:
+    def waitpid(process: int, options: int, /) -> Any:
+        guard = engaged()
+        frame, call = sys._getframe(1), "os.waitpid()"
+
+        def ended() -> Any:
+            found = real(process, options | os.WNOHANG)
+            return found if found[0] else NOT_YET
+
+        if guard is None or process not in guard.descriptors.processes:
+            patient = None if options & os.WNOHANG else is_patient(frame)
+            if patient is not None:
+                return patiently(patient, again_and_again(ended))
+            return real(process, options)
+        if options & os.WNOHANG or not guard.context.is_aside():
+            return guard.recorded(
+                Source.PROCESS, call, lambda: real(process, options), frame, process
+            )
+        return awaited(guard, Source.PROCESS, call, again_and_again(ended), frame, of=process)
+
+    return waitpid
+
+
+def _of_process(name: str, real: Callable[..., Any]) -> Any:
+    """Return the stand-in for a function of a process that was started."""
+
+    def function(process: int, *arguments: Any) -> Any:
+        guard = engaged()
+        if guard is None or process not in guard.descriptors.processes:
+            return real(process, *arguments)
+        frame = sys._getframe(1)
+        opened: list[int] = []
+
+        def call() -> Any:
+            value = real(process, *arguments)
+            if name == "pidfd_open":
+                opened.append(value)
+                return None
+            return value
+
+        value = guard.recorded(Source.PROCESS, f"os.{name}()", call, frame, process)
+        if name != "pidfd_open":
+            return value
+        fd = opened[0] if opened else stand_in()
+        guard.descriptors.drop(fd)
+        guard.descriptors.add(fd, Source.PROCESS)
+        return fd
+
+    return function
+
+
+def _running(real: Callable[..., int]) -> Any:
+    def system(command: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = recording(Source.PROCESS, frame)
+        if guard is None:
+            return real(command)
+        call = f"os.system({os.fsdecode(command)[:100]!r})"
+        return guard.recorded(Source.PROCESS, call, lambda: real(command), frame)
+
+    return system
+
+
+def sleep_for_process(seconds: float, real: Callable[[float], None], frame: FrameType) -> None:
+    """Let ``subprocess`` sleep until it looks again whether a process has ended: for real."""
+    guard = recording(Source.PROCESS, frame)
+    if guard is None:
+        real(seconds)
+    elif guard.context.is_aside():
+        call = "time.sleep() of subprocess"
+        # What is left of a timeout may be less than its clock can show: time must go on.
+        for_ns = max(int(seconds * 1e9), 1000)
+        awaited(guard, Source.PROCESS, call, _never, frame, of=0, for_ns=for_ns)
+    elif not guard.outside.replays:
+        real(seconds)
+
+
+def _never(seconds: float) -> Any:
+    return again_and_again(lambda: NOT_YET)(seconds)
+
+
+def _acquiring(real: Callable[..., bool]) -> Any:
+    def acquire(self: Any, block: bool = True, timeout: float | None = None) -> bool:
+        """Take a lock of multiprocessing, which a process may give back after others went on."""
+        guard = engaged()
+        if guard is None or not block or not guard.context.can_step():
+            return real(self, block, timeout)
+        look = again_and_again(lambda: real(self, False) or NOT_YET)
+        for_ns = None if timeout is None else int(timeout * 1e9)
+        return patiently(guard, look, for_ns) is True
+
+    return acquire
+
+
+@contextmanager
+def recorded_processes() -> Iterator[None]:
+    """Let processes answer from the trace in a re-run."""
+    with ExitStack() as stack:
+
+        def redirect(function: Any, make: Callable[[Any], Any]) -> None:
+            stack.callback(Redirected(function, make(copy_of(function))).restore)
+
+        redirect(_posixsubprocess.fork_exec, _starting)
+        redirect(os.system, _running)
+        redirect(os.waitpid, _waiting)
+        for name in ("kill", "pidfd_open"):
+            redirect(getattr(os, name), partial(_of_process, name))
+        acquire: Any = _multiprocessing.SemLock.acquire
+        exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
+        exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
+        module: Any = subprocess
+        stack.callback(setattr, module, "_USE_POSIX_SPAWN", module._USE_POSIX_SPAWN)
+        module._USE_POSIX_SPAWN = False  # a second way to do the same, that is not recorded
+        yield

@@ -1,0 +1,265 @@
+"""Sockets whose answers are recorded, TLS and all, and given again without anybody there.
+
+Of TLS the plain text is recorded: the keys of a connection are drawn in C, so what goes over the
+wire differs each time.
+"""
+
+from __future__ import annotations
+
+import _socket
+import socket
+import ssl
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.guard import Guard
+from rsltrace.guard.recorded.descriptors import joining, recording
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.virtual.waiting import awaited, is_patient, patiently, when_readable
+from rsltrace.model.finding import Source
+
+_NS_PER_S = 1_000_000_000
+_RECEIVING = ("recv", "recvfrom", "recvmsg")
+_RECEIVING_INTO = ("recv_into", "recvfrom_into")
+_PLAIN = (
+    *("connect", "connect_ex", "send", "sendall", "sendto", "sendmsg", "bind", "getsockname"),
+    *("getpeername", "shutdown", "listen", "setsockopt", "getsockopt"),
+)
+_RESOLVING = (
+    *("getaddrinfo", "gethostbyname", "gethostbyname_ex", "gethostbyaddr", "getnameinfo"),
+    *("gethostname", "if_nameindex"),
+)
+_TLS = (
+    *("do_handshake", "write", "shutdown", "pending", "getpeercert", "cipher", "version"),
+    *("selected_alpn_protocol", "compression", "get_channel_binding", "shared_ciphers"),
+)
+_BUFFERED = ("read", "write")
+
+
+def _recorded_of(sock: Any, frame: FrameType) -> Guard | None:
+    """Return the guard if what a socket answers is recorded: it leads outside of the run."""
+    guard = recording(Source.SOCKET, frame)
+    if guard is None or guard.descriptors.far_end(sock.fileno()) is not None:
+        return None
+    return guard
+
+
+def _answer(
+    guard: Guard, sock: Any, call: str, real: Callable[[], Any], frame: FrameType, *, waits: bool
+) -> Any:
+    number = guard.descriptors.number(sock)
+    if not waits or not guard.context.is_aside() or sock.gettimeout() == 0:
+        return guard.recorded(Source.SOCKET, call, real, frame, number)
+    timeout_s = sock.gettimeout()
+    look = when_readable(sock.fileno(), lambda: [real()])
+    found = awaited(
+        guard,
+        Source.SOCKET,
+        call,
+        look,
+        frame,
+        of=number,
+        for_ns=None if timeout_s is None else int(timeout_s * _NS_PER_S),
+    )
+    if found is None:
+        raise TimeoutError("timed out")
+    return found[0]
+
+
+def _wait_for(sock: Any, frame: FrameType) -> None:
+    """Let others go on until there is something to read; what it is is not recorded."""
+    guard, timeout_s = is_patient(frame), sock.gettimeout()
+    if guard is None or timeout_s == 0 or sock.fileno() < 0:
+        return
+    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
+    if patiently(guard, when_readable(sock.fileno(), lambda: True), for_ns) is None:
+        raise TimeoutError("timed out")
+
+
+def _of_socket(name: str, real: Callable[..., Any], *, waits: bool = False) -> Any:
+    call = f"socket.{name}()"
+
+    def method(self: Any, *arguments: Any, **options: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = _recorded_of(self, frame)
+        if guard is None:
+            if waits:
+                _wait_for(self, frame)
+            return real(self, *arguments, **options)
+        return _answer(
+            guard, self, call, lambda: real(self, *arguments, **options), frame, waits=waits
+        )
+
+    return method
+
+
+def _into(name: str, real: Callable[..., Any]) -> Any:
+    call = f"socket.{name}()"
+
+    def method(self: Any, buffer: Any, nbytes: int = 0, flags: int = 0) -> Any:
+        frame = sys._getframe(1)
+        guard = _recorded_of(self, frame)
+        if guard is None:
+            _wait_for(self, frame)
+            return real(self, buffer, nbytes, flags)
+
+        def receive() -> list[Any]:
+            found = real(self, buffer, nbytes, flags)
+            count = found[0] if isinstance(found, tuple) else found
+            return [bytes(memoryview(buffer).cast("B")[:count]), found]
+
+        data, found = _answer(guard, self, call, receive, frame, waits=True)
+        memoryview(buffer).cast("B")[: len(data)] = data
+        return found
+
+    return method
+
+
+def _accepting(real: Callable[[Any], Any]) -> Any:
+    def accept(self: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = _recorded_of(self, frame)
+        if guard is None:
+            _wait_for(self, frame)
+            return real(self)
+        accepted: list[int] = []
+
+        def connection() -> Any:
+            fd, address = real(self)
+            accepted.append(fd)
+            return address
+
+        address = _answer(guard, self, "socket.accept()", connection, frame, waits=True)
+        if not accepted:
+            accepted.append(_socket.socket(self.family, self.type, self.proto).detach())
+        guard.descriptors.drop(accepted[0])
+        return accepted[0], address
+
+    return accept
+
+
+def _resolving(name: str, real: Callable[..., Any]) -> Any:
+    def resolve(*arguments: Any, **options: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = recording(Source.SOCKET, frame)
+        if guard is None:
+            return real(*arguments, **options)
+        return guard.recorded(
+            Source.SOCKET, f"socket.{name}()", lambda: real(*arguments, **options), frame
+        )
+
+    return resolve
+
+
+# -- TLS ------------------------------------------------------------------------------------------
+
+
+def _of_tls(kind: str, name: str, real: Callable[..., Any]) -> Any:
+    def method(self: Any, *arguments: Any) -> Any:
+        frame = sys._getframe(1)
+        guard = recording(Source.SOCKET, frame)
+        if guard is None:
+            return real(self, *arguments)
+        return guard.recorded(
+            Source.SOCKET, f"{kind}.{name}()", lambda: real(self, *arguments), frame
+        )
+
+    return method
+
+
+def _reading(real: Callable[..., Any]) -> Any:
+    def read(self: Any, size: int, buffer: Any = None, /) -> Any:
+        frame = sys._getframe(1)
+        guard = recording(Source.SOCKET, frame)
+        if guard is None:
+            return real(self, size) if buffer is None else real(self, size, buffer)
+
+        def receive() -> Any:
+            if buffer is None:
+                return real(self, size)
+            return bytes(memoryview(buffer).cast("B")[: real(self, size, buffer)])
+
+        owner, call = self.owner, "TLS.read()"
+        if isinstance(owner, socket.socket):
+            data = _answer_tls(guard, self, owner, call, receive, frame)
+        else:
+            data = guard.recorded(Source.SOCKET, call, receive, frame)
+        if buffer is None:
+            return data
+        memoryview(buffer).cast("B")[: len(data)] = data
+        return len(data)
+
+    return read
+
+
+def _answer_tls(
+    guard: Guard,
+    tls: Any,
+    sock: socket.socket,
+    call: str,
+    receive: Callable[[], Any],
+    frame: FrameType,
+) -> Any:
+    """Wait for a TLS socket: what has been deciphered already makes it not readable."""
+    number = guard.descriptors.number(sock)
+    timeout_s = sock.gettimeout()
+    if timeout_s == 0 or not guard.context.is_aside():
+        return guard.recorded(Source.SOCKET, call, receive, frame, number)
+    wire = when_readable(sock.fileno(), lambda: [receive()])
+
+    def look(seconds: float) -> Any:
+        return [receive()] if tls.pending() else wire(seconds)
+
+    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
+    found = awaited(guard, Source.SOCKET, call, look, frame, of=number, for_ns=for_ns)
+    if found is None:
+        raise TimeoutError("The read operation timed out")
+    return found[0]
+
+
+def _pending(real: Any) -> property:
+    def pending(self: Any) -> Any:
+        guard = recording(Source.SOCKET, sys._getframe(1))
+        if guard is None:
+            return real.__get__(self)
+        return guard.recorded(
+            Source.SOCKET, "MemoryBIO.pending", lambda: real.__get__(self), sys._getframe(1)
+        )
+
+    return property(pending)
+
+
+@contextmanager
+def recorded_sockets() -> Iterator[None]:
+    """Let sockets answer from the trace in a re-run."""
+    with ExitStack() as stack:
+        for name in _RESOLVING:
+            function = getattr(_socket, name)
+            stack.callback(Redirected(function, _resolving(name, copy_of(function))).restore)
+        pair: Any = _socket.socketpair
+        stack.callback(Redirected(pair, joining(copy_of(pair))).restore)
+        kind: Any = socket.socket
+        makers: list[tuple[str, Any]] = [
+            *((name, partial(_of_socket, name)) for name in _PLAIN),
+            *((name, partial(_of_socket, name, waits=True)) for name in _RECEIVING),
+            *((name, partial(_into, name)) for name in _RECEIVING_INTO),
+            ("_accept", _accepting),
+        ]
+        for name, make in makers:
+            put_back = partial(setattr, kind, name, vars(kind).get(name))
+            stack.callback(put_back if name in vars(kind) else partial(delattr, kind, name))
+            setattr(kind, name, make(getattr(kind, name)))
+        tls: Any = sys.modules["_ssl"]._SSLSocket  # below both ssl.SSLSocket and ssl.SSLObject
+        memory = ssl.MemoryBIO
+        for name in _TLS:
+            exchange(stack, tls, name, partial(_of_tls, "TLS", name))
+        exchange(stack, tls, "read", _reading)
+        for name in _BUFFERED:
+            exchange(stack, memory, name, partial(_of_tls, "MemoryBIO", name))
+        exchange(stack, memory, "pending", _pending)
+        yield

@@ -1,0 +1,1 @@
+"""What a run makes deterministic: clocks, chance, order, the environment."""

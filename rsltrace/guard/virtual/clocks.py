@@ -1,0 +1,277 @@
+"""Every clock a node can read shows simulated time: ``time``, ``datetime``, also where it is bound.
+
+Built-in functions are redirected, ``datetime.now`` and ``utcnow`` (which belong to a type) are
+exchanged in the type. Clocks of processor time show what has passed of the simulation: computing
+takes no simulated time, looking at a clock again 1 us.
+"""
+
+from __future__ import annotations
+
+import gc
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from datetime import datetime, timezone
+from functools import partial
+from types import BuiltinFunctionType, FrameType
+from typing import Any
+
+from rsltrace.guard.extension_types import put_member
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.model.finding import Mode, Source
+
+_NS = 1_000_000_000
+
+REAL_TIME_MODULES = {
+    "hypothesis.internal.conjecture.junkdrawer",  # times the garbage collector, whenever it runs
+    "multiprocessing.connection",
+    "multiprocessing.popen_fork",
+    "multiprocessing.synchronize",
+    "selectors",
+    "socket",
+    "socketserver",
+    "subprocess",
+}
+"""Modules whose clocks measure how long the operating system takes: they wait for real, so what
+they read must go on. Their users get simulated time."""
+
+
+_wall_ns = copy_of(time.time_ns)  # type: ignore[arg-type]
+_REAL_NS = {
+    name: copy_of(getattr(time, f"{name}_ns"))
+    for name in ("monotonic", "perf_counter", "process_time", "thread_time")
+}
+
+_monotonic_ns = _REAL_NS["monotonic"]
+_real_gettime_ns = copy_of(time.clock_gettime_ns)  # type: ignore[arg-type]
+
+
+def clock_call(
+    guard: Guard,
+    frame: FrameType,
+    call: str,
+    virtual: Callable[[int], Any],
+    real: Callable[[], Any],
+    real_ns: Callable[[], int] | None = None,
+) -> Any:
+    """Answer the reading of a clock as the job says; ``real_ns`` is read if it is recorded."""
+    module = frame.f_globals.get("__name__")
+    if module in REAL_TIME_MODULES:
+        if module != "subprocess" or guard.mode(Source.PROCESS, frame) is not Mode.RECORD:
+            return real()
+        if guard.context.is_aside():
+            return virtual(guard.context.now_ns())
+        return virtual(
+            guard.recorded(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame)
+        )
+    mode = guard.mode(Source.CLOCK, frame)
+    if mode is Mode.VIRTUAL:
+        guard.count(Source.CLOCK, mode, call, frame)
+        return virtual(guard.clock_ns(frame))
+    if mode is Mode.ALLOW:
+        return real()
+    if mode is Mode.RECORD:
+        if real_ns is None:
+            real_ns = next((read for name, read in _REAL_NS.items() if name in call), _wall_ns)
+        return virtual(guard.recorded(Source.CLOCK, call, real_ns, frame))
+    value = real()
+    guard.found(Source.CLOCK, mode, call, value, frame)
+    return value
+
+
+def _readers() -> dict[str, Callable[[int], Any]]:
+    """Return what each clock function gives at a simulated time in nanoseconds."""
+    readers: dict[str, Callable[[int], Any]] = {}
+    for name in ("time", "monotonic", "perf_counter", "process_time", "thread_time"):
+        readers[name] = lambda now_ns: now_ns / _NS
+        readers[f"{name}_ns"] = lambda now_ns: now_ns
+    return readers
+
+
+def _reading(name: str, virtual: Callable[[int], Any], real: Callable[..., Any]) -> Any:
+    call = f"time.{name}()"
+
+    def read(*arguments: Any) -> Any:
+        guard = None if arguments else engaged()
+        if guard is None:
+            return real(*arguments)
+        return clock_call(guard, sys._getframe(1), call, virtual, real)
+
+    return read
+
+
+def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[..., Any]) -> Any:
+    def read(*arguments: Any) -> Any:
+        guard = engaged()
+        value = real(*arguments)  # raises for a clock that does not exist
+        if guard is None:
+            return value
+        return clock_call(
+            guard,
+            sys._getframe(1),
+            f"time.{name}()",
+            virtual,
+            lambda: value,
+            lambda: _real_gettime_ns(*arguments),
+        )
+
+    return read
+
+
+def _broken_down(name: str, real: Callable[..., Any]) -> Any:
+    """``localtime()`` and its like: without an argument, or with None, they mean now."""
+
+    def read(*arguments: Any) -> Any:
+        guard = engaged() if arguments in ((), (None,)) else None
+        if guard is None:
+            return real(*arguments)
+        return clock_call(
+            guard, sys._getframe(1), f"time.{name}()", lambda now_ns: real(now_ns // _NS), real
+        )
+
+    return read
+
+
+def _formatting(
+    name: str, given: int, real: Callable[..., Any], localtime: Callable[..., Any]
+) -> Any:
+    """``strftime(format)`` and ``asctime()``: without the last argument they mean now."""
+
+    def read(*arguments: Any) -> Any:
+        guard = engaged() if len(arguments) == given else None
+        if guard is None:
+            return real(*arguments)
+        return clock_call(
+            guard,
+            sys._getframe(1),
+            f"time.{name}()",
+            lambda now_ns: real(*arguments, localtime(now_ns // _NS)),
+            lambda: real(*arguments),
+        )
+
+    return read
+
+
+def _now(real: Any) -> Any:
+    def now(cls: type[datetime], tz: Any = None) -> datetime:
+        guard = engaged()
+
+        def virtual(now_ns: int) -> datetime:
+            whole = cls.fromtimestamp(now_ns // _NS, tz)
+            return whole.replace(microsecond=now_ns % _NS // 1000)
+
+        if guard is None:
+            return real.__get__(None, cls)(tz)  # type: ignore[no-any-return]
+        return clock_call(  # type: ignore[no-any-return]
+            guard,
+            sys._getframe(1),
+            "datetime.now()",
+            virtual,
+            lambda: real.__get__(None, cls)(tz),
+        )
+
+    return now
+
+
+def _utcnow(real: Any) -> Any:
+    def utcnow(cls: type[datetime]) -> datetime:
+        guard = engaged()
+
+        def virtual(now_ns: int) -> datetime:
+            whole = cls.fromtimestamp(now_ns // _NS, timezone.utc).replace(tzinfo=None)
+            return whole.replace(microsecond=now_ns % _NS // 1000)
+
+        if guard is None:
+            return real.__get__(None, cls)()  # type: ignore[no-any-return]
+        return clock_call(  # type: ignore[no-any-return]
+            guard, sys._getframe(1), "datetime.utcnow()", virtual, real.__get__(None, cls)
+        )
+
+    return utcnow
+
+
+def numpy_now(function: Any, text: str, *more: Any) -> Any:
+    """Do ``np.datetime64("now")``, which asks the C library: user modules come here instead."""
+    real = function(text, *more)
+    guard = engaged()
+    if guard is None:
+        return real
+    return clock_call(
+        guard,
+        sys._getframe(1),
+        f"datetime64({text!r})",
+        lambda now_ns: function(now_ns, "ns").astype(real.dtype),
+        lambda: real,
+    )
+
+
+def opencv_clock(stack: ExitStack) -> None:
+    """Redirect the clock of OpenCV, which is loaded: its unit is a nanosecond."""
+    count: Any = sys.modules["cv2"].getTickCount
+    real = copy_of(count)
+
+    def read() -> Any:
+        guard = engaged()
+        if guard is None:
+            return real()
+        return clock_call(guard, sys._getframe(1), "cv2.getTickCount()", lambda ns: ns, real)
+
+    stack.callback(Redirected(count, read).restore)
+
+
+@contextmanager
+def clocks() -> Iterator[None]:
+    """Redirect every clock; which guard answers is asked at each call."""
+    with ExitStack() as stack:
+
+        def redirect(name: str, make: Callable[[Any], Any]) -> None:
+            function = getattr(time, name, None)
+            if isinstance(function, BuiltinFunctionType):
+                stack.callback(Redirected(function, make(copy_of(function))).restore)
+
+        for name, virtual in _readers().items():
+            redirect(name, partial(_reading, name, virtual))
+        localtime = copy_of(time.localtime)  # type: ignore[arg-type]
+        redirect(
+            "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
+        )
+        redirect(
+            "clock_gettime_ns", lambda real: _clock_gettime("clock_gettime_ns", lambda ns: ns, real)
+        )
+        for name in ("localtime", "gmtime", "ctime"):
+            redirect(name, partial(_broken_down, name))
+        redirect("strftime", lambda real: _formatting("strftime", 1, real, localtime))
+        redirect("asctime", lambda real: _formatting("asctime", 0, real, localtime))
+        bound_before = _bound_before("now", "utcnow")
+        for name, make in (("now", _now), ("utcnow", _utcnow)):
+            _exchange(stack, name, make, bound_before[name])
+        yield
+
+
+def _exchange(
+    stack: ExitStack,
+    name: str,
+    make: Callable[[Any], Any],
+    bound_before: list[BuiltinFunctionType],
+) -> None:
+    """Exchange a class method of ``datetime``, in the type and where it was bound before."""
+    real = datetime.__dict__[name]
+    ours = make(real)
+    for bound in bound_before:
+        target = ours.__get__(bound.__self__)
+        stack.callback(Redirected(bound, target).restore)
+    put_member(datetime, name, classmethod(ours))
+    stack.callback(put_member, datetime, name, real)
+
+
+def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:
+    """Return the bound class methods that somebody keeps (``now = datetime.now``), by name."""
+    found: dict[str, list[BuiltinFunctionType]] = {name: [] for name in names}
+    for thing in gc.get_objects():
+        if type(thing) is BuiltinFunctionType and thing.__name__ in found:
+            owner = thing.__self__
+            if isinstance(owner, type) and issubclass(owner, datetime):
+                found[thing.__name__].append(thing)
+    return found

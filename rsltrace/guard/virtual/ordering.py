@@ -1,0 +1,279 @@
+"""Sets in an order of their own: user modules ask here before they go through a set.
+
+A set of texts is in the order of their hashes, which differ from process to process; a set of
+objects in that of their addresses. Python offers no hook for that, so the modules of user code are
+compiled with one: wherever a loop, a comprehension or one of a few functions goes through a value,
+it is passed through ``ordered`` first. Line numbers stay.
+"""
+
+from __future__ import annotations
+
+import ast
+import builtins
+import importlib.machinery
+import os
+import sys
+import weakref
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import CodeType, ModuleType
+from typing import Any
+
+from rsltrace.guard.callers import is_own
+from rsltrace.guard.guard import engaged
+from rsltrace.guard.virtual.clocks import numpy_now
+from rsltrace.guard.watch import is_by_address
+from rsltrace.model.finding import Mode, Source
+
+_ORDERED = "__rsltrace_ordered__"
+_SHOWN = "__rsltrace_shown__"
+_POP = "__rsltrace_pop__"
+_NOW = "__rsltrace_now__"
+_GOES_THROUGH = frozenset(
+    "list tuple sum iter enumerate map filter zip max min dict deque join fromkeys extend "
+    "fromiter".split()
+)
+_SHOWS = frozenset("str repr print format".split())
+_PLAIN = (str, bytes, int, float, bool, type(None))
+
+
+def ordered(thing: Any) -> Any:
+    """Return what a loop over ``thing`` should go through: a set in an order that stays."""
+    kind = type(thing)
+    if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
+        return thing
+    if len(thing) < 2:
+        return thing
+    guard = engaged()
+    if guard is None:
+        return thing
+    frame = sys._getframe(1)
+    mode = guard.mode(Source.ORDER, frame)
+    if mode is Mode.ALLOW or not any(map(_has_no_order, thing)):
+        return thing
+    if mode is Mode.VIRTUAL:
+        try:
+            in_order = sorted(thing, key=_key)
+        except TypeError:
+            pass  # objects: nothing tells them apart but their addresses
+        else:
+            guard.count(Source.ORDER, mode, "order of a set", frame)
+            return _Watched(thing, in_order)
+    kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
+    guard.watched(
+        Source.ORDER, f"order of a {kind.__name__} of {kinds}", f"{len(thing)} elements", frame
+    )
+    return thing
+
+
+def shown(thing: Any) -> Any:
+    """Return what a text of ``thing`` should be made of: a set's elements in order."""
+    if type(thing) is not set and type(thing) is not frozenset:
+        return thing
+    in_order = ordered(thing)
+    if not isinstance(in_order, _Watched):
+        return thing
+    inside = "{" + ", ".join(map(repr, in_order.items)) + "}"
+    return _Text(inside if type(thing) is set else f"frozenset({inside})")
+
+
+def pop(owner: Any, *arguments: Any) -> Any:
+    """Do ``owner.pop(...)``; of a set, take the first element in order."""
+    if type(owner) is set and not arguments:
+        in_order = ordered(owner)
+        if isinstance(in_order, _Watched):
+            first = in_order.items[0]
+            owner.remove(first)
+            return first
+    return owner.pop(*arguments)
+
+
+class _Text(str):
+    """A text that is its own ``repr``, as the text of a set is."""
+
+    def __repr__(self) -> str:
+        return str(self)
+
+
+class _Watched:
+    """The elements of a set in order; like a set, it notices when that changes on the way."""
+
+    def __init__(self, of: Any, items: list[Any]) -> None:
+        self.items = items
+        self._of = of
+
+    def __iter__(self) -> Iterator[Any]:
+        size = len(self._of)
+        for item in self.items:
+            if len(self._of) != size:
+                raise RuntimeError("Set changed size during iteration")
+            yield item
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+
+def _has_no_order(item: object) -> bool:
+    """Whether an element's place in a set differs from process to process, pinned or not."""
+    return isinstance(item, (str, bytes)) or is_by_address(item)
+
+
+def _key(item: Any) -> tuple[str, Any]:
+    kind = type(item)
+    if kind in _PLAIN:
+        return kind.__name__, item
+    if kind is tuple:
+        return "tuple", tuple(map(_key, item))
+    raise TypeError
+
+
+# -- compiling user modules with the calls above -------------------------------------------------
+
+
+class _Rewriter(ast.NodeTransformer):
+    def _call(self, function: str, node: ast.expr, *more: ast.expr) -> ast.expr:
+        name = ast.Name(function, ast.Load())
+        call = ast.Call(name, [node, *more], [])
+        return ast.fix_missing_locations(ast.copy_location(call, node))
+
+    def visit_For(self, node: ast.For) -> ast.AST:
+        self.generic_visit(node)
+        if not _is_harmless(node.iter):
+            node.iter = self._call(_ORDERED, node.iter)
+        return node
+
+    def visit_comprehension(self, node: ast.comprehension) -> ast.AST:
+        self.generic_visit(node)
+        if not node.is_async and not _is_harmless(node.iter):
+            node.iter = self._call(_ORDERED, node.iter)
+        return node
+
+    def visit_Starred(self, node: ast.Starred) -> ast.AST:
+        self.generic_visit(node)
+        if isinstance(node.ctx, ast.Load):
+            node.value = self._call(_ORDERED, node.value)
+        return node
+
+    def visit_FormattedValue(self, node: ast.FormattedValue) -> ast.AST:
+        self.generic_visit(node)
+        node.value = self._call(_SHOWN, node.value)
+        return node
+
+    def visit_Assign(self, node: ast.Assign) -> ast.AST:
+        self.generic_visit(node)
+        if any(isinstance(target, (ast.Tuple, ast.List)) for target in node.targets):
+            node.value = self._call(_ORDERED, node.value)
+        return node
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        function = node.func
+        name = getattr(function, "id", None) or getattr(function, "attr", None)
+        if isinstance(function, ast.Attribute) and name == "pop" and not node.keywords:
+            popped = ast.Call(ast.Name(_POP, ast.Load()), [function.value, *node.args], [])
+            return ast.fix_missing_locations(ast.copy_location(popped, node))
+        if name == "datetime64" and node.args and _says_now(node.args[0]):
+            node.args.insert(0, function)
+            node.func = ast.copy_location(ast.Name(_NOW, ast.Load()), function)
+            return ast.fix_missing_locations(node)
+        if name in _GOES_THROUGH or name in _SHOWS:
+            wrap = _ORDERED if name in _GOES_THROUGH else _SHOWN
+            node.args = [
+                a if isinstance(a, ast.Starred) or _is_harmless(a) else self._call(wrap, a)
+                for a in node.args
+            ]
+        return node
+
+
+def _says_now(node: ast.expr) -> bool:
+    return isinstance(node, ast.Constant) and node.value in ("now", "today")
+
+
+def _is_harmless(node: ast.expr) -> bool:
+    """Whether an expression cannot be a set, as far as one can see."""
+    if isinstance(node, (ast.Constant, ast.List, ast.Tuple, ast.Dict, ast.Lambda, ast.ListComp)):
+        return True
+    return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("range", "sorted", "len")
+
+
+def rewritten(source: bytes, path: str) -> CodeType:
+    """Return a module's code with sets in order."""
+    tree = ast.parse(source, path)
+    code: CodeType = compile(_Rewriter().visit(tree), path, "exec", dont_inherit=True)
+    return code
+
+
+class _Loader(importlib.machinery.SourceFileLoader):
+    def get_code(self, fullname: str) -> CodeType | None:
+        path = self.get_filename(fullname)
+        return rewritten(self.get_data(path), path)
+
+
+class _Finder:
+    """Finds the modules of user code: in the job's folders, or in the packages of its nodes."""
+
+    def __init__(
+        self,
+        folders: Sequence[str],
+        packages: frozenset[str],
+        on_loaded: Mapping[str, Callable[[], None]],
+    ) -> None:
+        self._folders = tuple(os.path.join(folder, "") for folder in folders)
+        self._packages = packages
+        self._on_loaded = on_loaded
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Return the spec of a user module with our loader, or None for any other module."""
+        if name in sys.builtin_module_names or is_own(name):
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
+            return None
+        if name in self._on_loaded:
+            _tell(spec.loader, self._on_loaded[name])
+            return spec
+        origin = spec.origin or ""
+        inside = origin.startswith(self._folders) and "site-packages" not in origin
+        if not inside and name.partition(".")[0] not in self._packages:
+            return None
+        spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        return spec
+
+
+def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
+    """Have a loader say when it has loaded its module."""
+    real = loader.exec_module
+
+    def exec_module(module: ModuleType) -> None:
+        real(module)
+        on_loaded()
+
+    loader.exec_module = exec_module
+
+
+@contextmanager
+def ordered_sets(
+    folders: Sequence[str],
+    packages: frozenset[str],
+    on_loaded: Mapping[str, Callable[[], None]],
+) -> Iterator[None]:
+    """Let user modules that are imported from now on go through sets in order.
+
+    ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
+    """
+    helpers: dict[str, Callable[..., Any]] = {
+        _ORDERED: ordered,
+        _SHOWN: shown,
+        _POP: pop,
+        _NOW: numpy_now,
+    }
+    finder = _Finder(folders, packages, on_loaded)
+    for name, function in helpers.items():
+        setattr(builtins, name, function)  # for good: modules may outlive the run
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)

@@ -1,0 +1,241 @@
+"""Chance, made of seeds: every node draws from streams of its own, named after it.
+
+``random``'s and numpy's module functions share one generator per process; here each node has its
+own, as if it were a process of its own, so adding a node changes nothing for the others. Whatever
+else asks for entropy (``Random()``, ``secrets``, ``uuid4``, ``default_rng()``) gets it through
+``os.urandom`` or ``Random.seed``, and so from the node's stream, too.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import sys
+import uuid
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
+from typing import Any
+
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.redirect import Redirected, RedirectedMethod, copy_of
+from rsltrace.model.finding import Mode, Source
+
+_NODE_ID = 0x02_00_00_00_00_01
+"""A locally administered MAC address, for ``uuid1`` and ``getnode``."""
+
+
+_real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
+
+
+def _drawn(
+    call: str,
+    real: Callable[..., Any],
+    virtual: Callable[[Guard, FrameType], Callable[..., Any]],
+    *,
+    is_method: bool = False,
+) -> Any:
+    """Return the stand-in for a function that answers by chance; a method's owner is dropped."""
+
+    def draw(*arguments: Any, **options: Any) -> Any:
+        if is_method:
+            arguments = arguments[1:]
+        guard = engaged()
+        if guard is None:
+            return real(*arguments, **options)
+        frame = sys._getframe(1)
+        mode = guard.mode(Source.RANDOM, frame)
+        if mode is Mode.RECORD:
+            guard.streams.begin(
+                guard.stream(frame),
+                lambda: guard.recorded(
+                    Source.RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame
+                ),
+            )
+            return virtual(guard, frame)(*arguments, **options)
+        if mode is Mode.VIRTUAL:
+            guard.count(Source.RANDOM, mode, call, frame)
+            return virtual(guard, frame)(*arguments, **options)
+        if mode is Mode.ALLOW:
+            return real(*arguments, **options)
+        value = real(*arguments, **options)
+        guard.found(Source.RANDOM, mode, call, _shown(value), frame)
+        return value
+
+    return draw
+
+
+def _shown(value: object) -> str:
+    text = value.hex() if isinstance(value, bytes) else repr(value)
+    return text if len(text) <= 200 else text[:199] + "…"
+
+
+@contextmanager
+def randomness() -> Iterator[None]:
+    """Redirect what answers by chance; which guard answers is asked at each call."""
+    with ExitStack() as stack:
+        _module_functions(stack, random, random._inst, "random", _random_of)
+        stack.callback(setattr, random, "_inst", random._inst)
+        random._inst = _Shared()
+        _entropy(stack)
+        _unseeded(stack)
+        _uuids(stack)
+        if "numpy" in sys.modules:
+            import numpy as np
+
+            _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
+            _shared_numpy(stack, np.random)
+            empty: Any = np.empty
+            stack.callback(Redirected(empty, _emptying(copy_of(empty))).restore)
+        yield
+
+
+class _Shared(random.Random):
+    """What libraries (networkx) take for the generator behind ``random``'s functions."""
+
+    def __init__(self) -> None:
+        """Seed nothing: that would seed the module."""
+
+    def __getattribute__(self, name: str) -> Any:
+        """Return the module's function of that name, which asks whose code it is."""
+        if name.startswith("_"):
+            return super().__getattribute__(name)
+        return vars(random).get(name) or super().__getattribute__(name)
+
+
+def _random_of(guard: Guard, frame: FrameType) -> Any:
+    return guard.streams.random(guard.stream(frame))
+
+
+def _numpy_of(guard: Guard, frame: FrameType) -> Any:
+    return guard.streams.numpy(guard.stream(frame))
+
+
+def _module_functions(
+    stack: ExitStack,
+    module: Any,
+    owner: Any,
+    prefix: str,
+    generator: Callable[[Guard, FrameType], Any],
+) -> None:
+    """Redirect a module's functions that are methods of one shared generator."""
+    for name, function in sorted(vars(module).items()):
+        if getattr(function, "__self__", None) is not owner or function.__name__ != name:
+            continue
+        kind = RedirectedMethod if isinstance(function, MethodType) else Redirected
+        real = getattr(owner, name)  # a new object: only the module's own is redirected
+
+        def virtual(guard: Guard, frame: FrameType, name: str = name) -> Any:
+            return getattr(generator(guard, frame), name)
+
+        is_method = kind is RedirectedMethod
+        draw = _drawn(f"{prefix}.{name}()", real, virtual, is_method=is_method)
+        stack.callback(kind(function, draw).restore)
+
+
+def _entropy(stack: ExitStack) -> None:
+    def bytes_of(guard: Guard, frame: FrameType) -> Callable[..., bytes]:
+        def entropy(size: int = 0, flags: int = 0) -> bytes:
+            if not isinstance(size, int) or size < 0:
+                raise ValueError("negative argument not allowed")
+            return guard.streams.entropy(guard.stream(frame), size)
+
+        return entropy
+
+    for name in ("urandom", "getrandom"):
+        function = getattr(os, name, None)
+        if isinstance(function, BuiltinFunctionType):
+            draw = _drawn(f"os.{name}()", copy_of(function), bytes_of)
+            stack.callback(Redirected(function, draw).restore)
+
+
+def _unseeded(stack: ExitStack) -> None:
+    """``Random()`` without a seed takes entropy in C, past any redirected function."""
+    real = random.Random.seed
+
+    def seed(self: random.Random, a: Any = None, version: int = 2) -> None:
+        if a is None and not isinstance(self, random.SystemRandom):
+            guard = engaged()
+            if guard is not None:
+                a = int.from_bytes(os.urandom(32), "big")
+        real(self, a, version)
+
+    random.Random.seed = seed  # type: ignore[method-assign]
+    stack.callback(setattr, random.Random, "seed", real)
+
+
+def _uuids(stack: ExitStack) -> None:
+    """``uuid1`` then asks ``time`` and ``random``; the machine's address is replaced, too."""
+    for name, value in (
+        ("_generate_time_safe", None),
+        ("_node", _NODE_ID),
+        ("_last_timestamp", None),
+    ):
+        if hasattr(uuid, name):
+            stack.callback(setattr, uuid, name, getattr(uuid, name))
+            setattr(uuid, name, value)
+    saved = uuid.uuid1.__code__
+    uuid.uuid1.__code__ = _uuid1_code.__code__  # wherever the function is bound
+    stack.callback(setattr, uuid.uuid1, "__code__", saved)
+    _real_uuid1[:] = [FunctionType(saved, vars(uuid), "uuid1", uuid.uuid1.__defaults__)]
+
+
+_real_uuid1: list[Callable[..., uuid.UUID]] = []
+
+
+def _uuid1_code(node=None, clock_seq=None):  # type: ignore[no-untyped-def]
+    from rsltrace.guard.virtual.randomness import uuid1
+
+    return uuid1(node, clock_seq)
+
+
+def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
+    """Do ``uuid.uuid1``, which never gives a time twice, for each node as if it were alone."""
+    real, guard = _real_uuid1[0], engaged()
+    if guard is None:
+        return real(node, clock_seq)
+    module: Any = uuid
+    last, stream = guard.streams.last_uuid, guard.stream(sys._getframe(2))
+    module._last_timestamp = last.get(stream)
+    made = real(node, clock_seq)
+    last[stream] = module._last_timestamp
+    return made
+
+
+def _shared_numpy(stack: ExitStack, module: Any) -> None:
+    """Libraries (scipy.stats) use numpy's shared generator itself: give it its state back."""
+    shared = module.mtrand._rand
+    stack.callback(shared.set_state, shared.get_state())
+    real = module.seed  # a function of its own that goes past the redirected methods
+
+    def seeding(guard: Guard, frame: FrameType) -> Callable[..., Any]:
+        seed: Callable[..., Any] = _numpy_of(guard, frame).seed
+        return seed
+
+    draw = _drawn("numpy.random.seed()", real, seeding)
+    for place in (module, module.mtrand):
+        stack.callback(setattr, place, "seed", place.seed)
+        place.seed = draw
+
+
+def _emptying(real: Callable[..., Any]) -> Any:
+    """``np.empty`` shows what was in the memory before; in user code, it shows zeros."""
+
+    def empty(*arguments: Any, **options: Any) -> Any:
+        made = real(*arguments, **options)
+        guard = engaged()
+        if guard is not None and not made.dtype.hasobject:
+            frame = sys._getframe(1)
+            if guard.is_user(frame) and guard.mode(Source.RANDOM, frame) is not Mode.ALLOW:
+                made.fill(0)
+        return made
+
+    return empty
+
+
+def begin_shared(seed: int) -> None:
+    """Seed what cannot be divided into streams: numpy's shared generator."""
+    if "numpy" in sys.modules:
+        import numpy as np
+
+        np.random.mtrand._rand.seed(random.Random(f"numpy {seed}").getrandbits(32))

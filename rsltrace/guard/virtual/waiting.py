@@ -1,0 +1,160 @@
+"""Waiting for what is outside of the run, in threads and event loops: others go on meanwhile.
+
+Simulated time then passes as fast as real time does, in steps of a millisecond. The trace keeps how
+many steps it were, and a re-run takes as many without waiting for anything.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.recorded.answers import answered, decoded, numbered
+from rsltrace.guard.redirect import copy_of
+from rsltrace.guard.virtual.real_time_pace import STEP_NS
+from rsltrace.model.finding import Mode, Source
+
+NOT_YET: Any = object()
+"""What somebody who looks for an answer returns if there is none."""
+
+Look = Callable[[float], Any]
+"""Waits for real, at most so many seconds, and returns the answer or ``NOT_YET``."""
+
+_poll = copy_of(select.poll)  # type: ignore[arg-type]
+_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
+
+
+def awaited(
+    guard: Guard,
+    source: Source,
+    call: str,
+    look: Look,
+    frame: FrameType,
+    *,
+    of: int,
+    for_ns: int | None = None,
+    step: Callable[[int], object] | None = None,
+) -> Any:
+    """Return the answer to a call that waits for it, or None if it does not come in time.
+
+    ``step`` lets simulated time pass; if it returns True, somebody else ends the wait.
+
+    :raises OSError: if that is what was answered.
+    """
+    context = guard.context
+    step = step or context.step
+    deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
+    steps = 0
+    kept = guard.outside.next_kept(context.node(), call, of) if guard.outside.replays else None
+    text: str | None = None
+    try:
+        while True:
+            if kept is None:
+                with engage(None):
+                    seconds = guard.pace.ahead_s(context.now_ns()) if steps else 0.0
+                    text = _looked(look, seconds)
+                if text is not None:
+                    break
+            elif steps >= kept.steps and kept.text is not None:
+                text = kept.text
+                break
+            left_ns = STEP_NS
+            if deadline_ns is not None:
+                left_ns = min(left_ns, deadline_ns - context.now_ns())
+            if left_ns <= 0 and kept is None:
+                text = "null"
+                break
+            is_ended = step(max(left_ns, 1))
+            steps += 1
+            if is_ended and kept is None:
+                text = "null"
+                break
+    finally:
+        # None: the run ends before the answer has come, and a re-run will wait as long for it.
+        guard.found(source, Mode.RECORD, call, numbered(of, steps, text), frame)
+    return decoded(text)
+
+
+def patiently(
+    guard: Guard,
+    look: Look,
+    for_ns: int | None = None,
+    step: Callable[[int], object] | None = None,
+) -> Any:
+    """Wait likewise for what is not recorded; return it, or None if it does not come in time.
+
+    A thread that blocked for real would keep everybody from going on, be it those it waits for.
+    """
+    context, steps = guard.context, 0
+    step = step or context.step
+    deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
+    while True:
+        with engage(None):
+            found = look(guard.pace.ahead_s(context.now_ns()) if steps else 0.0)
+        if found is not NOT_YET:
+            # Who always finds something may look at what another thread is to fetch.
+            if steps == 0 and guard.pace.is_greedy():
+                context.step(STEP_NS)
+            return found
+        left_ns = STEP_NS
+        if deadline_ns is not None:
+            left_ns = min(left_ns, deadline_ns - context.now_ns())
+            if left_ns <= 0:
+                return None
+        guard.pace.in_a_row = 0
+        if step(left_ns):
+            return None
+        steps += 1
+
+
+def is_patient(frame: FrameType) -> Guard | None:
+    """Return the guard if whoever calls from ``frame`` is to wait like that.
+
+    Threads are, and multiprocessing anywhere: it has threads of its own that must go on.
+    """
+    guard = engaged()
+    if guard is None or not guard.context.can_step():
+        return None
+    module = str(frame.f_globals.get("__name__", ""))
+    if guard.context.is_aside() or module.startswith(("multiprocessing.", "torch.multiprocessing")):
+        return guard
+    return None
+
+
+def _looked(look: Look, seconds: float) -> str | None:
+    found: list[Any] = []
+
+    def real() -> Any:
+        found.append(look(seconds))
+        return None if found[0] is NOT_YET else found[0]
+
+    text = answered(real)
+    return None if found and found[0] is NOT_YET else text
+
+
+def when_readable(fd: int, real: Callable[[], Any]) -> Look:
+    """Return a look that does ``real`` as soon as there is something to read."""
+
+    def look(seconds: float) -> Any:
+        waiting = _poll()
+        waiting.register(fd, select.POLLIN | select.POLLPRI)
+        return real() if waiting.poll(seconds * 1000) else NOT_YET
+
+    return look
+
+
+def again_and_again(real: Callable[[], Any]) -> Look:
+    """Return a look at something that nobody can wait for: ``real`` returns it, or ``NOT_YET``."""
+
+    def look(seconds: float) -> Any:
+        found = real()
+        if found is NOT_YET and seconds > 0:
+            _sleep(seconds)
+            found = real()
+        return found
+
+    return look

@@ -1,0 +1,1 @@
+"""A job written down: as YAML, as JSON Schema, as reference."""

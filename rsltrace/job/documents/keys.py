@@ -1,0 +1,107 @@
+"""The keys of a job as the models have them: walked for messages, overrides, schema and docs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from rsltrace.job.reading.problems import Loc
+
+
+def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:
+    """Yield (key in a job file, field) of a model, in order."""
+    for name, field in model.model_fields.items():
+        if field.exclude is not True:
+            yield field.alias or name, field
+
+
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Return the models that values of an annotation may be made of."""
+    # In Python 3.10 tuple[X, ...] calls itself a type, so what is inside comes first.
+    if inner := get_args(annotation):
+        return [found for argument in inner for found in models_in(argument)]
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    return []
+
+
+def keys_with(model: type[BaseModel], key: str) -> list[str]:
+    """Return the keys of a model whose parts have a key of that name."""
+    return [
+        own
+        for own, field in file_fields(model)
+        if any(key == name for part in models_in(field.annotation) for name, _ in file_fields(part))
+    ]
+
+
+def field_at(model: type[BaseModel], loc: Loc) -> FieldInfo | None:
+    """Return the field that governs the value at ``loc``, or None below free-form values."""
+    models, found = [model], None
+    in_mapping = False
+    for part in loc:
+        if isinstance(part, int) or in_mapping:
+            in_mapping = False  # a list's index, or a key that the author has chosen
+            continue
+        fields = [field for m in models for key, field in file_fields(m) if key == part]
+        if fields:
+            found = fields[0]
+            models = models_in(found.annotation)
+            in_mapping = bool(models) and get_origin(found.annotation) is dict
+        elif not models:
+            return None
+    return found
+
+
+def alternatives_at(model: type[BaseModel], loc: Loc) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of keys of the value at ``loc`` of which only one may be given."""
+    field = field_at(model, loc) if loc else None
+    models = [] if field is None else models_in(field.annotation)
+    return next((m.ALTERNATIVES for m in models if hasattr(m, "ALTERNATIVES")), ())
+
+
+def without_alternatives(
+    values: dict[Any, Any], keys: Iterable[Any], model: type[BaseModel], loc: Loc
+) -> dict[Any, Any]:
+    """Return ``values`` without what cannot stay beside the new ``keys``: another distribution
+    takes the place of the one that was there."""
+    alternatives = alternatives_at(model, loc)
+    given = {key for key in keys if isinstance(key, str)}
+    chosen = [set(group) for group in alternatives if given & set(group)]
+    gone = {key for group in alternatives for key in group if chosen} - set().union(*chosen)
+    return {key: value for key, value in values.items() if key not in gone}
+
+
+def is_list_at(model: type[BaseModel], loc: Loc) -> bool:
+    """Say whether the value at ``loc`` is a list and nothing else."""
+    field = field_at(model, loc) if loc else None
+    if field is None or field is field_at(model, loc[:-1]):
+        return False  # free-form values, or an entry of a list or mapping
+    kinds = [kind for kind in get_args(field.annotation) if get_origin(kind) is tuple]
+    return get_origin(field.annotation) is tuple or bool(kinds)
+
+
+def attached(field: FieldInfo, name: str) -> Any:
+    """Return what a field's check says about itself under ``name``, or None."""
+    for item in field.metadata:
+        value = getattr(getattr(item, "func", None), name, None)
+        if value is not None:
+            return value
+    return None
+
+
+def shorthand_at(model: type[BaseModel], loc: Loc) -> str | None:
+    """Return the key that text alone stands for at ``loc``, if it does."""
+    field = field_at(model, loc)
+    if field is None or not loc:
+        return None
+    around = field_at(model, loc[:-1])
+    if isinstance(loc[-1], int):
+        fact = "entry_shorthand"
+    else:
+        # An entry of a mapping has the field of the mapping itself.
+        fact = "value_shorthand" if around is field else "shorthand"
+    value = attached(field, fact)
+    return None if value is None else str(value)

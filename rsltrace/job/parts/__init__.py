@@ -1,0 +1,1 @@
+"""The parts of a job: one model for each key of a job file."""

@@ -1,0 +1,197 @@
+"""One entry of ``bags:``: what plays, when, under which name and with which QoS."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, ValidationInfo, field_validator
+
+from rsltrace.job.parts.names import check_glob, check_topic
+from rsltrace.job.parts.node import check_path, names_to_names
+from rsltrace.job.parts.part import (
+    Part,
+    attach,
+    check,
+    from_file,
+    one_of,
+    positive_number,
+    positive_time,
+    text,
+    whole,
+)
+from rsltrace.job.parts.run import Globs, TimeLike
+from rsltrace.job.parts.times import parse_time
+from rsltrace.job.reading.problems import Problem, Problems, describe
+
+
+class QosSpec(Part):
+    """QoS that a recorded topic is played with, where it differs from what was recorded."""
+
+    reliability: Annotated[
+        Literal["reliable", "best_effort"] | None,
+        check(one_of("reliable", "best_effort"), optional=True),
+    ] = Field(default=None, description="Whether messages may be lost.", examples=["reliable"])
+    durability: Annotated[
+        Literal["volatile", "transient_local"] | None,
+        check(one_of("volatile", "transient_local"), optional=True),
+    ] = Field(
+        default=None,
+        description="Whether late subscriptions get what was played before.",
+        examples=["transient_local"],
+    )
+    history: Annotated[
+        Literal["keep_last", "keep_all"] | None,
+        check(one_of("keep_last", "keep_all"), optional=True),
+    ] = Field(default=None, description="How much is kept for these.", examples=["keep_last"])
+    depth: Annotated[int | None, check(whole(1, 2**31 - 1), optional=True)] = Field(
+        default=None, description="How many messages `keep_last` keeps.", examples=[10]
+    )
+
+    def values(self) -> dict[str, str | int]:
+        """Return what is given."""
+        names = ("reliability", "durability", "history", "depth")
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
+
+
+def _check_bag_remappings(value: object) -> dict[str, str]:
+    return names_to_names(value, check_topic, check_topic)
+
+
+_TOPIC = {"type": "string", "pattern": check_topic.pattern}  # type: ignore[attr-defined]
+attach(
+    _check_bag_remappings,
+    schema={"type": "object", "propertyNames": _TOPIC, "additionalProperties": _TOPIC},
+)
+
+
+def _check_qos(value: object) -> object:
+    if not isinstance(value, dict):
+        raise Problem(f"expected a mapping of topics to QoS, got {describe(value)}")
+    problems = []
+    for name in value:
+        try:
+            text(check_glob)(name)
+        except ValueError as error:
+            problems.append(Problem(str(error), (str(name),), at_key=True))
+    if problems:
+        raise Problems(problems)
+    return value
+
+
+def _check_loop(value: object) -> bool | int:
+    if isinstance(value, bool):
+        return value
+    if not isinstance(value, int):
+        raise Problem(f"expected true, false or how often it plays, got {describe(value)}")
+    return whole(1)(value)
+
+
+attach(_check_loop, schema={"anyOf": [{"type": "boolean"}, {"type": "integer", "minimum": 1}]})
+
+
+class BagSpec(Part):
+    """One entry of ``bags:``.
+
+    ``topics`` and ``exclude`` are globs in which ``*`` matches ``/`` too; no ``topics`` means all.
+    ``start_offset_ns`` counts from the first message of the whole bag, ``duration_ns`` from there.
+    """
+
+    TIMES: ClassVar[dict[str, str]] = {
+        "start_offset": "start_offset_ns",
+        "duration": "duration_ns",
+        "at": "at_ns",
+    }
+
+    path: Annotated[str, check(check_path)] = Field(
+        description="The bag: its folder, or one `.mcap` or `.db3` file.",
+        examples=["../bags/outdoor"],
+    )
+    topics: Globs = Field(
+        default=(),
+        description="Play only these, globs in which `*` matches `/` too. Without it, all.",
+        examples=[["/imu/*", "/odom"]],
+    )
+    exclude: Globs = Field(
+        default=(), description="Do not play these, globs.", examples=[["/tf", "/camera/*"]]
+    )
+    start_offset_ns: Annotated[int, check(parse_time)] = Field(
+        default=0,
+        alias="start_offset",
+        description="Leave out so much of the beginning, from the bag's first message on.",
+        examples=["5s"],
+    )
+    duration_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None,
+        alias="duration",
+        description="Play only so much of the bag, in recorded time, from there on.",
+        examples=["30s"],
+    )
+    at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="at",
+        description="Simulated time at which its first message plays. Without it, the recorded "
+        "one. Stamps within messages stay as they are.",
+        examples=["0s"],
+    )
+    rate: Annotated[float, check(positive_number)] = Field(
+        default=1.0,
+        description="How many times as fast as recorded it plays.",
+        examples=[0.5],
+    )
+    loop: Annotated[bool | int, check(_check_loop)] = Field(
+        default=False,
+        description="How often it plays; `true` is for ever, which needs a `stop`. Each pass "
+        "begins when the last message of the one before plays.",
+        examples=[True, 3],
+    )
+    by: Annotated[
+        Literal["log_time", "publish_time", "header_stamp"],
+        check(one_of("log_time", "publish_time", "header_stamp")),
+    ] = Field(
+        default="log_time",
+        description="Which time says when a message plays: when it was recorded, when it was "
+        "published (MCAP only), or the stamp of its header. A message without one (no header, or "
+        "0) plays by its log time.",
+        examples=["header_stamp"],
+    )
+    remappings: Annotated[dict[str, str], check(_check_bag_remappings)] = Field(
+        default_factory=dict,
+        description="Recorded topics that play under another name.",
+        examples=[{"/scan": "/lidar/scan"}],
+    )
+    qos: Annotated[dict[str, QosSpec], check(_check_qos)] = Field(
+        default_factory=dict,
+        description="QoS by recorded topic, a glob, in place of the recorded one; the first glob "
+        "that matches counts.",
+        examples=[{"/map": {"durability": "transient_local", "depth": 1}}],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            path: str | os.PathLike[str],
+            topics: Sequence[str] = (),
+            exclude: Sequence[str] = (),
+            start_offset: TimeLike = 0,
+            start_offset_ns: int = 0,
+            duration: TimeLike | None = None,
+            duration_ns: int | None = None,
+            at: TimeLike | None = None,
+            at_ns: int | None = None,
+            rate: float = 1.0,
+            loop: bool | int = False,
+            by: Literal["log_time", "publish_time", "header_stamp"] = "log_time",
+            remappings: dict[str, str] = ...,
+            qos: dict[str, QosSpec | dict[str, Any]] = ...,
+        ) -> None: ...
+
+    @field_validator("topics")
+    @classmethod
+    def _not_empty_in_a_file(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if not value and from_file(info):
+            raise Problem("an empty list would play nothing: leave the key out to play all topics")
+        return value

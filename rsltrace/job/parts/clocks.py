@@ -1,0 +1,129 @@
+"""``clocks:`` of a job: the clocks of some nodes are wrong, as real ones are."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from typing import Annotated, ClassVar
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.parts.names import check_node_glob
+from rsltrace.job.parts.part import Part, attach, check, given, parts, positive_time, text
+from rsltrace.job.parts.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
+from rsltrace.job.reading.problems import Problem, describe
+
+DRIFT_MAX_PPM = 100_000
+JUMPS_EVERY_NS_MIN = 1_000_000
+
+
+def parse_signed_time(value: object) -> int:
+    """Return a time that may be negative, in nanoseconds."""
+    if isinstance(value, Nanoseconds):
+        if isinstance(value.value, int) and not isinstance(value.value, bool):
+            return value.value
+    elif isinstance(value, str) and re.match(r"\s*-\s*[^-+]", value):
+        return -parse_time(value.strip()[1:])
+    elif isinstance(value, (int, float)) and not isinstance(value, bool) and value < 0:
+        if isinstance(value, ExactFloat):
+            return -parse_time(f"{value.text.strip().lstrip('-')}s")
+        return -parse_time(-value)
+    return parse_time(value)
+
+
+def parse_interval(value: object) -> int:
+    """Return a mean time between jumps: each jump of a run is drawn and kept."""
+    time_ns = parse_time(value)
+    if time_ns < JUMPS_EVERY_NS_MIN:
+        raise Problem("must be at least 1ms")
+    return time_ns
+
+
+def parse_ppm(value: object) -> float:
+    """Return a drift in parts per million: a number, or text such as ``50ppm``."""
+    bare = value.strip().removesuffix("ppm") if isinstance(value, str) else value
+    try:
+        if isinstance(bare, bool) or not isinstance(bare, (str, int, float)):
+            raise ValueError
+        ppm = float(bare)
+    except ValueError:
+        raise Problem(f"expected parts per million such as 50ppm, got {describe(value)}") from None
+    if not -DRIFT_MAX_PPM <= ppm <= DRIFT_MAX_PPM:
+        raise Problem(f"must be between -{DRIFT_MAX_PPM} and {DRIFT_MAX_PPM} ppm, got {bare}")
+    return ppm
+
+
+_signed = {
+    "anyOf": [{"type": "number"}, {"type": "string", "pattern": r"^\s*-?"}],
+}
+attach(parse_signed_time, schema=_signed)
+attach(parse_interval, schema=TIME_SCHEMA)
+attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "pattern": "ppm\\s*$"}]})
+
+
+class JumpSpec(Part):
+    """A clock is set: by so much, at some time."""
+
+    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
+    LISTED: ClassVar[tuple[str, ...]] = ("at", "by")
+
+    at_ns: Annotated[int, check(parse_time)] = Field(
+        alias="at", description="When, since the start of the run.", examples=["5s"]
+    )
+    by_ns: Annotated[int, check(parse_signed_time)] = Field(
+        alias="by", description="How far; backwards if negative.", examples=["100ms", "-1s"]
+    )
+
+
+class RandomJumpsSpec(Part):
+    """Jumps at random times (a Poisson process) of random size (uniform), from the job's seed."""
+
+    TIMES: ClassVar[dict[str, str]] = {"every": "every_ns", "most": "most_ns"}
+
+    every_ns: Annotated[int, check(parse_interval)] = Field(
+        alias="every", description="Mean time between two jumps.", examples=["10s"]
+    )
+    most_ns: Annotated[int, check(positive_time)] = Field(
+        alias="most", description="Largest size, forwards or backwards.", examples=["50ms"]
+    )
+
+
+class ClockSpec(Part):
+    """The clock of some nodes, compared with simulated time."""
+
+    TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
+
+    node: Annotated[str, check(text(check_node_glob))] = Field(
+        description="Node, a glob; the first entry that fits counts.", examples=["/lidar"]
+    )
+    offset_ns: Annotated[int, check(parse_signed_time)] = Field(
+        default=0,
+        alias="offset",
+        description="How far it is ahead; behind if negative.",
+        examples=["-20ms"],
+    )
+    drift_ppm: Annotated[float, check(parse_ppm)] = Field(
+        default=0.0,
+        alias="drift",
+        description="How much too fast it is, in parts per million since the start of the run.",
+        examples=["50ppm"],
+    )
+    jumps: Annotated[tuple[JumpSpec, ...], parts()] = Field(
+        default=(), description="When it is set.", examples=[[{"at": "5s", "by": "100ms"}]]
+    )
+    random_jumps: Annotated[RandomJumpsSpec | None, given] = Field(
+        default=None,
+        description="It is set now and then.",
+        examples=[{"every": "10s", "most": "50ms"}],
+    )
+
+    @model_validator(mode="after")
+    def _jumps_in_order(self) -> ClockSpec:
+        for index in range(1, len(self.jumps)):
+            if self.jumps[index].at_ns < self.jumps[index - 1].at_ns:
+                raise Problem("it is before the jump above", ("jumps", index, "at"))
+        return self
+
+    def drift(self) -> Fraction:
+        """The drift as an exact fraction."""
+        return Fraction(self.drift_ppm) / 1_000_000

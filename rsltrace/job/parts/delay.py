@@ -1,0 +1,177 @@
+"""``delay:`` of a job: how long messages take, which are lost, and who is cut off when."""
+
+from __future__ import annotations
+
+from typing import Annotated, ClassVar
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.parts.distribution import DistributionSpec, named, number, shorthand
+from rsltrace.job.parts.names import check_glob, check_node_glob, check_service_glob
+from rsltrace.job.parts.node import check_path
+from rsltrace.job.parts.part import Part, check, given, parts, positive_time, text
+from rsltrace.job.parts.times import parse_time
+from rsltrace.job.reading.problems import Problem
+
+Probability = Annotated[float, check(number(0, 1))]
+
+
+class BurstSpec(Part):
+    """Loss in bursts, after Gilbert and Elliott: a good and a bad state, probabilities per message.
+
+    A burst lasts 1 / ``bad_to_good`` messages on average.
+    """
+
+    good_to_bad: Probability = Field(
+        description="Probability that a burst begins with a message.", examples=[0.01]
+    )
+    bad_to_good: Probability = Field(
+        description="Probability that a burst ends with a message.", examples=[0.2]
+    )
+    loss_bad: Probability = Field(
+        default=1.0, description="Probability of a loss in a burst.", examples=[0.9]
+    )
+    loss_good: Probability = Field(
+        default=0.0, description="Probability of a loss outside of bursts.", examples=[0.001]
+    )
+
+
+class DelaySpec(DistributionSpec):
+    """What happens to messages on their way. A plain time stands for ``{constant: time}``."""
+
+    TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns", "retransmit": "retransmit_ns"}
+    NEEDS_ONE: ClassVar[bool] = False
+
+    drop: Probability = Field(
+        default=0.0,
+        description="Probability that a message is lost. Where publisher and subscription are "
+        "reliable it is sent again, `retransmit` later.",
+        examples=[0.01],
+    )
+    burst: Annotated[BurstSpec | None, given] = Field(
+        default=None,
+        description="Loss in bursts (Gilbert-Elliott).",
+        examples=[{"good_to_bad": 0.01, "bad_to_good": 0.2}],
+    )
+    duplicate: Probability = Field(
+        default=0.0,
+        description="Probability that a message arrives twice.",
+        examples=[0.001],
+    )
+    keep_order: bool = Field(
+        default=True,
+        description="A message never overtakes an earlier one of its link, as in DDS.",
+        examples=[False],
+    )
+    retransmit_ns: Annotated[int, check(positive_time)] = Field(
+        default=10_000_000,
+        alias="retransmit",
+        description="What each loss costs where reliable messages are sent again.",
+        examples=["10ms"],
+    )
+
+
+class LinkSpec(DelaySpec):
+    """A delay for the links from some publishers to some subscriptions."""
+
+    topic: Annotated[str, check(text(check_glob))] = Field(
+        default="*", description="Topic, a glob.", examples=["/scan"]
+    )
+    sender: Annotated[str, check(text(check_node_glob))] = Field(
+        default="*",
+        alias="from",
+        description="Node of the publisher, a glob.",
+        examples=["/lidar"],
+    )
+    receiver: Annotated[str, check(text(check_node_glob))] = Field(
+        default="*", alias="to", description="Node of the subscription, a glob.", examples=["/slam"]
+    )
+
+
+class OutageSpec(Part):
+    """A topic, a service or a whole node is cut off for some time."""
+
+    TIMES: ClassVar[dict[str, str]] = {"from": "from_ns", "to": "to_ns"}
+
+    topic: Annotated[str | None, check(text(check_glob), optional=True)] = Field(
+        default=None, description="Topic that is cut off, a glob.", examples=["/scan"]
+    )
+    service: Annotated[str | None, check(text(check_service_glob), optional=True)] = Field(
+        default=None, description="Service that is cut off, a glob.", examples=["/set_mode"]
+    )
+    node: Annotated[str | None, check(text(check_node_glob), optional=True)] = Field(
+        default=None, description="Node that is cut off, a glob.", examples=["/lidar"]
+    )
+    from_ns: Annotated[int, check(parse_time)] = Field(
+        alias="from", description="Begin, since the start of the run.", examples=["10s"]
+    )
+    to_ns: Annotated[int, check(parse_time)] = Field(
+        alias="to", description="End, since the start of the run.", examples=["12s"]
+    )
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> OutageSpec:
+        if sum(name is not None for name in (self.topic, self.service, self.node)) != 1:
+            raise Problem("give one of topic, service or node")
+        if self.to_ns < self.from_ns:
+            raise Problem("the outage ends before it begins", ("to",))
+        if self.to_ns == self.from_ns:
+            raise Problem("the outage ends when it begins: 'to' has to be later", ("to",))
+        return self
+
+    @property
+    def what(self) -> tuple[str, str]:
+        """What is cut off: its kind, and its glob."""
+        for kind in ("topic", "service", "node"):
+            glob = getattr(self, kind)
+            if glob is not None:
+                return kind, glob
+        raise AssertionError("checked when it was made")
+
+
+class DelaysSpec(Part):
+    """Delays and losses. Of ``links`` the first that fits counts, then ``topics`` (an exact name
+    before globs, globs in order), then ``file``, then ``default``."""
+
+    MEANT: ClassVar[str] = "default"
+
+    default: Annotated[DelaySpec | None, shorthand("constant")] = Field(
+        default=None,
+        description="For every topic (except /rosout and /parameter_events) and service without a "
+        "model of its own.",
+        examples=["1ms"],
+    )
+    topics: Annotated[dict[str, DelaySpec], named("constant", check_glob)] = Field(
+        default_factory=dict,
+        description="By topic, a glob. Each link of a topic draws from a stream of its own.",
+        examples=[{"/scan": {"constant": "5ms"}}],
+    )
+    links: Annotated[tuple[LinkSpec, ...], parts()] = Field(
+        default=(),
+        description="From some publishers to some subscriptions.",
+        examples=[[{"topic": "/scan", "to": "/slam", "constant": "20ms"}]],
+    )
+    services: Annotated[dict[str, DelaySpec], named("constant", check_service_glob)] = Field(
+        default_factory=dict,
+        description="By service, a glob; for requests and responses alike.",
+        examples=[{"/set_mode": "2ms"}],
+    )
+    outages: Annotated[tuple[OutageSpec, ...], parts()] = Field(
+        default=(),
+        description="Who is cut off when. Best-effort messages are lost; reliable ones wait, as "
+        "many as the publisher's history holds.",
+        examples=[[{"node": "/lidar", "from": "10s", "to": "12s"}]],
+    )
+    file: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="A delay file of RSLCPP (CSV), with FIXED delays by topic.",
+        examples=["delays.csv"],
+    )
+
+    @model_validator(mode="after")
+    def _answered_once(self) -> DelaysSpec:
+        for name, model in self.services.items():
+            if model.duplicate:
+                place = ("services", name, "duplicate")
+                raise Problem("requests and responses of services never arrive twice", place)
+        return self

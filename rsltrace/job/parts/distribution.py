@@ -1,0 +1,377 @@
+"""How long something takes, as a job says it: for delays and for execution times."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from decimal import Decimal, InvalidOperation
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+
+from rsltrace.chance.distribution import LONGEST_NS
+from rsltrace.job.parts.node import check_path
+from rsltrace.job.parts.part import (
+    Part,
+    attach,
+    check,
+    from_file,
+    given,
+    items,
+    one_of,
+    positive_time,
+)
+from rsltrace.job.parts.times import TIME_SCHEMA, UNITS_NS, parse_time
+from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
+
+SAMPLE_UNITS = tuple(UNITS_NS)
+
+
+def parse_short_time(value: object) -> int:
+    """Return a time that something may take, in nanoseconds."""
+    return check_short(parse_time(value), getattr(value, "text", value))
+
+
+def check_short(time_ns: int, shown: object) -> int:
+    """Return ``time_ns`` unless it is longer than anything takes."""
+    if time_ns > LONGEST_NS:
+        raise ValueError(f"{shown} is too long: at most {LONGEST_NS // UNITS_NS['h']}h")
+    return time_ns
+
+
+attach(parse_short_time, schema=TIME_SCHEMA)
+
+
+def number(least: float, most: float | None = None, *, open_below: bool = False) -> Any:
+    """Return a check for a number within bounds (``open_below``: greater than ``least``)."""
+
+    def function(value: object) -> float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            raise Problem(f"expected a number, got {describe(value)}{_as_number(value)}")
+        low = value > least if open_below else value >= least
+        if not low or (most is not None and not value <= most) or value in (float("inf"),):
+            above = f"greater than {least:g}" if open_below else f"at least {least:g}"
+            below = f" and at most {most:g}" if most is not None else ""
+            raise Problem(f"must be {above}{below}, got {getattr(value, 'text', value)}")
+        return float(value)
+
+    schema: dict[str, object] = {"type": "number"}
+    schema["exclusiveMinimum" if open_below else "minimum"] = least
+    if most is not None:
+        schema["maximum"] = most
+    return attach(function, schema=schema)
+
+
+def _as_number(value: object) -> str:
+    """Say how to write a number that was written in another way: ``10%``, ``"0.1"``."""
+    if not isinstance(value, str):
+        return ""
+    try:
+        number = Decimal(value.strip().removesuffix("%"))
+    except InvalidOperation:
+        return ""
+    percent = value.strip().endswith("%") and number.is_finite()
+    return f"; write {number / 100:f}" if percent else "; take the quotes away"
+
+
+def shorthand(key: str) -> BeforeValidator:
+    """Let a plain time stand for ``{key: time}``."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None and from_file(info):
+            raise Problem("no value is given: give one, or leave the key out")
+        return expand(value, key)
+
+    return BeforeValidator(attach(validate, shorthand=key))
+
+
+def expand(value: object, key: str) -> object:
+    """Return ``{key: value}`` for a plain time, anything else as it is."""
+    plain = isinstance(value, (str, int, float)) and not isinstance(value, bool)
+    return {key: value} if plain else value
+
+
+def named(key: str, rule: Callable[[str], None]) -> BeforeValidator:
+    """Prepare a mapping of names to parts for pydantic; a plain time stands for ``{key: time}``."""
+
+    def validate(values: object) -> object:
+        if not isinstance(values, dict):
+            raise Problem(f"expected a mapping of names to models, got {describe(values)}")
+        problems = []
+        for name in values:
+            try:
+                if not isinstance(name, str):
+                    raise Problem(f"expected a name, got {describe(name)}")
+                rule(name)
+            except ValueError as error:
+                problems.append(Problem(str(error), (str(name),), at_key=True))
+        if problems:
+            raise Problems(problems)
+        return {name: expand(value, key) for name, value in values.items()}
+
+    names = {"pattern": rule.pattern}  # type: ignore[attr-defined]
+    return BeforeValidator(attach(validate, value_shorthand=key, names=names))
+
+
+class UniformSpec(Part):
+    """Evenly between two bounds."""
+
+    LISTED: ClassVar[tuple[str, ...]] = ("min", "max")
+    TIMES: ClassVar[dict[str, str]] = {"min": "min_ns", "max": "max_ns"}
+
+    min_ns: Annotated[int, check(parse_short_time)] = Field(
+        alias="min", description="Shortest time.", examples=["1ms"]
+    )
+    max_ns: Annotated[int, check(parse_short_time)] = Field(
+        alias="max", description="Longest time.", examples=["3ms"]
+    )
+
+    @model_validator(mode="after")
+    def _in_order(self) -> UniformSpec:
+        if self.max_ns < self.min_ns:
+            raise Problem("max is less than min", ("max",))
+        return self
+
+
+class NormalSpec(Part):
+    """Normal, truncated at zero: negative values are drawn again."""
+
+    LISTED: ClassVar[tuple[str, ...]] = ("mean", "sd")
+    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns"}
+
+    mean_ns: Annotated[int, check(parse_time)] = Field(
+        alias="mean", description="Mean before the truncation.", examples=["5ms"]
+    )
+    sd_ns: Annotated[int, check(parse_time)] = Field(
+        alias="sd", description="Standard deviation before the truncation.", examples=["1ms"]
+    )
+
+
+class LognormalSpec(Part):
+    """Lognormal: by mean and standard deviation, or by median and sigma of the logarithm."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("median", "sigma"))
+    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "median": "median_ns"}
+
+    mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
+    )
+    sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
+    )
+    median_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="median", description="Median; goes with `sigma`.", examples=["5ms"]
+    )
+    sigma: Annotated[float | None, check(number(0, 10, open_below=True), optional=True)] = Field(
+        default=None,
+        description="Standard deviation of the natural logarithm.",
+        examples=[0.5],
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> LognormalSpec:
+        _either(self, *self.ALTERNATIVES)
+        return self
+
+
+class GammaSpec(Part):
+    """Gamma: by mean and standard deviation, or by shape and scale."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("mean", "sd"), ("shape", "scale"))
+    TIMES: ClassVar[dict[str, str]] = {"mean": "mean_ns", "sd": "sd_ns", "scale": "scale_ns"}
+
+    mean_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="mean", description="Mean; goes with `sd`.", examples=["5ms"]
+    )
+    sd_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="sd", description="Standard deviation.", examples=["2ms"]
+    )
+    shape: Annotated[float | None, check(number(0, 1e9, open_below=True), optional=True)] = Field(
+        default=None, description="Shape; goes with `scale`.", examples=[2.0]
+    )
+    scale_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None, alias="scale", description="Scale.", examples=["1ms"]
+    )
+
+    @model_validator(mode="after")
+    def _one_way(self) -> GammaSpec:
+        _either(self, *self.ALTERNATIVES)
+        return self
+
+
+class SamplesSpec(Part):
+    """Measured values, each as likely as the others: listed here, or in a file."""
+
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("values",), ("file", "unit"))
+    MEANT: ClassVar[str] = "values"
+    MEANT_LIST: ClassVar[bool] = True
+
+    values_ns: Annotated[tuple[int, ...] | None, check(items(parse_short_time), optional=True)] = (
+        Field(
+            default=None, alias="values", description="The values.", examples=[["4.8ms", "5.1ms"]]
+        )
+    )
+    file: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="A text file with one value per line, rounded to nanoseconds; empty lines and "
+        "# comments are skipped.",
+        examples=["delays.txt"],
+    )
+    unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
+        default="s",
+        description="Unit of the values in the file that have none.",
+        examples=["ms"],
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SamplesSpec:
+        if (self.values_ns is None) == (self.file is None):
+            raise Problem("give either values or a file")
+        if self.values_ns == ():
+            raise Problem("an empty list has nothing to draw from", ("values",))
+        return self
+
+
+def _check_point(value: object) -> tuple[int, int]:
+    if not isinstance(value, (list, tuple)) or len(value) != 2:
+        raise Problem("expected a pair: [time since the start, value]")
+    return parse_time(value[0]), parse_short_time(value[1])
+
+
+attach(_check_point, schema={"type": "array", "items": TIME_SCHEMA, "minItems": 2, "maxItems": 2})
+
+
+class SeriesSpec(Part):
+    """A value that changes over time: listed here, or in a file."""
+
+    OF_TIMES: ClassVar[tuple[str, ...]] = ("points",)
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = (("points",), ("file", "unit"))
+    MEANT: ClassVar[str] = "points"
+    MEANT_LIST: ClassVar[bool] = True
+
+    points: Annotated[
+        tuple[tuple[int, int], ...] | None, check(items(_check_point), optional=True)
+    ] = Field(
+        default=None,
+        description="Pairs [time since the start of the run, value], in order of time.",
+        examples=[[["0s", "1ms"], ["60s", "20ms"]]],
+    )
+    file: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="A CSV file with two columns: time since the start, value. A first line "
+        "without numbers is a header.",
+        examples=["link.csv"],
+    )
+    unit: Annotated[str, check(one_of(*SAMPLE_UNITS))] = Field(
+        default="s", description="Unit of the numbers in the file that have none.", examples=["s"]
+    )
+    steps: bool = Field(
+        default=False,
+        description="Hold each value until the next point instead of interpolating.",
+        examples=[True],
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> SeriesSpec:
+        if (self.points is None) == (self.file is None):
+            raise Problem("give either points or a file")
+        if self.points is not None:
+            check_series(self.points)
+        return self
+
+
+def check_series(points: tuple[tuple[int, int], ...]) -> None:
+    """Raise ``Problem`` unless there are points, in order of time."""
+    if not points:
+        raise Problem("a series needs at least one point", ("points",))
+    for index in range(1, len(points)):
+        if points[index][0] <= points[index - 1][0]:
+            raise Problem("its time is not after that of the point before", ("points", index))
+
+
+class DistributionSpec(Part):
+    """A time: constant, random, or changing. Exactly one of the keys."""
+
+    TIMES: ClassVar[dict[str, str]] = {"constant": "constant_ns"}
+
+    constant_ns: Annotated[int | None, check(parse_short_time, optional=True)] = Field(
+        default=None, alias="constant", description="Always this.", examples=["5ms"]
+    )
+    uniform: Annotated[UniformSpec | None, given] = Field(
+        default=None,
+        description="Evenly between two bounds.",
+        examples=[{"min": "1ms", "max": "3ms"}],
+    )
+    normal: Annotated[NormalSpec | None, given] = Field(
+        default=None,
+        description="Normal, truncated at zero.",
+        examples=[{"mean": "5ms", "sd": "1ms"}],
+    )
+    lognormal: Annotated[LognormalSpec | None, given] = Field(
+        default=None,
+        description="Lognormal: a long tail.",
+        examples=[{"median": "5ms", "sigma": 0.5}],
+    )
+    gamma: Annotated[GammaSpec | None, given] = Field(
+        default=None, description="Gamma.", examples=[{"mean": "5ms", "sd": "2ms"}]
+    )
+    samples: Annotated[SamplesSpec | None, given] = Field(
+        default=None,
+        description="One of some measured values.",
+        examples=[{"file": "delays.txt", "unit": "ms"}],
+    )
+    series: Annotated[SeriesSpec | None, given] = Field(
+        default=None,
+        description="A value that changes over time.",
+        examples=[{"points": [["0s", "1ms"], ["60s", "20ms"]]}],
+    )
+
+    KINDS: ClassVar[tuple[str, ...]] = (
+        "constant",
+        "uniform",
+        "normal",
+        "lognormal",
+        "gamma",
+        "samples",
+        "series",
+    )
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((kind,) for kind in KINDS)
+    NEEDS_ONE: ClassVar[bool] = True
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> DistributionSpec:
+        given = self.kinds()
+        if len(given) > 1:
+            raise Problem(f"give one of {' and '.join(given)}, not both", (given[1],), at_key=True)
+        if not given and self.NEEDS_ONE:
+            raise Problem(f"give one of {', '.join(self.KINDS)}")
+        return self
+
+    def kinds(self) -> list[str]:
+        """Return which of ``KINDS`` are given."""
+        values = {**vars(self), "constant": self.constant_ns}
+        return [kind for kind in self.KINDS if values[kind] is not None]
+
+
+def _either(part: Part, one: tuple[str, ...], other: tuple[str, ...]) -> None:
+    values = {key: getattr(part, part.TIMES.get(key, key)) for key in (*one, *other)}
+    given = {key for key, value in values.items() if value is not None}
+    if given not in (set(one), set(other)):
+        raise Problem(f"give either {' and '.join(one)}, or {' and '.join(other)}")
+
+
+def files_of(value: object, loc: Loc = ()) -> Iterator[tuple[Loc, str]]:
+    """Yield (place, path) of every ``file`` in a part, however deep."""
+    if isinstance(value, Part):
+        for name, field in type(value).model_fields.items():
+            inner = getattr(value, name)
+            place = (*loc, field.alias or name)
+            if name == "file" and inner is not None:
+                yield place, inner
+            else:
+                yield from files_of(inner, place)
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from files_of(inner, (*loc, key))
+    elif isinstance(value, tuple):
+        for index, inner in enumerate(value):
+            yield from files_of(inner, (*loc, index))

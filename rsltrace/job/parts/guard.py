@@ -1,0 +1,218 @@
+"""``guard:`` — what is done about each source of nondeterminism, for a job or for one node."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, ValidationInfo
+
+from rsltrace.job.parts.part import Part, attach, check, flag, from_file, items, text
+from rsltrace.job.reading.problems import Problem, as_flag, describe
+from rsltrace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
+
+ModeName = Literal["virtual", "record", "warn", "error", "allow"]
+
+
+def _module_glob(value: str) -> None:
+    if not value.replace("*", "a").replace("?", "a").replace(".", "a").isidentifier():
+        raise Problem(f"expected the name of a module, or a glob like my_robot.*, got {value!r}")
+
+
+class SourceSpec(Part):
+    """What is done about one source, and the modules (globs) that may use it all the same."""
+
+    mode: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="`virtual`: the run makes the answer; `record`: the real one is kept in the "
+        "trace; `warn`: the call is a finding; `error`: it ends the run; `allow`: nothing.",
+        examples=["warn"],
+    )
+    allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = Field(
+        default=(),
+        description="Modules, globs, that may use the source all the same.",
+        examples=[["my_robot.logging", "rerun.*"]],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(self, *, mode: ModeName | None = None, allow: Sequence[str] = ()) -> None: ...
+
+
+def _source(source: Source) -> BeforeValidator:
+    """Prepare one source: its mode as plain text, or a mapping with its mode and exemptions."""
+    valid = [mode.value for mode in MODES[source]]
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None:
+            if from_file(info):
+                raise Problem("no value is given: give one, or leave the key out")
+            return None
+        given = value.get("mode") if isinstance(value, dict) else getattr(value, "mode", value)
+        if given is not None and given not in valid:
+            hint = ""
+            if given in list(Mode):
+                hint = f"; the answers of this source cannot be made {given!r}"
+                if given == Mode.RECORD:
+                    hint = "; what this source answers cannot be recorded"
+            place = ("mode",) if isinstance(value, dict) else ()
+            raise Problem(f"expected one of {', '.join(valid)}, got {describe(given)}{hint}", place)
+        return {"mode": value} if isinstance(value, str) else value
+
+    mode = {"enum": valid}
+    allow = {"type": "array", "items": {"type": "string"}}
+    whole = {
+        "type": "object",
+        "properties": {"mode": mode, "allow": allow},
+        "additionalProperties": False,
+    }
+    attach(validate, schema={"anyOf": [mode, whole]})
+    return BeforeValidator(validate)
+
+
+def _about(source: Source, what: str) -> Any:
+    default = DEFAULT_MODES[source].value
+    return Field(
+        default=None,
+        description=f"{what} Unless said otherwise: `{default}`.",
+        examples=[MODES[source][0].value, {"mode": "error", "allow": ["my_robot.logging"]}],
+    )
+
+
+def _state(value: object) -> object:
+    if value is True or value is False or value == "record":
+        return value
+    raise Problem(f"expected true, false or record, got {describe(value)}")
+
+
+attach(_state, schema={"enum": [True, False, "record"]})
+
+
+class GuardSpec(Part):
+    """``guard:`` of a job, or of a node, where it overrides the job's key by key.
+
+    ``enabled`` false (``guard: false``) leaves everything as it is. ``state`` hashes a node's state
+    after each callback; ``record`` keeps its attributes, too. A source that is None keeps what the
+    job says, or the default.
+    """
+
+    enabled: Annotated[bool, check(flag)] = Field(
+        default=True,
+        description="`false` leaves every source as it is; `guard: false` is short for it.",
+        examples=[False],
+    )
+    pin: Annotated[bool | None, check(flag, optional=True)] = Field(
+        default=None,
+        description="Whether `rsltrace record` starts its process once more with a fixed hash "
+        "seed, fixed addresses, in UTC, in C.UTF-8, with one thread per numerical library. For "
+        "the job as a whole only. Unless said otherwise: `true`.",
+        examples=[False],
+    )
+    state: Annotated[bool | Literal["record"] | None, check(_state, optional=True)] = Field(
+        default=None,
+        description="Whether a node's state is hashed after each of its callbacks; `record` keeps "
+        "its attributes in the trace, too.",
+        examples=[True, "record"],
+    )
+    clock: Annotated[SourceSpec | None, _source(Source.CLOCK)] = _about(
+        Source.CLOCK, "Wall clocks: `time.time`, `datetime.now` and the like."
+    )
+    random: Annotated[SourceSpec | None, _source(Source.RANDOM)] = _about(
+        Source.RANDOM, "Random numbers: `random`, `numpy.random`, `os.urandom`, `uuid4`, `secrets`."
+    )
+    directory: Annotated[SourceSpec | None, _source(Source.DIRECTORY)] = _about(
+        Source.DIRECTORY, "The order of directory listings."
+    )
+    file: Annotated[SourceSpec | None, _source(Source.FILE)] = _about(
+        Source.FILE, "What files hold."
+    )
+    environment: Annotated[SourceSpec | None, _source(Source.ENVIRONMENT)] = _about(
+        Source.ENVIRONMENT, "Environment variables."
+    )
+    thread: Annotated[SourceSpec | None, _source(Source.THREAD)] = _about(
+        Source.THREAD, "Threads that are started."
+    )
+    process: Annotated[SourceSpec | None, _source(Source.PROCESS)] = _about(
+        Source.PROCESS, "Processes that are started."
+    )
+    socket: Annotated[SourceSpec | None, _source(Source.SOCKET)] = _about(Source.SOCKET, "Sockets.")
+    address: Annotated[SourceSpec | None, _source(Source.ADDRESS)] = _about(
+        Source.ADDRESS, "Addresses of objects: `id`, the default `hash` and `repr`."
+    )
+    order: Annotated[SourceSpec | None, _source(Source.ORDER)] = _about(
+        Source.ORDER, "The order of sets, which depends on hash seeds."
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            enabled: bool = True,
+            pin: bool | None = None,
+            state: bool | Literal["record"] | None = None,
+            clock: SourceSpec | dict[str, Any] | ModeName | None = None,
+            random: SourceSpec | dict[str, Any] | ModeName | None = None,
+            directory: SourceSpec | dict[str, Any] | ModeName | None = None,
+            file: SourceSpec | dict[str, Any] | ModeName | None = None,
+            environment: SourceSpec | dict[str, Any] | ModeName | None = None,
+            thread: SourceSpec | dict[str, Any] | ModeName | None = None,
+            process: SourceSpec | dict[str, Any] | ModeName | None = None,
+            socket: SourceSpec | dict[str, Any] | ModeName | None = None,
+            address: SourceSpec | dict[str, Any] | ModeName | None = None,
+            order: SourceSpec | dict[str, Any] | ModeName | None = None,
+        ) -> None: ...
+
+    @property
+    def pins(self) -> bool:
+        """Whether the process that records the job is pinned."""
+        return self.enabled and self.pin is not False
+
+
+def guard_part() -> BeforeValidator:
+    """Prepare a ``guard:`` for pydantic; true and false stand for ``{enabled: …}``."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None and from_file(info):
+            raise Problem("no value is given: give one, or leave the key out")
+        if isinstance(value, str):
+            hint = as_flag(value)
+            raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
+        return {"enabled": value} if isinstance(value, bool) else value
+
+    attach(validate, shorthand="enabled")
+    return BeforeValidator(validate)
+
+
+def resolved_guard(*guards: GuardSpec) -> dict[str, Any]:
+    """Return what ``policy_of`` says, as JSON-compatible values."""
+    policy = policy_of(*guards)
+    values: dict[str, Any] = {
+        source.value: {"mode": mode.value, "allow": list(policy.allowed.get(source, ()))}
+        for source, mode in policy.modes.items()
+    }
+    return {
+        "enabled": guards[0].enabled,
+        "pin": guards[0].pins,
+        "state": policy.state or "false",
+        **values,
+    }
+
+
+def policy_of(*guards: GuardSpec) -> Policy:
+    """Return what is done in the end, where a later ``guard:`` overrides an earlier one."""
+    modes = dict(DEFAULT_MODES)
+    allowed: dict[Source, tuple[str, ...]] = {}
+    state = ""
+    for guard in guards:
+        if not guard.enabled:
+            modes = dict.fromkeys(Source, Mode.ALLOW)
+        if guard.state is not None:
+            state = "record" if guard.state == "record" else "true" if guard.state else ""
+        for source in Source:
+            spec: SourceSpec | None = getattr(guard, source.value)
+            if spec is not None:
+                if spec.mode is not None:
+                    modes[source] = Mode(spec.mode)
+                allowed[source] = allowed.get(source, ()) + spec.allow
+    return Policy(modes, allowed, state)

@@ -1,0 +1,308 @@
+"""One entry of ``nodes:``: what to construct, and how it is named, configured and connected."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.parts.guard import GuardSpec, guard_part
+from rsltrace.job.parts.names import (
+    check_executable,
+    check_namespace,
+    check_node_name,
+    check_remap_from,
+    check_remap_to,
+    check_target,
+)
+from rsltrace.job.parts.parameters import ParameterValue, flatten_parameters
+from rsltrace.job.parts.part import Part, attach, check, items, one_of, text
+from rsltrace.job.parts.times import ExactFloat
+from rsltrace.job.reading.problems import Problem, Problems, describe
+from rsltrace.job.reading.tree import FileText, from_its_folder
+
+Target = str | Callable[..., object]
+"""``module:attribute`` as text, or (in Python) the class or function itself."""
+
+
+def target_text(target: Target) -> str:
+    """Return ``module:qualname`` of a target."""
+    if isinstance(target, str):
+        return target
+    kind = type(target)
+    module = getattr(target, "__module__", kind.__module__)
+    return f"{module}:{getattr(target, '__qualname__', kind.__qualname__)}"
+
+
+def check_callable_target(value: object) -> Target:
+    """Check a class or function, given itself or as ``module:attribute``."""
+    if callable(value):
+        return value
+    if not isinstance(value, str):
+        raise Problem(f"expected module:Class or module:function, got {describe(value)}")
+    return text(check_target)(value)
+
+
+def check_path(value: object) -> str:
+    """Check a path given as text or (in Python) as a path object."""
+    if isinstance(value, os.PathLike):
+        value = os.fspath(value)
+    if isinstance(value, str) and not value:
+        raise Problem("a path cannot be empty")
+    text()(value)
+    return from_its_folder(value)  # type: ignore[arg-type]  # text, as just checked
+
+
+attach(check_path, schema={"type": "string", "minLength": 1})
+attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]
+
+
+def names_to_names(
+    value: object, rule_from: Callable[[str], None], rule_to: Callable[[str], None]
+) -> dict[str, str]:
+    """Check a mapping of names to names, each side by a rule of its own."""
+    if not isinstance(value, dict):
+        raise Problem(f"expected a mapping of names to names (from: to), got {describe(value)}")
+    problems: list[Problem] = []
+    for name, to in value.items():
+        for rule, side, at_key in ((rule_from, name, True), (rule_to, to, False)):
+            try:
+                text(rule)(side)
+            except ValueError as error:
+                problems.append(Problem(str(error), (str(name),), at_key=at_key))
+    if problems:
+        raise Problems(problems)
+    return {str(name): str(to) for name, to in value.items()}
+
+
+def _check_remappings(value: object) -> dict[str, str]:
+    return names_to_names(value, check_remap_from, check_remap_to)
+
+
+def _check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:
+    if isinstance(value, (list, tuple)):
+        return _check_words(value)
+    if not isinstance(value, dict):
+        raise Problem(
+            "expected a mapping of argument names to values (node:) or a list of command-line "
+            f"words (main:, executable:), got {describe(value)}"
+        )
+    for name in value:
+        if not isinstance(name, str) or not name.isidentifier():
+            raise Problem(f"{name!r} cannot be the name of an argument", (str(name),), at_key=True)
+    return {name: _plain_floats(item) for name, item in value.items()}
+
+
+def _check_words(values: list[object] | tuple[object, ...]) -> tuple[str, ...]:
+    """Check command-line words; a number stands for its digits, as on a command line."""
+    problems = [
+        Problem(f"expected a word of a command line, got {describe(value)}", (index,))
+        for index, value in enumerate(values)
+        if isinstance(value, bool) or not isinstance(value, (str, int, float))
+    ]
+    if problems:
+        raise Problems(problems)
+    return tuple(str(getattr(value, "text", value)) for value in values)
+
+
+attach(
+    _check_arguments,
+    schema={
+        "anyOf": [
+            {"type": "object"},
+            {"type": "array", "items": {"type": ["string", "number"]}},
+        ]
+    },
+)
+
+
+def _check_executable(value: object) -> str:
+    return text(check_executable)(value)
+
+
+attach(_check_executable, schema={"type": "string", "pattern": check_executable.pattern})  # type: ignore[attr-defined]
+
+
+def _plain_floats(value: object) -> object:
+    # What user code gets must not carry types of ours.
+    if isinstance(value, ExactFloat):
+        return float(value)
+    if isinstance(value, FileText):
+        return str(value)
+    if type(value) is dict:
+        return {key: _plain_floats(item) for key, item in value.items()}
+    if type(value) is list:
+        return [_plain_floats(item) for item in value]
+    return value
+
+
+_KINDS = ("node", "main", "executable")
+"""What an entry may be."""
+
+_NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
+attach(
+    _check_remappings,
+    schema={
+        "type": "object",
+        "propertyNames": _NAME,
+        "additionalProperties": {"type": "string", "pattern": check_remap_to.pattern},  # type: ignore[attr-defined]
+    },
+)
+attach(
+    flatten_parameters,
+    schema={
+        "type": "object",
+        "propertyNames": {"not": {"const": "ros__parameters"}},
+        "additionalProperties": {"$ref": "#/$defs/Parameter"},
+    },
+)
+
+
+class NodeSpec(Part):
+    """One entry of ``nodes:``: one of ``node``, ``main`` and ``executable``.
+
+    ``node`` is a Node subclass or a function returning a node or a list of nodes, ``main`` a
+    function that initializes rclpy, makes nodes and spins, ``executable`` (``package/name``) an
+    installed one. ``arguments`` are keyword arguments of a ``node``, and command-line words (a
+    list) of the other two. ``parameters`` are flat (dotted names); paths are relative to the job's
+    folder.
+    """
+
+    ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
+
+    @staticmethod
+    def meant_key(word: str) -> str:
+        """Return the key that text in place of an entry was meant for."""
+        return "executable" if "/" in word and ":" not in word else "node"
+
+    node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="What to construct: `module:Class`, a Node subclass, or `module:function`, "
+        "which returns a node or a list of nodes. Looked for in `search_path`.",
+        examples=["my_robot.ekf:EkfNode"],
+    )
+    main: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a function that initializes rclpy, makes nodes and spins, "
+        "as `module:function`.",
+        examples=["my_robot.talker:main"],
+    )
+    executable: Annotated[str | None, check(_check_executable, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: an installed Python executable, as `ros2 run` would start "
+        "it, as `package/name`.",
+        examples=["demo_nodes_py/talker"],
+    )
+    name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
+        default=None,
+        description="Name of the node, in place of the one it gives itself.",
+        examples=["ekf"],
+    )
+    namespace: Annotated[str | None, check(text(check_namespace), optional=True)] = Field(
+        default=None, description="Namespace of the node.", examples=["/robot1"]
+    )
+    parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
+        default_factory=dict,
+        description="Its ROS parameters; `a: {b: 1}` and `a.b: 1` are the same. They win over "
+        "`parameter_files`.",
+        examples=[{"frequency": 50.0, "noise": {"x": 0.1, "y": 0.1}}],
+    )
+    parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = Field(
+        default=(),
+        description="ROS parameter files, wildcards and all; later ones win.",
+        examples=[["ekf.yaml"]],
+    )
+    remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(
+        default_factory=dict,
+        description="Names of topics and services that become others, as in `--ros-args -r`.",
+        examples=[{"odom": "/husky/odom"}],
+    )
+    arguments: Annotated[dict[str, Any] | tuple[str, ...], check(_check_arguments)] = Field(
+        default_factory=dict,
+        description="Keyword arguments of a `node`; a list of command-line words of a `main` or "
+        "an `executable`.",
+        examples=[{"robots": 3}, ["--rate", 10]],
+    )
+    on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
+        default="stop",
+        description="What happens when a callback raises: `stop` ends the run (exit status 3); "
+        "`log` writes exception and traceback to the trace, logs an error, and goes on. A "
+        "constructor that raises always ends the run.",
+        examples=["log"],
+    )
+    guard: Annotated[GuardSpec | None, guard_part()] = Field(
+        default=None,
+        description="What is done about sources of nondeterminism in this node, where that differs "
+        "from the job's `guard`.",
+        examples=[{"random": "allow"}],
+    )
+    # Not a key of a job file: where the entry came from, if not from the job itself.
+    origin: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None, exclude=True, repr=False
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            node: Target | None = None,
+            main: Target | None = None,
+            executable: str | None = None,
+            name: str | None = None,
+            namespace: str | None = None,
+            parameters: dict[str, Any] = ...,
+            parameter_files: list[str | os.PathLike[str]] | tuple[str | os.PathLike[str], ...] = (),
+            remappings: dict[str, str] = ...,
+            arguments: dict[str, Any] | Sequence[str] = ...,
+            on_exception: Literal["stop", "log"] = "stop",
+            origin: str | None = None,
+            guard: GuardSpec | dict[str, Any] | bool | None = None,
+        ) -> None: ...
+
+    @model_validator(mode="after")
+    def _check_kind(self) -> NodeSpec:
+        kinds = [name for name in _KINDS if getattr(self, name) is not None]
+        if not kinds:
+            raise Problem("missing key: give one of 'node', 'main' and 'executable'")
+        if len(kinds) > 1:
+            raise Problem(
+                f"'{kinds[0]}' says what to run already: give only one of 'node', 'main' and "
+                "'executable'",
+                (kinds[1],),
+                at_key=True,
+            )
+        if self.guard is not None and self.guard.pin is not None:
+            raise Problem(
+                "'pin' is for the process that all nodes share: write it in the job's own 'guard:'",
+                ("guard", "pin"),
+            )
+        if self.node is not None and isinstance(self.arguments, tuple):
+            raise Problem(
+                "a node takes arguments by name (a mapping); a list of command-line words is for "
+                "'main' and 'executable'",
+                ("arguments",),
+            )
+        if self.node is None and isinstance(self.arguments, dict) and self.arguments:
+            raise Problem(
+                f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
+                ("arguments",),
+            )
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Which of ``node``, ``main`` and ``executable`` the entry is."""
+        return next(name for name in _KINDS if getattr(self, name) is not None)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """The other two of ``node``, ``main`` and ``executable``."""
+        return tuple(name for name in _KINDS if name != self.kind)
+
+    @property
+    def target(self) -> str:
+        """What is run: ``module:attribute``, or ``package/name`` of an executable."""
+        return target_text(getattr(self, self.kind))

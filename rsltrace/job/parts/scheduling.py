@@ -1,0 +1,181 @@
+"""``policy:``, ``executors:`` and ``execution:`` of a job: what runs when, where, and how long."""
+
+from __future__ import annotations
+
+import json
+from typing import Annotated, Any, ClassVar
+
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+
+from rsltrace.job.parts.distribution import DistributionSpec, named, shorthand
+from rsltrace.job.parts.names import check_node_glob
+from rsltrace.job.parts.node import Target, check_callable_target, check_path
+from rsltrace.job.parts.part import (
+    Part,
+    attach,
+    check,
+    from_file,
+    items,
+    one_of,
+    parts,
+    text,
+    whole,
+)
+from rsltrace.job.reading.problems import Problem, describe, meant_by, nearest
+
+ORDERS = ("fifo", "rate_monotonic", "permutation")
+PRIORITY_MAX = 2**31 - 1
+
+NodeGlob = Annotated[str, check(text(check_node_glob))]
+NameGlob = Annotated[str | None, check(text(), optional=True)]
+
+
+class PriorityRuleSpec(Part):
+    """A priority for a node, for one of its entities, or for a whole callback group."""
+
+    priority: Annotated[int, check(whole(-PRIORITY_MAX, PRIORITY_MAX))] = Field(
+        description="Higher runs first; what no rule fits has 0.", examples=[10]
+    )
+    node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/controller"])
+    entity: NameGlob = Field(
+        default=None,
+        description="Topic, service, or name of a timer's callback, a glob.",
+        examples=["/scan", "Controller.on_timer"],
+    )
+    group_of: NameGlob = Field(
+        default=None,
+        description="Everything in the callback group of this entity, a glob.",
+        examples=["/scan"],
+    )
+
+    @model_validator(mode="after")
+    def _not_both(self) -> PriorityRuleSpec:
+        if self.entity is not None and self.group_of is not None:
+            raise Problem("give entity or group_of, not both", ("group_of",), at_key=True)
+        return self
+
+
+class PolicySpec(Part):
+    """Which of the callbacks that are ready runs next. Exactly one of the keys; a word alone is an
+    ``order``."""
+
+    ONE_OF: ClassVar[tuple[str, ...]] = ("order", "priority", "recorded", "function")
+    ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((key,) for key in ONE_OF)
+
+    order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
+        default=None,
+        description="`fifo` (first come, first served; timers last), `rate_monotonic` (shortest "
+        "period first: of the timer, or of the node's fastest timer) or `permutation` (what is "
+        "ready at one instant in an order that the seed decides).",
+        examples=["rate_monotonic"],
+    )
+    priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts()] = Field(
+        default=None,
+        description="Highest priority first; the first rule that fits counts.",
+        examples=[[{"node": "/controller", "priority": 10}]],
+    )
+    recorded: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="A trace whose order of events is followed exactly.",
+        examples=["run1.mcap"],
+    )
+    function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="A class of your own, called without arguments: see docs/policies.md.",
+        examples=["my_robot.policy:LongestQueue"],
+    )
+
+    @model_validator(mode="after")
+    def _one(self) -> PolicySpec:
+        given = [key for key in self.ONE_OF if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+        return self
+
+
+class ExecutorSpec(Part):
+    """A simulated executor: so many workers for some nodes."""
+
+    nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
+        default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]
+    )
+    workers: Annotated[int, check(whole(1, 1024))] = Field(
+        default=1,
+        description="Callbacks it can run at once; 1 is a single-threaded executor.",
+        examples=[4],
+    )
+
+
+class EntityExecutionSpec(DistributionSpec):
+    """How long the callbacks of some entities of some nodes take."""
+
+    node: NodeGlob = Field(default="*", description="Node, a glob.", examples=["/detector"])
+    entity: Annotated[str, check(text())] = Field(
+        description="Topic, service, or name of a timer's callback, a glob.", examples=["/image"]
+    )
+
+
+class ExecutionSpec(Part):
+    """How long callbacks take. Of ``entities`` the first that fits counts, then ``nodes``, then
+    ``default``."""
+
+    MEANT: ClassVar[str] = "default"
+
+    default: Annotated[DistributionSpec | None, shorthand("constant")] = Field(
+        default=None, description="For every callback without a time of its own.", examples=["1ms"]
+    )
+    nodes: Annotated[dict[str, DistributionSpec], named("constant", check_node_glob)] = Field(
+        default_factory=dict,
+        description="By node, a glob.",
+        examples=[{"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}],
+    )
+    entities: Annotated[tuple[EntityExecutionSpec, ...], parts()] = Field(
+        default=(),
+        description="By entity of a node.",
+        examples=[[{"node": "/detector", "entity": "/image", "constant": "50ms"}]],
+    )
+
+
+def policy_part() -> BeforeValidator:
+    """Let a word stand for ``{order: word}``."""
+
+    def validate(value: object, info: ValidationInfo) -> object:
+        if value is None and from_file(info):
+            raise Problem("no value is given: give one, or leave the key out")
+        if isinstance(value, str) and value in PolicySpec.ONE_OF:
+            example = PolicySpec.model_fields[value].examples or [None]
+            shown = json.dumps({value: example[0]}).replace('"', "")
+            raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
+        if isinstance(value, str) and value not in ORDERS:
+            word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
+            near = meant_by(word, names) or nearest(word, names)
+            hint = f"; did you mean {near}?" if near else ""
+            raise Problem(
+                f"expected {' or '.join(ORDERS)}, or a mapping with "
+                f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
+            )
+        return {"order": value} if isinstance(value, str) else value
+
+    return BeforeValidator(attach(validate, shorthand="order"))
+
+
+def executors_part() -> BeforeValidator:
+    """Let ``single_threaded`` and ``per_node`` stand for the lists they mean."""
+    words: dict[str, list[dict[str, Any]]] = {
+        "single_threaded": [{"nodes": ["*"], "workers": 1}],
+        "per_node": [],
+    }
+
+    def validate(value: object) -> object:
+        if isinstance(value, str) and value in words:
+            value = words[value]
+        if not isinstance(value, (list, tuple)):
+            hint = ""
+            if isinstance(value, str) and value.startswith("multi"):
+                hint = "; write [{workers: 4}]"
+            raise Problem(
+                f"expected {' or '.join(words)} or a list of executors, got {describe(value)}{hint}"
+            )
+        return tuple(value)
+
+    return BeforeValidator(attach(validate, words=tuple(words)))

@@ -1,0 +1,1 @@
+"""From job files to models, with file, line and column for every mistake."""

@@ -1,0 +1,201 @@
+"""From a job file to a ``Job``: every mistake becomes an error with file, line and column."""
+
+from __future__ import annotations
+
+import codecs
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from rsltrace.errors import JobError
+from rsltrace.job.documents.keys import file_fields, keys_with
+from rsltrace.job.job import Job
+from rsltrace.job.parts.part import FROM_FILE
+from rsltrace.job.reading.compose import Composition, compose
+from rsltrace.job.reading.problems import Problem, format_loc, nearest, problems_of, unknown_key
+from rsltrace.job.reading.tree import Item, Place, YamlSource, place_at, plain
+from rsltrace.job.reading.yaml_source import Mark, parse_yaml
+
+Overrides = Sequence["str | tuple[str, str]"]
+
+FREE_PREFIX = "x-"
+"""Keys of a job that begin so mean nothing: a place for YAML anchors, as in other formats."""
+
+SIZE_MAX = 4 << 20
+"""A job file of more bytes is something else."""
+
+
+def load_job(path: str | os.PathLike[str], *, overrides: Overrides = ()) -> Job:
+    """Return the job in the YAML file ``path``; relative paths in it start at its folder.
+
+    ``overrides`` are ``key=value`` texts as of ``--set``, or pairs of what messages call one and
+    the text. Imports neither rclpy nor user code.
+    Raises ``JobError`` with ``file:line:column``, the line itself and what is expected; several
+    mistakes are reported together, in the order of the file.
+    """
+    name = os.fspath(path)
+    return _load(name, os.path.dirname(os.path.abspath(name)), _parse, overrides)
+
+
+def job_from_text(
+    text: str, name: str, folder: str | os.PathLike[str], *, overrides: Overrides = ()
+) -> Job:
+    """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``."""
+    base_dir = os.path.abspath(folder)
+
+    def read(other: str) -> YamlSource:
+        return parse_yaml(text, name, folder=base_dir) if other == name else _parse(other)
+
+    return _load(name, base_dir, read, overrides)
+
+
+def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides: Overrides) -> Job:
+    labelled = [("--set", text) if isinstance(text, str) else text for text in overrides]
+    composed = compose(name, read, labelled)
+    given = plain(composed.root, base_dir)
+    assert isinstance(given, dict)
+
+    job_keys = [key for key, _ in file_fields(Job)]
+    composing = {key for key, _ in file_fields(Composition)}
+    problems = _composition_problems({key: given[key] for key in given if key in composing})
+    values: dict[str, object] = {}
+    for key, value in given.items():
+        if key in job_keys:
+            values[key] = value
+        elif key not in composing and not str(key).startswith(FREE_PREFIX):
+            below = keys_with(Job, str(key))
+            problems.append(unknown_key(key, [*job_keys, *sorted(composing)], (), below=below))
+    values["base_dir"] = base_dir
+    values["source_name"] = name
+    if composed.is_plain:
+        values["source_text"] = composed.source.text
+    else:
+        values["composed"] = composed
+    try:
+        job = Job.model_validate(values, context=FROM_FILE)
+    except ValidationError as error:
+        problems += problems_of(error, Job)
+    if problems:
+        raise _job_error(composed.root, problems)
+    return job
+
+
+def _parse(name: str) -> YamlSource:
+    folder = os.path.dirname(os.path.abspath(name))
+    return parse_yaml(_read(Path(name)), name, folder=folder)
+
+
+def _composition_problems(values: dict[str, object]) -> list[Problem]:
+    try:
+        Composition.model_validate(values, context=FROM_FILE)
+    except ValidationError as error:
+        return problems_of(error, Composition)
+    return []
+
+
+def _beside(path: Path) -> str:
+    """Say which file of the folder was probably meant."""
+    try:
+        files = {file.stem: file.name for file in sorted(path.parent.iterdir()) if _is_job(file)}
+    except OSError:
+        return ""
+    near = nearest(path.stem, files)
+    return f"; did you mean {str(path.with_name(files[near]))!r}?" if near else ""
+
+
+def _is_job(file: Path) -> bool:
+    return file.suffix in (".yaml", ".yml", ".json")
+
+
+def _read(path: Path) -> str:
+    name = str(path)
+    try:
+        with path.open("rb") as file:
+            data = file.read(SIZE_MAX + 1)
+    except FileNotFoundError:
+        raise JobError(f"there is no such job file{_beside(path)}", where=name) from None
+    except IsADirectoryError:
+        inside = path / "job.yaml"
+        advice = f"name the job file in it: {inside}" if inside.is_file() else "name a job file"
+        raise JobError(f"this is a folder; {advice}", where=name) from None
+    except OSError as error:
+        raise JobError(f"cannot read the job file: {error.strerror}", where=name) from None
+    if name.endswith(".py"):
+        raise JobError(
+            f"this is Python, not a job file; `rsltrace init --from {name}` writes one", where=name
+        )
+    if data.startswith(b"\x89MCAP"):
+        raise JobError(
+            "this is a recording, not a job file (rsltrace info, view and diff read traces)",
+            where=name,
+        )
+    if len(data) > SIZE_MAX:
+        raise JobError(f"larger than {SIZE_MAX >> 20} MiB: this is not a job file", where=name)
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            raise JobError("this is UTF-16; save the file as UTF-8 text", where=name) from None
+        good = data[: error.start].decode("utf-8-sig", "replace")
+        mark = Mark(good.count("\n") + 1, len(good) - good.rfind("\n"))
+        raise YamlSource(name, data.decode("utf-8-sig", "replace")).error(
+            f"not UTF-8: byte 0x{data[error.start]:02x}; save the file as UTF-8 text", mark
+        ) from None
+
+
+def _job_error(root: Item, problems: list[Problem]) -> JobError:
+    """Return one error that tells all problems: the first file's first, each in its order."""
+    found = [(place_at(root, p.loc, at_key=p.at_key), p.message) for p in problems]
+    names = list(
+        dict.fromkeys([root.place.source.name, *(place.source.name for place, _ in found)])
+    )
+
+    def order(entry: tuple[Place, str]) -> tuple[int, int, int]:
+        place = entry[0]
+        return names.index(place.source.name), place.mark.line, place.mark.column
+
+    texts: list[str] = []
+    for place, message in sorted(found, key=order):
+        source = place.source
+        head = f"{source.where(place.mark)}: " if texts else ""
+        texts.append(f"{head}{message}{source.excerpt(place.mark)}")
+    first = min(found, key=order)[0]
+    return JobError("\n".join(texts), where=first.source.where(first.mark))
+
+
+def locate(job: Job, loc: tuple[str | int, ...]) -> str:
+    """Return where in its file a part of a job stands: ``job.yaml:3:11``.
+
+    For mistakes that show only when the run begins. A job built in Python has no lines; its parts
+    are named instead: ``<python>: nodes[0].node``.
+    """
+    place = _place(job, loc)
+    if place is None:
+        return f"{job.source_name}: {format_loc(loc)}"
+    return place.source.where(place.mark)
+
+
+@contextmanager
+def showing_line(job: Job, loc: tuple[str | int, ...]) -> Iterator[None]:
+    """Add the line of the job to a ``JobError`` that is raised about the part at ``loc``."""
+    try:
+        yield
+    except JobError as error:
+        place = _place(job, loc)
+        if place is None or error.where != place.source.where(place.mark):
+            raise
+        message = str(error).removeprefix(f"{error.where}: ")
+        raise place.error(message) from error.__cause__
+
+
+def _place(job: Job, loc: tuple[str | int, ...]) -> Place | None:
+    if job.composed is not None:
+        return place_at(job.composed.root, loc)
+    if job.given_text is None:
+        return None
+    root = parse_yaml(job.given_text, job.source_name).root
+    assert root is not None, "the text has been a job"
+    return place_at(root, loc)

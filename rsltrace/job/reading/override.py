@@ -1,0 +1,181 @@
+"""``--set nodes.ekf.parameters.rate=20.0``: every key of a job from the command line.
+
+An override is YAML with its path written in front, so its mistakes are shown in its own text.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.job.documents.keys import is_list_at, shorthand_at, without_alternatives
+from rsltrace.job.reading.problems import Loc, describe
+from rsltrace.job.reading.tree import Item, Place, YamlSource
+from rsltrace.job.reading.yaml_source import Mark, parse_yaml
+
+if TYPE_CHECKING:
+    from rsltrace.job.job import Job
+
+_STEP = re.compile(r'"([^"]*)"|\'([^\']*)\'|([^.=\'"\[\]]+)|\[([0-9]+|\+)\]')
+_APPEND = "+"
+
+
+@dataclass(frozen=True)
+class _Step:
+    """One part of a path, where it stands, and how it was written."""
+
+    text: str
+    place: Place
+    quoted: bool
+
+
+def apply_override(root: Item, label: str, override: str, *, folder: str) -> Item:
+    """Return the job with ``override`` (``path=value``) applied; ``label`` names it in messages.
+
+    The value is YAML; null takes the key away. List entries are given by index, by
+    a node's name, or as ``+`` for a new one at the end. Paths start at ``folder``.
+    """
+    shown = YamlSource(label, override, folder, is_option=True)
+    steps, at = _steps(shown)
+    if steps[0].text in ("base", "include"):
+        raise steps[0].place.error(
+            f"{steps[0].text}: is read before the command line is: write it in the job file"
+        )
+    if not override[at:].strip():
+        # A shell variable without a value must not take a stop condition away.
+        raise shown.error("there is no value after '=': null takes the key away", Mark(1, at))
+    source = parse_yaml(override[at:], label, folder=folder, option=override)
+    value = source.root or Item(None, steps[-1].place)
+    if value.value is None:
+        value = Item(None, steps[-1].place)
+    return _set(root, steps, value, ())
+
+
+def _steps(source: YamlSource) -> tuple[list[_Step], int]:
+    """Return the path of an override, and where its value begins."""
+    text, at = source.text, 0
+    steps: list[_Step] = []
+    while True:
+        match = _STEP.match(text, at)
+        if match is None:
+            break
+        quoted = match.group(1) is not None or match.group(2) is not None
+        name = next(group for group in match.groups() if group is not None)
+        steps.append(_Step(name.strip() if not quoted else name, _place(source, at), quoted))
+        at = match.end()
+        if text[at : at + 1] == ".":
+            at += 1
+        elif text[at : at + 1] != "[":
+            break
+    if not steps or text[at : at + 1] != "=" or text[at - 1 : at] == ".":
+        example = "--set stop.duration=10s, --set nodes.0.parameters.rate=20.0"
+        raise source.error(f"expected key=value, as in {example}", Mark(1, at + 1))
+    return steps, at + 1
+
+
+def _place(source: YamlSource, at: int) -> Place:
+    return Place(source, Mark(1, at + 1))
+
+
+def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
+    """Return ``item`` with the value at the end of the path replaced."""
+    if not steps:
+        return value
+    step = steps[0]
+    if item is None or item.value is None:
+        starts_list = not step.quoted and step.text == _APPEND
+        if not step.quoted and step.text.isdecimal() and is_list_at(_job(), loc):
+            name = ".".join(map(str, loc))
+            raise step.place.error(f"{name} has no entries yet: write {name}.+ for a new one")
+        item = Item([] if starts_list else {}, step.place, step.place)
+    inner: Any = item.value
+    if is_shorthand(inner) and (key := shorthand_at(_job(), loc)) is not None:
+        inner = {key: replace(item, key_place=item.place)}
+    if isinstance(inner, list):
+        return replace(item, value=_set_in_list(inner, steps, value, loc))
+    if not isinstance(inner, dict):
+        raise step.place.error(
+            f"{'.'.join(map(str, loc))} is {describe(inner)}: there is nothing below it to set"
+        )
+    name, used = _key(inner, steps)
+    values = without_alternatives(inner, (name,), _job(), loc)
+    new = _set(values.get(name), steps[used:], value, (*loc, name))
+    if new.value is None and used == len(steps):
+        if name not in values:
+            raise step.place.error(
+                f"no value is given, and {'.'.join(map(str, (*loc, name)))} has none to take away"
+            )
+        del values[name]
+    else:
+        values[name] = replace(new, key_place=step.place)
+    return replace(item, value=values)
+
+
+def _key(values: dict[Any, Item], steps: list[_Step]) -> tuple[str, int]:
+    """Return the key that a path goes on with: parameters may have dots in their names."""
+    for used in range(len(steps), 1, -1):
+        name = ".".join(step.text for step in steps[:used])
+        if name in values:
+            return name, used
+    return steps[0].text, 1
+
+
+def _set_in_list(items: list[Item], steps: list[_Step], value: Item, loc: Loc) -> list[Item]:
+    step, name = steps[0], ".".join(map(str, loc))
+    if step.text == _APPEND and not step.quoted:
+        return [*items, _set(None, steps[1:], value, (*loc, len(items)))]
+    index = _index(items, step, name)
+    new = _set(items[index], steps[1:], value, (*loc, index))
+    if new.value is None and len(steps) == 1:
+        return items[:index] + items[index + 1 :]
+    return [*items[:index], new, *items[index + 1 :]]
+
+
+def _index(items: list[Item], step: _Step, name: str) -> int:
+    if step.text.isdecimal() and not step.quoted:
+        if int(step.text) < len(items):
+            return int(step.text)
+        there = f"it has 0 to {len(items) - 1}" if items else "it is empty"
+        raise step.place.error(f"{name} has no entry {step.text}: {there}, and + is a new one")
+    named = [(key, i) for i, item in enumerate(items) for key in _names(item)]
+    found = {i for key, i in named if key == step.text}
+    if len(found) == 1:
+        return found.pop()
+    if found:
+        numbers = ", ".join(map(str, sorted(found)))
+        raise step.place.error(
+            f"{step.text!r} is more than one of {name}: give a number, {numbers}"
+        )
+    names = [key for key, _ in named]
+    close = difflib.get_close_matches(step.text, names, n=1)
+    hint = f"did you mean {close[0]!r}?" if close else "give a number, counted from 0"
+    if not close and names:
+        hint += f", or one of {', '.join(dict.fromkeys(names))}"
+    raise step.place.error(f"{name} has no entry {step.text!r}: {hint}")
+
+
+def _names(item: Item) -> list[str]:
+    """Return what an entry may be called: its name, else its class, or the end of its path."""
+    if isinstance(item.value, str):
+        return [item.value.rstrip("/").rpartition("/")[2]]
+    if not isinstance(item.value, dict):
+        return []
+    for key, separator in (("name", ""), ("node", ":"), ("path", "/")):
+        inner = item.value.get(key)
+        if inner is not None and isinstance(inner.value, str):
+            text = inner.value.rstrip("/")
+            return [text.rpartition(separator)[2] if separator else text]
+    return []
+
+
+def is_shorthand(value: object) -> bool:
+    """Say whether a value may stand for a part: a bag's path, a topic's name, a plain time."""
+    return isinstance(value, (str, int, float)) and not isinstance(value, bool)
+
+
+def _job() -> type[Job]:
+    from rsltrace.job.job import Job
+
+    return Job

@@ -1,0 +1,181 @@
+"""The graph of a world as plain values: who is there, who talks to whom, and who never will."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.doors.rclpy.boundary.action_client import ActionClientHandle
+from rsltrace.doors.rclpy.boundary.entity_handle import callback_name
+from rsltrace.doors.rclpy.wire.interfaces import type_name as name_of_type
+from rsltrace.middleware.qos import Liveliness, incompatible_policies
+from rsltrace.middleware.qos_timing import finite
+from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
+from rsltrace.model.stamp import format_duration
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.boundary.node import NodeHandle
+    from rsltrace.doors.rclpy.core import Core
+
+_ACTION = "/_action/"
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """One end of a topic, service or action: the node, and (of a topic) its QoS in words."""
+
+    node: str
+    qos: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """A topic, service or action with its ends. ``senders`` publish or call, ``receivers``
+    subscribe or serve; both in creation order. ``apart`` has (sender, receiver, policies) of the
+    pairs that do not connect."""
+
+    kind: str
+    name: str
+    type: str
+    senders: tuple[End, ...]
+    receivers: tuple[End, ...]
+    apart: tuple[tuple[End, End, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class NodeView:
+    """A node, its class, and its timers as (callback, period in ns)."""
+
+    name: str
+    type: str
+    timers: tuple[tuple[str, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Overview:
+    """What there is once the nodes are constructed. ``waiting`` says what has not finished (a
+    program that waits for work has)."""
+
+    nodes: tuple[NodeView, ...]
+    links: tuple[Link, ...]
+    waiting: tuple[str, ...] = ()
+    problems: tuple[str, ...] = field(default=())
+
+    def of_kind(self, kind: str) -> list[Link]:
+        """Return the links of one kind (``topic``, ``service``, ``action``), by name."""
+        return [link for link in self.links if link.kind == kind]
+
+
+def overview(core: Core, *, everything: bool = False) -> Overview:
+    """Return the present graph of a world; ``everything`` with what every node has."""
+    graph = core.graph
+    nodes = tuple(_node(node) for node in graph.nodes)
+    links = [*_topics(core), *_services(core), *_actions(core)]
+    if not everything:
+        links = [link for link in links if not _is_everywhere(link)]
+    links.sort(key=lambda link: (link.kind, link.name))
+    return Overview(
+        nodes,
+        tuple(links),
+        waiting=tuple(wait.waits_for() for wait in core.blocked if not wait.is_patient()),
+        problems=tuple(problem for link in links for problem in _problems(link)),
+    )
+
+
+def _node(node: NodeHandle) -> NodeView:
+    timers = () if node.wrapper is None else tuple(node.wrapper.timers)
+    return NodeView(
+        node.fully_qualified_name,
+        node.trace_type(),
+        tuple((callback_name(timer.callback), timer.handle.state.period_ns) for timer in timers),
+    )
+
+
+def _topics(core: Core) -> Iterator[Link]:
+    graph = core.graph
+    for name, (type_name,) in graph.topic_names_and_types():
+        publishers, subscriptions = graph.publishers(name), graph.subscriptions(name)
+        yield Link(
+            "topic",
+            name,
+            type_name,
+            tuple(_end(publisher) for publisher in publishers),
+            tuple(_end(subscription) for subscription in subscriptions),
+            tuple(
+                (
+                    _end(publisher),
+                    _end(subscription),
+                    " and ".join(p.name.lower() for p in policies),
+                )
+                for publisher in publishers
+                for subscription in subscriptions
+                if (policies := incompatible_policies(publisher.qos, subscription.qos))
+            ),
+        )
+
+
+def _services(core: Core) -> Iterator[Link]:
+    for name, (type_name, *_) in core.graph.service_names_and_types():
+        yield Link(
+            "service",
+            name,
+            type_name,
+            tuple(End(_name_of(client)) for client in core.graph.clients(name)),
+            tuple(End(_name_of(server)) for server in core.graph.services(name)),
+        )
+
+
+def _actions(core: Core) -> Iterator[Link]:
+    ends: dict[tuple[str, str], tuple[list[End], list[End]]] = {}
+    for node in core.graph.nodes:
+        for action in node.actions:
+            key = (action.name, name_of_type(action.action_type))
+            is_client = isinstance(action, ActionClientHandle)
+            ends.setdefault(key, ([], []))[0 if is_client else 1].append(
+                End(node.fully_qualified_name)
+            )
+    for (name, type_name), (clients, servers) in ends.items():
+        yield Link("action", name, type_name, tuple(clients), tuple(servers))
+
+
+def _end(endpoint: Any) -> End:
+    qos = endpoint.qos
+    history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
+    words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
+    words.append(history)
+    if qos.liveliness is Liveliness.MANUAL_BY_TOPIC:
+        words.append("liveliness manual by topic")
+    limits = {"deadline": qos.deadline_ns, "lease": qos.lease_ns, "lifespan": qos.lifespan_ns}
+    words += [f"{name} {format_duration(ns)}" for name, ns in limits.items() if finite(ns)]
+    return End(_name_of(endpoint), ", ".join(words))
+
+
+def _name_of(endpoint: Any) -> str:
+    return "(no node)" if endpoint.node is None else str(endpoint.node.fully_qualified_name)
+
+
+def _is_everywhere(link: Link) -> bool:
+    """Say whether a link is one that rclpy makes for every node, or a part of an action."""
+    if _ACTION in link.name:
+        return True
+    if link.kind == "topic":
+        return link.name in NODE_TOPICS and not link.receivers
+    return link.kind == "service" and (
+        link.name.rpartition("/")[2] in NODE_SERVICES and not link.senders
+    )
+
+
+def _problems(link: Link) -> Iterator[str]:
+    for sender, receiver, policy in link.apart:
+        yield (
+            f"topic {link.name}: {sender.node} and {receiver.node} do not connect: {policy} "
+            f"({sender.node} offers {sender.qos}; {receiver.node} asks for {receiver.qos})"
+        )
+    if link.receivers and not link.senders and link.kind == "topic":
+        names = ", ".join(dict.fromkeys(end.node for end in link.receivers))
+        if link.name not in NODE_TOPICS:
+            yield f"topic {link.name}: {names} subscribes, and nobody publishes"
+    if link.senders and not link.receivers and link.kind != "topic":
+        names = ", ".join(dict.fromkeys(end.node for end in link.senders))
+        yield f"{link.kind} {link.name}: {names} calls, and nobody serves"

@@ -1,0 +1,108 @@
+"""The usual links in a hurry: every message arrives, in the order of sending, at once or later.
+
+With a delay on every link, most events of a run are messages that come this way. What a link has to
+look up is therefore bound once, in a closure, its arrivals go straight into the loop's queue, and
+its draws to the recorder without a call.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from heapq import heappush
+from typing import TYPE_CHECKING
+
+from rsltrace.chance.distribution import Sampler
+from rsltrace.loop.loop import ORDER_RELEASE, Release
+from rsltrace.model.draw import Draw, encode_draw
+from rsltrace.model.event import OutputKind
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.format import OUTPUT_CONTENT
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.boundary.entity_handle import Receiver
+    from rsltrace.doors.rclpy.boundary.pubsub import SubscriptionHandle
+    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.middleware.links import Link
+
+Send = Callable[[bytes, int, int, int, int, int], None]
+"""Sends a message on its way: what a ``Delivery`` has from the CDR on."""
+
+_DELAY = encode_draw(Draw.DELAY)
+_DRAW = int(OutputKind.DRAW)
+_pack_output = OUTPUT_CONTENT.pack
+
+
+def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
+    """Return how ``link`` sends, if it does nothing but delay and keeps the order."""
+    loop = core.loop
+    subscription = link.subscription
+    entity = subscription.entity_id
+    scheduled, next_place = loop.scheduled, loop.next_place
+
+    def arrive(release: Release) -> SubscriptionHandle | None:
+        if subscription.destroyed:
+            return None
+        subscription.queue.append(release)
+        if subscription.wrapper is not None:
+            return subscription
+        subscription.find_wrapper()
+        return None
+
+    def send(
+        data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
+    ) -> None:
+        leaves_ns = loop.now_ns
+        if core.busy_ns:
+            leaves_ns += core.busy_ns
+        delay_ns = delay(leaves_ns)
+        arrival_ns = leaves_ns + delay_ns
+        if arrival_ns < link.last_ns:
+            arrival_ns = link.last_ns
+            delay_ns = arrival_ns - leaves_ns
+        link.last_ns = arrival_ns
+        recorder = core.recorder
+        if recorder is not None:  # what Recorder.draw does
+            packed = _pack_output(_DELAY | delay_ns, entity, _DRAW)
+            recorder.output_hash = hash64(packed, recorder.output_hash)
+            recorder.add_output(packed)
+            recorder.outputs += 1
+        place = next_place()
+        release = (
+            arrival_ns, ORDER_RELEASE, place, arrive, data, event, position, digest, stamp_ns, count
+        )  # fmt: skip
+        if delay_ns or arrival_ns != loop.now_ns or link.expects(arrive):
+            heappush(scheduled, release)
+        elif arrive(release) is not None:
+            loop.ready.append(subscription)
+
+    return send
+
+
+def direct_send(core: Core, link: Link) -> Send:
+    """Return how ``link`` sends, if there is nothing the matter with it.
+
+    Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
+    """
+    loop = core.loop
+    scheduled = loop.scheduled
+    subscription = link.subscription
+    arrived = subscription.arrived
+
+    def arrive(release: Release) -> Receiver | None:
+        return None if subscription.destroyed else arrived(release)
+
+    def send(
+        data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
+    ) -> None:
+        now_ns = loop.now_ns
+        late_ns = core.busy_ns
+        if late_ns or (scheduled and scheduled[0][0] <= now_ns and link.expects(arrive)):
+            what = (data, event, position, digest, stamp_ns, count)
+            loop.schedule_release(now_ns + late_ns, arrive, *what)
+        elif (
+            arrived((now_ns, 0, 0, None, data, event, position, digest, stamp_ns, count))
+            is not None
+        ):
+            loop.ready.append(subscription)
+
+    return send

@@ -1,0 +1,277 @@
+"""The bags of a job: opened, checked and merged into the graph."""
+
+from __future__ import annotations
+
+import heapq
+import struct
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import BagError
+from rsltrace.job import BagSpec, Job, locate
+from rsltrace.loop.stop import Stop
+from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
+from rsltrace.run.plans.stopping import end_ns_of, has_stop
+
+if TYPE_CHECKING:
+    from rsltrace.bag import Bag
+    from rsltrace.bag.playback import Playback
+    from rsltrace.bag.storage import StoredTopic
+    from rsltrace.bag.topic import BagTopic
+    from rsltrace.doors.rclpy.world import World
+
+PLAYER = "rosbag2_player"
+"""The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
+_ACTION = "/_action/"
+_SERVICE_EVENT = "/_service_event"
+_LONG_GAP_NS = 3600 * NS_PER_S
+"""No robot is silent for so long in the middle of a run: the bags are from different days."""
+
+
+@dataclass(frozen=True)
+class BagInput:
+    """One entry of ``bags:`` with its open bag, and when its messages play."""
+
+    spec: BagSpec
+    bag: Bag
+    playback: Playback
+
+    def name_of(self, topic: BagTopic) -> str:
+        """Return the name under which a recorded topic plays."""
+        return self.spec.remappings.get(topic.name, topic.name)
+
+
+@contextmanager
+def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
+    """Open one bag of a job. Raises BagError."""
+    from rsltrace.bag import open_bag
+    from rsltrace.bag.playback import Playback
+
+    spec = job.bags[index]
+    try:
+        opened = open_bag(
+            job.resolve(spec.path),
+            topics=spec.topics,
+            exclude=spec.exclude,
+            start_offset_ns=spec.start_offset_ns,
+            duration_ns=spec.duration_ns,
+            recover=True,
+            skip=never_plays,
+        )
+    except BagError as error:
+        loc: tuple[str | int, ...] = ("bags", index, "path")
+        if error.glob in spec.topics:
+            loc = ("bags", index, "topics", spec.topics.index(error.glob or ""))
+        raise BagError(f"{locate(job, loc)}: {error}") from error
+    with opened as bag:
+        _check_names(job, index, bag)
+        yield BagInput(
+            spec,
+            bag,
+            Playback(
+                bag,
+                by=spec.by,
+                headers=_with_headers(spec, bag) if spec.by == "header_stamp" else frozenset(),
+                rate=Fraction(repr(spec.rate)),
+                at_ns=spec.at_ns,
+                passes=None if spec.loop is True else int(spec.loop) or 1,
+            ),
+        )
+
+
+def never_plays(topic: StoredTopic) -> bool:
+    """Services and actions are recorded as topics that only their own middleware may fill."""
+    return _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
+
+
+def _check_names(job: Job, index: int, bag: Bag) -> None:
+    """Raise BagError if a name in the job fits no topic that plays."""
+    spec, names = job.bags[index], sorted({topic.name for topic in bag.topics})
+    for key, globs in (("remappings", spec.remappings), ("qos", spec.qos)):
+        for glob in globs:
+            if not any(fnmatchcase(name, glob) for name in names):
+                raise BagError(
+                    f"{locate(job, ('bags', index, key, glob))}: {spec.path} plays no topic "
+                    f"{glob!r}: it plays {', '.join(names)}"
+                )
+
+
+def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
+    from rsltrace.doors.player import begins_with_header, check_type
+
+    return frozenset(
+        index
+        for index, topic in enumerate(bag.topics)
+        if begins_with_header(
+            check_type(bag=spec.path, topic=topic.name, type_name=topic.type_name)
+        )
+    )
+
+
+def notes_of(job: Job, bags: list[BagInput]) -> Iterator[str]:
+    """Yield what somebody should know about the bags: what is missing, what does not play."""
+    for index, entry in enumerate(bags):
+        yield from entry.bag.notes
+        for number, glob in enumerate(entry.spec.exclude):
+            if glob in entry.bag.excluded_nothing and not glob.startswith("*"):
+                yield (
+                    f"{locate(job, ('bags', index, 'exclude', number))}: {entry.spec.path} has no "
+                    f"topic {glob!r}, so nothing is left out for it"
+                )
+        begin_ns = entry.playback.start_ns
+        if job.start_ns is not None and begin_ns < job.start_ns:
+            yield (
+                f"{entry.spec.path}: begins at {format_seconds(begin_ns)} s, before the run does "
+                f"({format_seconds(job.start_ns)} s): what comes earlier plays all at once, at the "
+                "start; leave it out with start_offset, or move the bag with at"
+            )
+        services = [name for name in entry.bag.skipped if name.endswith(_SERVICE_EVENT)]
+        actions = sorted({n.partition(_ACTION)[0] for n in entry.bag.skipped if _ACTION in n})
+        services = [n.removesuffix(_SERVICE_EVENT) for n in services if _ACTION not in n]
+        for what, names in (("services", sorted(services)), ("actions", actions)):
+            if names:
+                yield (
+                    f"{entry.spec.path}: recorded {what} are not played: {', '.join(names)} (only "
+                    "topics play; what a server answers, its node must answer again)"
+                )
+    yield from _apart(job, bags)
+
+
+def _apart(job: Job, bags: list[BagInput]) -> Iterator[str]:
+    """Yield the bags that were recorded at another time than what plays before them."""
+    start_ns = start_ns_of(job, bags)
+    run_ends_ns = end_ns_of(job, start_ns)
+    until_ns: int | None = start_ns
+    for entry in sorted(bags, key=lambda entry: entry.playback.start_ns):
+        begin_ns = entry.playback.start_ns
+        gap_ns = 0 if until_ns is None else begin_ns - until_ns
+        begins = f"{entry.spec.path}: begins at {format_seconds(begin_ns)} s, "
+        if run_ends_ns is not None and begin_ns > run_ends_ns:
+            end = f"after the end of the run ({format_seconds(run_ends_ns)} s)"
+            yield f"{begins}{end}: nothing of it plays; move it with at"
+        elif gap_ns > _LONG_GAP_NS:
+            gap = f"{format_duration(gap_ns)} after everything before it has played"
+            yield f"{begins}{gap}, and simulated time passes until then; move it with at"
+        end_ns = entry.playback.end_ns
+        until_ns = None if until_ns is None or end_ns is None else max(until_ns, end_ns)
+
+
+def start_ns_of(job: Job, bags: list[BagInput]) -> int:
+    """Return when the run starts: what the job says, else the first message of the bags, else 0."""
+    if job.start_ns is not None:
+        return job.start_ns
+    return min((entry.playback.start_ns for entry in bags), default=0)
+
+
+def check_bag_types(bags: list[BagInput]) -> None:
+    """Raise BagError if a recorded topic has a type that is not installed."""
+    from rsltrace.doors.player import check_type
+
+    for entry in bags:
+        for topic in entry.bag.topics:
+            check_type(bag=entry.spec.path, topic=topic.name, type_name=topic.type_name)
+
+
+def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
+    """Make a publisher for every recorded topic and merge the bags by time, then by order."""
+    if not bags:
+        return
+    from rclpy.node import Node
+
+    from rsltrace.doors.player import Player, make_publisher, progress_publisher
+    from rsltrace.model.event import EventKind
+
+    core = world.core
+    streams: list[Iterator[tuple[int, Any, bytes]]] = []
+    told: list[Any] = []
+
+    def build() -> None:
+        player = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
+        publishers: dict[tuple[str, str], Any] = {}
+        for entry in bags:
+            ends = []
+            for topic in entry.bag.topics:
+                key = (entry.name_of(topic), topic.type_name)
+                if key not in publishers:
+                    publishers[key] = make_publisher(
+                        core,
+                        player.handle,
+                        bag=entry.spec.path,
+                        topic=key[0],
+                        type_name=topic.type_name,
+                        qos={**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)},
+                    )
+                ends.append(publishers[key])
+            streams.append(_messages(entry.playback, ends))
+        if job.progress is not None:
+            told.append(progress_publisher(core, player.handle, job.progress))
+        world.keep(player)
+
+    core.run_outside(lambda: "the bag player", EventKind.CONSTRUCT, 0, None, build)
+    if core.loop.stopped is not None:
+        return
+    ends_run = not has_stop(job)
+
+    def on_end() -> None:
+        if ends_run:
+            core.loop.stop_after_step(Stop("end of the bag"))
+
+    merged = streams[0]
+    if len(streams) > 1:
+        merged = heapq.merge(*streams, key=lambda message: message[0])
+    if told:
+        merged = _with_progress(merged, told[0], _span_ns(bags))
+    Player(core, merged, on_end).start()
+
+
+def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:
+    for stamp_ns, topic, data in playback.messages():
+        yield stamp_ns, publishers[topic], data
+
+
+def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
+    """Return when the first bag begins to play, and when the last one ends."""
+    ends = [entry.playback.end_ns for entry in bags]
+    assert all(end is not None for end in ends), "a job with a bag for ever has no progress"
+    return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
+
+
+def _with_progress(
+    messages: Iterator[tuple[int, Any, bytes]], publisher: Any, span_ns: tuple[int, int]
+) -> Iterator[tuple[int, Any, bytes]]:
+    """Put progress from 0 to 1 among the messages, each hundredth once, when it is reached."""
+    start_ns, end_ns = span_ns
+    told, stamp_ns = -1, start_ns
+    for message in messages:
+        yield message
+        stamp_ns = message[0]
+        percent = min((stamp_ns - start_ns) * 100 // max(end_ns - start_ns, 1), 99)
+        if percent > told:
+            told = percent
+            yield stamp_ns, publisher, _float32(percent)
+    yield stamp_ns, publisher, _float32(100)
+
+
+def _float32(percent: int) -> bytes:
+    return b"\x00\x01\x00\x00" + struct.pack("<f", percent / 100)
+
+
+def _qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
+    for glob, qos in spec.qos.items():
+        if fnmatchcase(topic, glob):
+            return qos.values()
+    return {}
+
+
+def _qos_values(qos: Any) -> dict[str, Any]:
+    if qos is None:
+        return {}
+    return {
+        name: getattr(value, "name", value)
+        for name in ("reliability", "durability", "history", "depth")
+        if (value := getattr(qos, name, None)) is not None
+    }

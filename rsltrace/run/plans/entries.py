@@ -1,0 +1,156 @@
+"""From the nodes and hooks of a job to the entries of a world: imported, arguments parsed."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from functools import partial
+from inspect import Parameter
+from typing import Any
+
+from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.doors.rclpy.entry import Entry, ros_arguments
+from rsltrace.doors.rclpy.hints import parameter_in
+from rsltrace.errors import JobError, RunError
+from rsltrace.job import Job, locate, policy_of, showing_line
+from rsltrace.job.parts.node import Target, target_text
+from rsltrace.job.reading.problems import Loc, nearest
+from rsltrace.run.plans.executables import Mains
+from rsltrace.run.plans.guarding import entry_key
+from rsltrace.run.plans.target import load_target
+
+_BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+
+
+def node_entries(job: Job) -> list[Entry]:
+    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
+    entries = []
+    mains = Mains()
+    for_all = _arguments_for_all(job)
+    for index, spec in enumerate(job.nodes):
+        loc = ("nodes", index, spec.kind)
+        where = spec.origin or locate(job, loc)
+        argv = None
+        make: Any
+        with showing_line(job, loc):
+            _check_parameter_files(job, index)
+            arguments = ros_arguments(
+                name=spec.name,
+                namespace=spec.namespace,
+                parameters=spec.parameters,
+                parameter_files=[job.resolve(path) for path in spec.parameter_files],
+                remappings=spec.remappings,
+                where=where,
+                for_all=for_all,
+            )
+            if isinstance(spec.arguments, tuple) or spec.node is None:
+                name, make = mains.find(spec, where=where)
+                argv = [name, *spec.arguments]
+            else:
+                target = spec.node
+                found = load_target(target, where=where) if isinstance(target, str) else target
+                _check_arguments(job, index, found)
+                make = partial(found, **spec.arguments)
+        entries.append(
+            Entry(
+                spec.target,
+                make,
+                arguments,
+                argv=argv,
+                log_exceptions=spec.on_exception == "log",
+                key=entry_key(spec, job.nodes[:index]),
+                policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
+            )
+        )
+    return entries
+
+
+def _check_parameter_files(job: Job, index: int) -> None:
+    """Raise ``JobError`` at the line of a parameter file that rcl cannot read."""
+    spec = job.nodes[index]
+    for number, path in enumerate(spec.parameter_files):
+        try:
+            RosArguments(["--ros-args", "--params-file", str(job.resolve(path))])
+        except InvalidArgumentsError as error:
+            loc = ("nodes", index, "parameter_files", number)
+            where = spec.origin or locate(job, loc)
+            said = str(error).partition("Error: ")[2].strip() or str(error)
+            with showing_line(job, loc):
+                raise JobError(f"{path} is no ROS parameter file: {said}", where=where) from error
+
+
+def _check_arguments(job: Job, index: int, target: Any) -> None:
+    """Raise ``JobError`` if a class or function does not take the ``arguments`` of its entry."""
+    spec = job.nodes[index]
+    assert isinstance(spec.arguments, dict)
+    try:
+        signature = inspect.signature(target, follow_wrapped=False)
+    except (TypeError, ValueError):
+        return  # nobody knows
+    names = [name for name, one in signature.parameters.items() if one.kind in _BY_NAME]
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
+    for name in spec.arguments:
+        if name not in names and not takes_any:
+            near = nearest(name, names)
+            takes = f"it takes {', '.join(names)}" if names else "it takes none"
+            hint = f"did you mean {near!r}?" if near else takes
+            wrong = f"{spec.target} takes no argument {name!r}: {hint}"
+            raise _shown(job, ("nodes", index, "arguments", name), wrong)
+    try:
+        signature.bind(**spec.arguments)
+    except TypeError as error:
+        where = locate(job, ("nodes", index, "node"))
+        raise JobError(f"{spec.target}: {error}; give it in 'arguments:'", where=where) from error
+
+
+def _shown(job: Job, loc: Loc, message: str) -> JobError:
+    try:
+        with showing_line(job, loc):
+            raise JobError(message, where=locate(job, loc))
+    except JobError as error:
+        return error
+
+
+def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
+    """Add to the error of a constructor the line of the job at which the parameter stands that it
+    refused, or the node, if there are several that are made in the same way."""
+    for index, spec in enumerate(job.nodes):
+        if error is None or entry_key(spec, job.nodes[:index]) != entry.key:
+            continue
+        name = parameter_in(error.__cause__)
+        if name in spec.parameters:
+            place = spec.origin or locate(job, ("nodes", index, "parameters", name or ""))
+            error.args = (f"{error}\n  the job gives it at {place}",)
+        elif sum(other.target == spec.target for other in job.nodes) > 1:
+            place = spec.origin or locate(job, ("nodes", index))
+            error.args = (f"{error}\n  the job names it at {place}",)
+
+
+def hook_entries(
+    job: Job, name: str, target: Target | None, argument: Callable[[], object]
+) -> list[Entry]:
+    """Return a hook of the job, if it has it, as an entry: what it returns are more nodes."""
+    if target is None:
+        return []
+    where = locate(job, ("hooks", name))
+    function: Any = load_target(target, where=where) if isinstance(target, str) else target
+    title = f"hook {name}: {target_text(target)}"
+    return [Entry(title, lambda: function(argument()) or [], [], key=title)]
+
+
+def _arguments_for_all(job: Job) -> list[str]:
+    """Return the ROS arguments of all nodes, the paths in them absolute.
+
+    :raises JobError: if rcl refuses them.
+    """
+    words = list(job.ros_arguments)
+    for index, word in enumerate(words[:-1]):
+        if word == "--params-file":
+            words[index + 1] = str(job.resolve(words[index + 1]))
+    if words:
+        try:
+            RosArguments(["--ros-args", *words])
+        except InvalidArgumentsError as error:
+            where = locate(job, ("ros_arguments",))
+            raise JobError(f"ros_arguments (--ros-args): {error}", where=where) from None
+    return words

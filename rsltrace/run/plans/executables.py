@@ -1,0 +1,222 @@
+"""Finding what ``main:`` and ``executable:`` name: the function that ``ros2 run`` would run.
+
+An executable is a console script of a Python distribution, or a Python script that a ROS package
+has installed (``lib/<package>/<executable>`` below a prefix of the ament index). Both run as they
+are, in this process.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+from types import ModuleType
+
+from rsltrace.errors import JobError
+from rsltrace.job import NodeSpec
+from rsltrace.run.plans.target import load_target
+
+_ELF = b"\x7fELF"
+
+
+class Mains:
+    """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
+
+    def __init__(self) -> None:
+        self._packages: set[str] = set()
+
+    def find(self, spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
+        """Return what ``sys.argv[0]`` shall be, and the function to call.
+
+        :raises JobError: if there is no such thing, or it is not Python.
+        """
+        if spec.executable is not None:
+            found = find_executable(spec.executable, where=where)
+            name = spec.executable.partition("/")[2]
+            if isinstance(found, str):
+                with _command_line(name, spec):
+                    return name, self._load(found, where)
+            return name, found
+        assert spec.main is not None
+        if isinstance(spec.main, str):
+            name = spec.main.partition(":")[0].rpartition(".")[2]
+            with _command_line(name, spec):
+                return name, self._load(spec.main, where)
+        return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
+
+    def _load(self, target: str, where: str) -> Callable[[], object]:
+        package = re.split("[.:]", target)[0]
+        again = package in self._packages
+        self._packages.add(package)
+        with _own_copy(package) if again else nullcontext():
+            function: Callable[[], object] = load_target(target, where=where)
+        return function
+
+
+@contextmanager
+def _command_line(name: str, spec: NodeSpec) -> Iterator[None]:
+    """Let a module see its own arguments when it is imported: ``def main(args=sys.argv):``."""
+    before = sys.argv
+    sys.argv = [name, *spec.arguments]
+    try:
+        yield
+    finally:
+        sys.argv = before
+
+
+@contextmanager
+def _own_copy(package: str) -> Iterator[None]:
+    """Import a package once more than it is: who has it already keeps what it has."""
+
+    def modules() -> dict[str, ModuleType]:
+        return {
+            name: module
+            for name, module in sys.modules.items()
+            if name == package or name.startswith(package + ".")
+        }
+
+    before = modules()
+    for name in before:
+        del sys.modules[name]
+    try:
+        yield
+    finally:
+        for name in modules():
+            del sys.modules[name]
+        sys.modules.update(before)
+
+
+def why_not(package: str, name: str) -> str | None:
+    """Return why an executable cannot run here, or None if it can; nothing is imported."""
+    try:
+        find_executable(f"{package}/{name}", where="")
+    except JobError as error:
+        return str(error)
+    return None
+
+
+def source_of(target: str, *, where: str) -> str | Path:
+    """Return where an executable's code is: ``module:function``, or a script.
+
+    :raises JobError: as ``find_executable``.
+    """
+    found = find_executable(target, where=where)
+    package, _, name = target.partition("/")
+    return found if isinstance(found, str) else _installed_files(package)[name]
+
+
+def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
+    """Return what runs ``package/name``: a function, or its name (``module:function``).
+
+    :raises JobError: if the package or the executable is unknown, or not Python.
+    """
+    package, _, name = target.partition("/")
+    scripts = _console_scripts(package)
+    if name in scripts:
+        return scripts[name]
+    files = _installed_files(package)
+    if name in files:
+        return partial(_run_script, _python_script(files[name], target, where), files[name])
+    known = _packages()
+    if not scripts and not files and package not in known:
+        raise JobError(
+            f"there is no package {package!r}{_near(package, known)}: install it for this Python "
+            "(pip install), source the workspace it is built in, or name its function with 'main:'",
+            where=where,
+        )
+    available = sorted({*scripts, *files})
+    has = f"it has {', '.join(available[:10])}" if available else "it has none"
+    raise JobError(
+        f"package {package!r} has no executable {name!r}{_near(name, available)}: {has}",
+        where=where,
+    )
+
+
+def _same(name: str) -> str:
+    """Return a distribution's name as package indexes compare it."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _console_scripts(package: str) -> dict[str, str]:
+    """Return ``module:function`` by name of a distribution's console scripts."""
+    found: dict[str, str] = {}
+    for entry in metadata.entry_points(group="console_scripts"):
+        if entry.dist is not None and _same(entry.dist.name) == _same(package):
+            found.setdefault(entry.name, f"{entry.module}:{entry.attr}")
+    return found
+
+
+def _prefixes() -> list[Path]:
+    """Return where ROS packages are installed, as the ament index has it."""
+    listed = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    return [Path(folder) for folder in [*listed, sys.prefix] if folder]
+
+
+def _installed_files(package: str) -> dict[str, Path]:
+    """Return what a ROS package has in its ``lib`` folder to be run."""
+    found: dict[str, Path] = {}
+    for prefix in _prefixes():
+        folder = prefix / "lib" / package
+        if not (prefix / "share/ament_index/resource_index/packages" / package).exists():
+            continue
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if path.is_file() and os.access(path, os.X_OK):
+                found.setdefault(path.name, path)
+    return found
+
+
+def _packages() -> set[str]:
+    """Return the names of the packages there are."""
+    names = {dist.name for dist in metadata.distributions() if dist.name}
+    names |= {name.replace("-", "_") for name in names}
+    for prefix in _prefixes():
+        index = prefix / "share/ament_index/resource_index/packages"
+        names |= {path.name for path in index.iterdir()} if index.is_dir() else set()
+    return names
+
+
+def _near(name: str, names: Iterable[str]) -> str:
+    close = difflib.get_close_matches(name, sorted(names), n=1)
+    return f"; did you mean {close[0]!r}?" if close and close[0] != name else ""
+
+
+def _python_script(path: Path, target: str, where: str) -> str:
+    """Return the text of a Python script.
+
+    :raises JobError: if it is something else.
+    """
+    data = path.read_bytes()
+    first = data.split(b"\n", 1)[0]
+    if data.startswith(_ELF):
+        what = "a compiled program"
+    elif first.startswith(b"#!") and b"python" not in first:
+        what = f"a script for {first[2:].decode(errors='replace').strip()}"
+    else:
+        try:
+            compile(data, str(path), "exec", dont_inherit=True)
+            return data.decode()
+        except (SyntaxError, ValueError) as error:
+            what = f"not a Python program ({error})"
+    raise JobError(
+        f"{target} is {what} ({path.name}): rsltrace runs Python nodes only; leave it out, or feed "
+        "the graph what it publishes from a bag",
+        where=where,
+    )
+
+
+def _run_script(text: str, path: Path) -> None:
+    """Run a script as ``python script`` would, in a module of its own."""
+    folder = str(path.parent)
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    code = compile(text, str(path), "exec", dont_inherit=True)
+    exec(code, {"__name__": "__main__", "__file__": str(path), "__builtins__": __builtins__})
+
+
+__all__ = ["Mains", "find_executable", "source_of"]

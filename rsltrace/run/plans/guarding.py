@@ -1,0 +1,160 @@
+"""The guard of a run, as its job wants it."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+import sys
+from collections.abc import Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import JobError
+from rsltrace.guard.guard import Guard, engage
+from rsltrace.guard.install import installed
+from rsltrace.guard.pin import pinned_place
+from rsltrace.guard.virtual.clocks import opencv_clock
+from rsltrace.guard.virtual.ordering import ordered_sets
+from rsltrace.guard.virtual.randomness import begin_shared
+from rsltrace.guard.virtual.torch_streams import torch_streams
+from rsltrace.job import Job, NodeSpec, policy_of
+from rsltrace.model.finding import Finding, GuardCount, Source
+from rsltrace.trace.format import METADATA_GUARD
+from rsltrace.trace.guarded import counts_text
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.recorder import Recorder
+from rsltrace.trace.writer import TraceWriter
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.core import Core
+
+
+class Guarding:
+    """The guard of one run; without one (``guard: false``) everything here does nothing."""
+
+    def __init__(self, job: Job, stack: ExitStack) -> None:
+        self._job = job
+        self._stack = stack
+        self.guard: Guard | None = None
+        self._core: Core | None = None
+        self._early: list[Finding] = []
+
+    def begin(self, core: Core, replay: Path | None = None) -> None:
+        """Make the guard of a world: from here on ``engaged`` puts it in charge."""
+        from rsltrace.doors.rclpy.guard_context import GuardContext
+
+        def on_finding(finding: Finding) -> None:
+            if core.recorder is not None:
+                core.recorder.finding(finding, core.loop.now_ns)
+            elif not core.loop.events:
+                self._early.append(finding)  # of an import, before there is a trace
+
+        self._core = core
+        if replay is not None and not self._job.guard.enabled:
+            raise JobError("'guard: false' in the job: nothing from outside can be given again")
+        job = self._job
+        if job.guard.enabled:
+            self.guard = Guard(
+                GuardContext(core),
+                policy=policy_of(job.guard),
+                seed=job.seed,
+                packages=_packages(job.nodes),
+                on_finding=on_finding,
+            )
+            begin_shared(job.seed)
+            if replay is not None:
+                with Trace.open(replay) as trace:
+                    kept = [one for found in trace.findings.values() for one in found]
+                self.guard.outside.replay(kept, str(replay))
+        core.default_policy = policy_of(job.guard)
+        if self.guard is not None and self.guard.is_virtual(Source.CLOCK):
+            self._begin_log_time(core.loop.now_ns)
+        if "torch" in sys.modules:
+            self.torch_loaded()
+
+    def _begin_log_time(self, now_ns: int) -> None:
+        """Let ``logging`` count the time of a record from the begin of the run."""
+        module: Any = logging
+        self._stack.callback(setattr, module, "_startTime", module._startTime)
+        whole = isinstance(module._startTime, int)  # nanoseconds, from Python 3.13 on
+        module._startTime = now_ns if whole else now_ns / 1e9
+
+    def torch_loaded(self) -> None:
+        """Give each node a state of torch's generator from now on."""
+        core, guard = self._core, self.guard
+        if core is None or guard is None or core.on_node is not None:
+            return
+        streams = torch_streams(self._stack, guard)
+        name_of = guard.context.node
+
+        def on_node(node: object, *, is_made: bool = False) -> None:
+            (streams.rename if is_made else streams.enter)(name_of())
+
+        core.on_node = on_node
+        streams.enter(name_of())
+
+    def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
+        """Write down what was found before there was a trace: when modules were imported."""
+        for finding in self._early:
+            recorder.finding(finding, now_ns)
+        self._early.clear()
+
+    @property
+    def counts(self) -> tuple[GuardCount, ...]:
+        """How often each call was met so far."""
+        counts = self.guard.counts if self.guard is not None else {}
+        return tuple(GuardCount(*key, count) for key, count in sorted(counts.items()))
+
+    def write(self, writer: TraceWriter) -> None:
+        """Put the summary into the trace, if there is anything to say."""
+        summary = {}
+        if self.counts:
+            summary["calls"] = counts_text(self.counts)
+        states = self._core.states if self._core is not None else {}
+        left_out = {name: state.left_out for name, state in states.items() if state.left_out}
+        if left_out:
+            summary["left_out"] = json.dumps(left_out, sort_keys=True, ensure_ascii=False)
+        if summary:
+            writer.add_metadata(METADATA_GUARD, summary)
+
+    def engaged(self) -> AbstractContextManager[None]:
+        """Put the guard in charge of what this thread does now."""
+        return nullcontext() if self.guard is None else engage(self.guard)
+
+
+def guarding(stack: ExitStack, job: Job) -> Guarding:
+    """Put the replacements in place until ``stack`` ends."""
+    made = Guarding(job, stack)
+    if job.guard.enabled:
+        if job.guard.pins:
+            stack.enter_context(pinned_place())
+        stack.enter_context(installed())
+        folders = [str(job.resolve(folder)) for folder in job.search_path]
+        on_loaded = {"torch": made.torch_loaded, "cv2": lambda: opencv_clock(stack)}
+        if "cv2" in sys.modules:
+            opencv_clock(stack)
+        stack.enter_context(ordered_sets(folders, _packages(job.nodes), on_loaded))
+    return made
+
+
+def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
+    """Return a name for an entry that other entries (of other classes) do not change."""
+
+    def own(other: NodeSpec) -> tuple[str, str | None, str | None]:
+        return other.target, other.namespace, other.name
+
+    same = sum(1 for other in before if own(other) == own(spec))
+    name = " ".join(part for part in own(spec) if part)
+    return f"{name} #{same + 1}" if same else name
+
+
+def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+    return frozenset(re.split("[:./]", spec.target)[0] for spec in nodes) - {
+        "rsltrace",
+        "rclpy",
+    }
+
+
+__all__ = ["Guarding", "entry_key", "guarding"]

@@ -1,0 +1,133 @@
+"""From ``policy: {recorded: …}`` to the order that a run follows, and what a run writes for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.errors import JobError, TraceError
+from rsltrace.job import Job, locate
+from rsltrace.loop.choices import Choices, decoded
+from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.ordered import OrderedLoop
+from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
+from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
+from rsltrace.model.event import EventKind
+from rsltrace.run.plans.scheduling import of_order, own_policy
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.writer import TraceWriter
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.middleware.recorded_run import Following
+
+ATTACHMENT_CHOICES = "rsltrace/choices"
+"""What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
+
+
+def following(job: Job, core: Core, stack: ExitStack) -> Following | None:
+    """Have a run follow the order of a recording, if the job says so; it stays open as long as
+    ``stack``.
+
+    :raises JobError: if the recording cannot be read, or has nothing to follow.
+    """
+    from rsltrace.middleware.recorded_run import Following
+
+    if job.policy is None or job.policy.recorded is None:
+        return None
+    trace = _opened(job, job.policy.recorded, stack)
+    met = core.met
+    assert met is not None, "a job with a policy has rules"
+    file = Path(job.policy.recorded).name
+    order = Recorded(file, _Events(trace).event, _chosen(trace), met.describe_all())
+    return Following(core, order, is_whole=trace.complete)
+
+
+def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
+    where = locate(job, ("policy", "recorded"))
+    try:
+        trace = stack.enter_context(Trace.open(job.resolve(path)))
+        trace.check()
+    except TraceError as error:
+        raise JobError(str(error), where=where) from None
+    if trace.event_count == 0:
+        raise JobError(
+            f"{path} has no events to follow: it was cut off before the first was "
+            "written (record.segment_events says how often that is)",
+            where=where,
+        )
+    return trace
+
+
+def note_choices(loop: EventLoop) -> None:
+    """Have a loop remember what its policy chooses; what comes first needs no remembering."""
+    if isinstance(loop, OrderedLoop) and not isinstance(loop.policy, Fifo):
+        loop.choices = Choices()
+
+
+def keep_choices(writer: TraceWriter, loop: EventLoop) -> None:
+    """Write down what a policy has chosen, if it had a choice."""
+    if isinstance(loop, OrderedLoop) and loop.choices:
+        data = loop.choices.encoded()
+        writer.add_attachment(ATTACHMENT_CHOICES, "application/octet-stream", data)
+
+
+def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:
+    """Return what chooses as the recording's policy did, None if nobody knows.
+
+    A recording that was cut off has no choices; its policy, made again, makes the same ones.
+    """
+    data = trace.attachment(ATTACHMENT_CHOICES)
+    if data is not None:
+        choices = decoded(data)
+        return lambda ready, moment: next(choices, None) if len(ready) > 1 else 0
+    resolved = json.loads(trace.job.get("resolved") or "null")
+    if not isinstance(resolved, dict):
+        return None
+    policy = _same_policy(resolved.get("policy") or {"order": "fifo"}, int(resolved["seed"]))
+    return None if policy is None else policy.choose
+
+
+def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
+    """Return the policy of a resolved job, None if it cannot be made."""
+    if spec.get("priority") is not None:
+        return Priority([PriorityRule(**rule) for rule in spec["priority"]])
+    if spec.get("function") is not None:
+        with suppress(JobError):
+            return own_policy(spec["function"], "")
+    return of_order(str(spec.get("order")), seed)
+
+
+class _Events:
+    """The events of a recording up to its end, read once, from the first to the last."""
+
+    def __init__(self, trace: Trace) -> None:
+        self._following = _events(trace)
+        self._next = 0
+        self._present: RecordedEvent | None = None
+
+    def event(self, index: int) -> RecordedEvent | None:
+        """Return the event of an index, which is no less than that of the call before."""
+        while self._next <= index:
+            self._present = next(self._following, None)
+            self._next += 1
+        return self._present
+
+
+def _events(trace: Trace) -> Iterator[RecordedEvent]:
+    names = {}
+    for entity in trace.entities.values():
+        node = trace.node_of(entity).name if entity.node else ""
+        names[entity.id] = described(entity, node)
+    left = trace.event_count if trace.ended_after is None else trace.ended_after
+    for rows in trace.events():
+        for stamp, kind, entity_id in zip(
+            rows["stamp"].tolist(), rows["kind"].tolist(), rows["entity"].tolist(), strict=True
+        ):
+            if left == 0 or kind == EventKind.SHUTDOWN:
+                return
+            left -= 1
+            yield RecordedEvent(stamp, kind, entity_id, names.get(entity_id, THE_RUN))

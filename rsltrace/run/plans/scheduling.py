@@ -1,0 +1,100 @@
+"""From a job's ``policy:``, ``executors:`` and ``execution:`` to the plan that a world follows."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.chance.stream import Stream
+from rsltrace.errors import JobError
+from rsltrace.job import Job, locate
+from rsltrace.loop.policy import (
+    Fifo,
+    Permutation,
+    Policy,
+    Priority,
+    PriorityRule,
+    RateMonotonic,
+)
+from rsltrace.loop.recorded import Recorded
+from rsltrace.run.plans.network import distribution_of
+from rsltrace.run.plans.target import load_target
+
+if TYPE_CHECKING:
+    from rsltrace.middleware.scheduling import SchedulingPlan
+
+
+def is_ordered(job: Job) -> bool:
+    """Whether a job needs more than the plain loop."""
+    policy = job.policy
+    fifo = policy is None or policy.order == "fifo"
+    return not fifo or job.executors is not None or job.execution is not None
+
+
+def scheduling_plan(job: Job, start_ns: int, recorded: Recorded | None) -> SchedulingPlan:
+    """Return the plan of a job. ``recorded`` is the order that it follows, if it says so.
+
+    :raises JobError: if the policy's class cannot be made.
+    """
+    from rsltrace.middleware.scheduling import ExecutionRule, ExecutorRule, SchedulingPlan
+
+    rules = []
+    if job.execution is not None:
+        for spec in job.execution.entities:
+            rules.append(ExecutionRule(spec.node, spec.entity, distribution_of(job, spec)))
+        for name, by_node in job.execution.nodes.items():
+            rules.append(ExecutionRule(name, None, distribution_of(job, by_node)))
+        if job.execution.default is not None:
+            rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
+    return SchedulingPlan(
+        policy=recorded or _policy(job),
+        executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
+        occupies=job.executors is not None or job.execution is not None,
+        execution=tuple(rules),
+        seed=job.seed,
+        start_ns=start_ns,
+    )
+
+
+def _policy(job: Job) -> Policy:
+    spec = job.policy
+    if spec is None:
+        return Fifo()
+    if spec.order is not None:
+        policy = of_order(spec.order, job.seed)
+        assert policy is not None, "the job has been checked"
+        return policy
+    if spec.priority is not None:
+        rules = [PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in spec.priority]
+        return Priority(rules)
+    return own_policy(spec.function, locate(job, ("policy", "function")))
+
+
+def of_order(order: str, seed: int) -> Policy | None:
+    """Return the policy that a job calls by a word alone, None if there is none of that name."""
+    if order == "permutation":
+        return Permutation(Stream(seed, "permutation"))
+    if order == "rate_monotonic":
+        return RateMonotonic()
+    return Fifo() if order == "fifo" else None
+
+
+def own_policy(function: Any, where: str) -> Policy:
+    """Make a policy of the user's own.
+
+    :raises JobError: beginning with ``where``, if there is no such class, or it is no policy.
+    """
+    if isinstance(function, str):
+        function = load_target(function, where=where)
+    try:
+        policy: Any = function()
+    except Exception as error:
+        raise JobError(
+            f"the policy cannot be made: {type(error).__qualname__}: {error}", where=where
+        ) from error
+    if not callable(getattr(policy, "choose", None)):
+        raise JobError(
+            f"a {type(policy).__qualname__} has no method choose(ready, moment): see "
+            "docs/policies.md",
+            where=where,
+        )
+    return policy  # type: ignore[no-any-return]

@@ -1,0 +1,572 @@
+"""Executables as they are: ``main()`` functions with their own init, executors and shutdown."""
+
+from __future__ import annotations
+
+import atexit
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.context import Context
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    ShutdownException,
+    SingleThreadedExecutor,
+    TimeoutException,
+)
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+from std_srvs.srv import Trigger
+
+from rsltrace import NodeSpec
+from rsltrace.errors import DeadlockError, NodeError
+
+pytestmark = pytest.mark.ros
+
+
+def seconds(node: Node) -> float:
+    return float(node.get_clock().now().nanoseconds) / 1e9
+
+
+def main_spec(main: Any, *words: str, **options: Any) -> NodeSpec:
+    return NodeSpec(main=main, arguments=list(words), **options)
+
+
+class Counter(Node):
+    """Publishes 1, 2, 3, … every half second."""
+
+    def __init__(self) -> None:
+        super().__init__("counter")
+        self.publisher = self.create_publisher(UInt64, "numbers", 10)
+        self.count = 0
+        self.create_timer(0.5, self.tick)
+
+    def tick(self) -> None:
+        self.count += 1
+        self.publisher.publish(UInt64(data=self.count))
+
+
+def listener(log: list[Any], name: str = "listener", depth: int = 10) -> Node:
+    node = Node(name)
+    node.create_subscription(
+        UInt64, "numbers", lambda m: log.append((m.data, seconds(node))), depth
+    )
+    return node
+
+
+def test_mains_spin_and_are_told_to_end_as_by_ctrl_c(simulate: Any) -> None:
+    log: list[Any] = []
+    ends: list[str] = []
+
+    def talk() -> None:
+        rclpy.init()
+        node = Counter()
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt:
+            ends.append(f"talk interrupted, context {'up' if rclpy.ok() else 'down'}")
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+            ends.append("talk ended")
+
+    def listen() -> None:
+        try:
+            context = Context()
+            rclpy.init(context=context)
+            node = Node("other", context=context)
+            node.create_subscription(UInt64, "numbers", lambda m: log.append(m.data), 10)
+            executor = SingleThreadedExecutor(context=context)
+            executor.add_node(node)
+            executor.spin()
+        except (KeyboardInterrupt, ExternalShutdownException) as error:
+            ends.append(f"listen: {type(error).__name__}")
+
+    recorded = simulate(main_spec(talk), main_spec(listen), duration=2)
+    assert log == [1, 2, 3, 4]
+    assert ends == ["talk interrupted, context down", "talk ended", "listen: KeyboardInterrupt"]
+    assert recorded.result.notes == ()
+    with recorded.trace() as trace:
+        mains = [
+            e.name.rpartition(".")[2] for e in trace.entities.values() if e.kind.label == "main"
+        ]
+    assert mains == ["talk", "listen"]
+    kinds = recorded.kinds()
+    assert kinds == ["construct"] * 2 + ["timer", "subscription"] * 4 + ["resume"] * 2
+
+
+def test_every_main_has_its_own_arguments_and_default_context(simulate: Any) -> None:
+    seen: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("program")
+        node.declare_parameter("gain", 0.0)
+        seen.append(
+            (sys.argv[1:], node.get_fully_qualified_name(), node.get_parameter("gain").value)
+        )
+        node.create_publisher(UInt64, "numbers", 1)
+        rclpy.spin_once(node, timeout_sec=1.0)
+        seen.append(
+            (sys.argv[1:], rclpy.ok(), rclpy.utilities.get_default_context() is node.context)
+        )
+        rclpy.shutdown()
+        seen.append(rclpy.ok())
+
+    before = list(sys.argv)
+    recorded = simulate(
+        main_spec(program, "--fast", name="one", parameters={"gain": 1.5}),
+        main_spec(program, "x", "--ros-args", "-r", "__ns:=/two", "-p", "gain:=2.5"),
+        main_spec(program, remappings={"numbers": "counts"}, namespace="/three"),
+        duration=5,
+    )
+    two = ["x", "--ros-args", "-r", "__ns:=/two", "-p", "gain:=2.5"]
+    assert seen[:3] == [
+        (["--fast"], "/one", 1.5),
+        (two, "/two/program", 2.5),
+        ([], "/three/program", 0.0),
+    ]
+    assert seen[3:] == [
+        (["--fast"], True, True), False, (two, True, True), False, ([], True, True), False,
+    ]  # fmt: skip
+    assert sys.argv == before
+    with recorded.trace() as trace:
+        topics = [e.name for e in trace.entities.values() if "/UInt64" in e.type]
+    assert topics == ["/numbers", "/two/numbers", "/three/counts"]
+    assert recorded.result.stop_reason == "every main has ended"
+    assert recorded.result.sim_seconds == "1.000000000"
+
+
+def test_callbacks_of_a_node_nobody_spins_do_not_run_and_its_queue_has_its_depth(
+    simulate: Any,
+) -> None:
+    log: list[Any] = []
+
+    def late() -> None:
+        rclpy.init()
+        node = listener(log, depth=2)
+        idle = listener(log, "idle")
+        time.sleep(2.2)
+        assert log == []
+        rclpy.spin_once(node)
+        log.append(("between", seconds(node)))
+        rclpy.spin_once(node)
+        rclpy.spin_once(node, timeout_sec=0.1)
+        log.append(("timed out", seconds(node)))
+        idle.destroy_node()
+
+    recorded = simulate(Counter, main_spec(late), duration=4)
+    assert log == [(3, 2.2), ("between", 2.2), (4, 2.2), ("timed out", 2.3)]
+    assert any("late ended at 2.300000000 s" in note for note in recorded.result.notes)
+
+
+def test_a_main_that_never_spins_is_said(simulate: Any) -> None:
+    def hasty() -> None:
+        rclpy.init()
+        Counter()
+
+    recorded = simulate(main_spec(hasty), duration=3)
+    (note,) = recorded.result.notes
+    assert note.endswith(
+        "hasty ended at 0.000000000 s without ever spinning: no callback of /counter has run"
+    )
+    assert recorded.kinds() == ["construct"]
+
+
+def test_what_a_callback_raises_comes_out_of_spin(simulate: Any) -> None:
+    caught: list[str] = []
+
+    def careful() -> None:
+        rclpy.init()
+        node = Node("careful")
+        node.create_timer(1.0, lambda: 1 / 0)
+        for _ in range(2):
+            try:
+                rclpy.spin(node)
+            except ZeroDivisionError as error:
+                caught.append(str(error))
+        raise SystemExit(7)
+
+    recorded = simulate(main_spec(careful), duration=10)
+    assert caught == ["division by zero"] * 2
+    assert recorded.result.exit_code == 7
+    (note,) = recorded.result.notes
+    assert "careful exited with 7 at 2.000000000 s" in note
+
+
+def test_an_exception_nobody_catches_ends_the_run_and_names_the_callback(simulate: Any) -> None:
+    def careless() -> None:
+        rclpy.init()
+        node = Node("careless")
+        node.create_timer(1.0, lambda: 1 / 0)
+        rclpy.spin(node)
+
+    with pytest.raises(NodeError) as caught:
+        simulate(main_spec(careless), duration=10)
+    assert str(caught.value).startswith("/careless: timer test_an_exception")
+    assert "at simulated time 1.000000000 s raised ZeroDivisionError" in str(caught.value)
+    assert "1 / 0" in caught.value.traceback_text
+
+
+def test_spin_until_future_complete_and_a_missing_server(simulate: Any) -> None:
+    log: list[Any] = []
+
+    class Server(Node):
+        def __init__(self) -> None:
+            super().__init__("server")
+            self.create_service(Trigger, "ask", self.answer)
+
+        def answer(self, request: Any, response: Any) -> Any:
+            response.message = f"at {seconds(self)}"
+            return response
+
+    def client() -> None:
+        rclpy.init()
+        node = Node("client")
+        client = node.create_client(Trigger, "ask")
+        while not client.wait_for_service(timeout_sec=1.0):
+            log.append("waiting")
+        future = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(node, future)
+        log.append(future.result().message)
+        missing = node.create_client(Trigger, "nobody")
+        future = missing.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(node, future, timeout_sec=1.5)
+        log.append((future.done(), seconds(node)))
+        rclpy.spin_until_future_complete(node, future)
+
+    def server() -> None:
+        rclpy.init()
+        rclpy.spin(Server())
+
+    with pytest.raises(DeadlockError) as caught:
+        simulate(main_spec(client), main_spec(server))
+    assert log == ["at 0.25", (False, 1.75)]
+    assert "client waits for a future to be completed" in str(caught.value)
+    assert "rclpy.spin_until_future_complete(node, future)" not in str(caught.value)
+    assert "server waits" not in str(caught.value), "whoever spins waits for more work, for ever"
+
+
+def test_a_service_call_on_ones_own_single_threaded_executor_is_a_deadlock(simulate: Any) -> None:
+    """As natively: the executor is in the callback and cannot run the response."""
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("selfish")
+        group = ReentrantCallbackGroup()
+        node.create_service(Trigger, "ask", lambda q, r: r, callback_group=group)
+        client = node.create_client(Trigger, "ask", callback_group=group)
+        node.create_timer(1.0, lambda: client.call(Trigger.Request()), callback_group=group)
+        rclpy.spin(node)
+
+    with pytest.raises(DeadlockError, match=r"/selfish: timer .* waits for the response"):
+        simulate(main_spec(program))
+
+
+def test_an_executor_class_of_the_users_own(simulate: Any) -> None:
+    order: list[str] = []
+
+    class Picky(Executor):
+        """The example of rclpy's documentation: one override."""
+
+        def spin_once(self, timeout_sec: float | None = None) -> None:
+            try:
+                handler, _, node = self.wait_for_ready_callbacks(timeout_sec=timeout_sec)
+            except (ShutdownException, TimeoutException):
+                return
+            order.append(node.get_name() if node else "task")
+            handler()
+            if handler.exception() is not None:
+                raise handler.exception()
+
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        executor = Picky()
+        executor.add_node(Counter())
+        executor.add_node(listener(log))
+        task = executor.create_task(lambda: "made")
+        executor.spin_once()
+        order.append(task.result())
+        executor.spin()
+
+    simulate(main_spec(program), duration=1)
+    assert [value for value, _ in log] == [1, 2]
+    assert order == ["task", "made", *["counter", "listener"] * 2]
+
+
+def test_polling_without_a_timeout_takes_time(simulate: Any) -> None:
+    turns = 0
+
+    def program() -> None:
+        nonlocal turns
+        rclpy.init()
+        node = Node("poller")
+        done: list[int] = []
+        node.create_timer(0.25, lambda: done.append(1))
+        while len(done) < 2:
+            rclpy.spin_once(node, timeout_sec=0)
+            turns += 1
+
+    recorded = simulate(main_spec(program), duration=5)
+    assert recorded.result.sim_seconds == "0.500000000"
+    assert 900 < turns < 1100  # a look takes a millisecond, except the first at an instant
+    assert recorded.kinds() == ["construct", "timer", "timer", "resume"]
+
+
+def test_the_same_twice_gives_the_same_digest(simulate: Any) -> None:
+    def run() -> str:
+        log: list[Any] = []
+
+        def listen() -> None:
+            rclpy.init()
+            rclpy.spin(listener(log))
+
+        def talk() -> None:
+            rclpy.init()
+            rclpy.spin(Counter())
+
+        return str(simulate(main_spec(listen), main_spec(talk), duration=3).result.digest)
+
+    assert run() == run()
+
+
+@pytest.mark.parametrize("record_it", [True, False])
+def test_a_run_without_recording_has_as_many_events(record_it: bool, tmp_path: Any) -> None:
+    from rsltrace import Job, StopSpec, record
+
+    def program() -> None:
+        rclpy.init()
+        node = Counter()
+        for _ in range(3):
+            rclpy.spin_once(node)
+            node.get_logger().info("turn")
+
+    job = Job(nodes=[main_spec(program)], stop=StopSpec(duration=5), base_dir=tmp_path)
+    assert record(job, tmp_path / "run.mcap" if record_it else None).events == 7
+
+
+def test_wait_for_message_in_a_main_and_in_a_callback(simulate: Any) -> None:
+    from rclpy.wait_for_message import wait_for_message
+
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("waits")
+        ok, message = wait_for_message(UInt64, node, "numbers")
+        log.append((ok, message.data, seconds(node)))
+        log.append(wait_for_message(UInt64, node, "silence", time_to_wait=0.25))
+        log.append(seconds(node))
+
+    class Asks(Node):
+        def __init__(self) -> None:
+            super().__init__("asks")
+            self.once = self.create_timer(1.2, self.tick)
+
+        def tick(self) -> None:
+            self.once.cancel()
+            log.append(wait_for_message(UInt64, self, "numbers")[1].data)
+
+    simulate(Counter, Asks, main_spec(program), duration=3)
+    assert log == [(True, 1, 0.5), (False, None), 0.75, 3]
+
+
+def test_the_events_executor(simulate: Any) -> None:
+    events_executor = pytest.importorskip("rclpy.experimental.events_executor")
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        executor = events_executor.EventsExecutor()
+        executor.add_node(listener(log))
+        executor.spin()
+
+    simulate(Counter, main_spec(program), duration=1)
+    assert log == [(1, 0.5), (2, 1.0)]
+
+
+def test_a_main_that_has_cleaned_up_has_spun_all_the_same(simulate: Any) -> None:
+    def program() -> None:
+        rclpy.init()
+        node = rclpy.create_node("tidy")
+        rclpy.spin_once(node, timeout_sec=0.5)
+        node.destroy_node()
+        rclpy.shutdown()
+
+    recorded = simulate(main_spec(program), duration=2)
+    (note,) = recorded.result.notes
+    assert note.endswith("program ended at 0.500000000 s")
+
+
+def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program(name: str, exit_ns: int) -> Any:
+        def main() -> None:
+            rclpy.init()
+            node = Node(name)
+            atexit.register(lambda: log.append((name, "first", seconds(node))))
+            atexit.register(log.append, (name, "second"))
+            atexit.register(log.append, "never")
+            atexit.unregister(log.append)
+            atexit.register(log.append, (name, "last"))
+            time.sleep(exit_ns)
+
+        return main_spec(main)
+
+    simulate(program("one", 1), program("two", 9), duration=3)
+    assert log == [
+        ("one", "last"), ("one", "first", 1.0), ("two", "last"), ("two", "first", 1.0),
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda node: rclpy.spin_once(node, timeout_sec=0.5),
+        lambda node: rclpy.spin(node),
+        lambda node: time.sleep(0.5),
+    ],
+    ids=["spin_once", "spin", "sleep"],
+)
+def test_a_main_that_will_not_hear_of_the_end_is_left_behind(
+    simulate: Any, work: Callable[[Node], None]
+) -> None:
+    def deaf() -> None:
+        rclpy.init()
+        node = Node("deaf")
+        while True:
+            try:
+                work(node)
+            except BaseException:
+                continue
+
+    log: list[str] = []
+
+    def polite() -> None:
+        rclpy.init()
+        try:
+            rclpy.spin(Counter())
+        finally:
+            log.append("ended")
+
+    recorded = simulate(main_spec(deaf), main_spec(polite), duration=2)
+    assert log == ["ended"]
+    assert recorded.result.stop_reason == "duration of 2.000000000 s"
+
+
+def test_a_simulation_steps_through_mains(tmp_path: Any) -> None:
+    import rsltrace
+
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = listener(log)
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt:
+            log.append("ended")
+
+    job = rsltrace.Job(
+        nodes=[main_spec(program)], stop=rsltrace.StopSpec(duration=9), base_dir=tmp_path
+    )
+    with rsltrace.Simulation(job) as sim:
+        sim.run_for(1.0)
+        sim.publish("/numbers", UInt64(data=5))
+        sim.run_for(0.5)
+        assert [value for value, _ in log] == [5]
+        sim.publish("/numbers", UInt64(data=6))
+        sim.run_for(0.5)
+    assert [entry if isinstance(entry, str) else entry[0] for entry in log] == [5, 6, "ended"]
+
+
+def test_a_callback_with_an_execution_time_keeps_its_executor_busy(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("slow")
+        node.create_timer(1.0, lambda: log.append(("a", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("b", seconds(node))))
+        rclpy.spin(node)
+
+    simulate(
+        main_spec(program),
+        duration=3.5,
+        job={"execution": {"nodes": {"/slow": {"constant": "0.5s"}}}},
+    )
+    assert log == [
+        ("a", 1.0),
+        ("b", 1.5),
+        ("a", 2.0),
+        ("b", 2.5),
+        ("a", 3.0),
+    ]
+
+
+def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
+    simulate: Any,
+) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("slow")
+        reentrant = ReentrantCallbackGroup()
+        node.create_timer(1.0, lambda: log.append(("a", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("b", seconds(node))))
+        node.create_timer(1.25, lambda: log.append(("r", seconds(node))), callback_group=reentrant)
+        executor = MultiThreadedExecutor(3)
+        executor.add_node(node)
+        executor.spin()
+
+    simulate(
+        main_spec(program),
+        duration=2,
+        job={"execution": {"nodes": {"/slow": {"constant": "0.5s"}}}},
+    )
+    assert log == [("a", 1.0), ("r", 1.25), ("b", 1.5), ("a", 2.0)]
+
+
+def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
+    from rsltrace.doors.rclpy.stacks.program import _FAILURES_MAX, Program
+
+    kept: list[int] = []
+
+    class Faulty(Node):
+        def __init__(self) -> None:
+            super().__init__("faulty")
+            self.count = 0
+            self.create_timer(0.1, self.tick)
+
+        def tick(self) -> None:
+            self.count += 1
+            raise KeyError(self.count)
+
+    def main() -> None:
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+
+        rclpy.init()
+        executor = SingleThreadedExecutor()
+        executor.add_node(Faulty())
+        for number in range(3 * _FAILURES_MAX):
+            with pytest.raises(KeyError, match=str(number + 1)):
+                executor.spin_once()
+        import gc
+
+        held = [each for each in gc.get_objects() if isinstance(each, Program)]
+        kept.extend(len(each.failures) for each in held if each.entry is not None)
+        rclpy.shutdown()
+
+    simulate(NodeSpec(main=main))
+    assert kept == [_FAILURES_MAX]

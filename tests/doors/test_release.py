@@ -1,0 +1,46 @@
+"""A release of ROS 2 that rsltrace does not know is refused before anything runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+import rsltrace.doors.rclpy.installation as installing
+from rsltrace.doors.rclpy.boundary.boundary import Boundary
+from rsltrace.doors.rclpy.boundary.timers import TimerHandle
+from rsltrace.doors.rclpy.installation import boundary
+from rsltrace.doors.rclpy.release import missing_parts
+from rsltrace.errors import SetupError
+
+pytestmark = pytest.mark.ros
+
+
+def test_a_missing_part_of_the_boundary_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    boundary()  # this release is complete
+    monkeypatch.setattr(installing, "_installed", None)
+    monkeypatch.delattr(Boundary, "rclpy_get_topic_names_and_types")
+    monkeypatch.delattr(TimerHandle, "time_since_last_call")
+    with pytest.raises(SetupError) as caught:
+        boundary()
+    text = str(caught.value)
+    assert "it uses Timer.time_since_last_call, rclpy_get_topic_names_and_types of" in text
+    assert "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)" in text
+    assert installing._installed is None
+
+
+def test_only_what_rclpy_uses_and_has_is_missed(tmp_path: Path) -> None:
+    (tmp_path / "deep").mkdir()
+    (tmp_path / "deep" / "new.py").write_text(
+        "x: '_rclpy.OnlyForTypeCheckers'\n_rclpy.teleport(1)\n_rclpy.known()\nhandle.beam(2)\n"
+    )
+
+    class Timer:
+        def beam(self) -> None: ...
+        def unused(self) -> None: ...
+
+    real = SimpleNamespace(teleport=1, known=2, unused=3, Timer=Timer)
+    ours = SimpleNamespace(known=2)
+    assert missing_parts(real, ours, {"Timer": object}, tmp_path) == ["Timer.beam", "teleport"]
+    assert missing_parts(real, real, {"Timer": Timer}, tmp_path) == []
