@@ -8,7 +8,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from rsltrace.bag.mcap_file import McapFile
-from rsltrace.bag.mcap_records import MAGIC as MCAP_MAGIC
 from rsltrace.bag.metadata import NAME, read_metadata
 from rsltrace.bag.sqlite_file import MAGIC as SQLITE_MAGIC
 from rsltrace.bag.sqlite_file import SqliteFile
@@ -16,6 +15,7 @@ from rsltrace.bag.sqlite_recover import recover_database
 from rsltrace.bag.storage import Storage
 from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
+from rsltrace.mcap.records import MAGIC as MCAP_MAGIC
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

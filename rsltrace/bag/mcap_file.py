@@ -10,14 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from rsltrace.bag.mcap_chunk import cut_messages, read_chunk
-from rsltrace.bag.mcap_index import CutOffError, read_index
-from rsltrace.bag.mcap_records import MAGIC, Channel
-from rsltrace.bag.mcap_scan import McapIndex, Span
+from rsltrace.bag.mcap_index import read_index
+from rsltrace.bag.mcap_scan import McapIndex, Part
 from rsltrace.bag.merge import Message
 from rsltrace.bag.qos import parse_qos
 from rsltrace.bag.storage import Extent, StoredTopic
 from rsltrace.errors import BagError
+from rsltrace.mcap.chunk import cut_messages, read_chunk
+from rsltrace.mcap.records import Channel, CutOff, Damaged
+from rsltrace.mcap.source import FileSource
 from rsltrace.model.stamp import format_seconds
 
 
@@ -29,14 +30,15 @@ class McapFile:
         self.path = path
         self._recover = recover
         self.with_publish_time = False
-        self._file = path.open("rb")
+        self._closed = False
+        self._source = FileSource(path, BagError)
         try:
             self._index = self._read_index()
-            self._spans = {span.offset: span for span in self._index.spans}
-            channels = self._index.channels.values()
+            self._parts = {part.span.offset: part for part in self._index.parts}
+            channels = self._index.definitions.channels.values()
             self.topics = [self._topic(channel) for channel in channels]
         except BaseException:
-            self._file.close()
+            self.close()
             raise
         self.message_count = self._index.counts.total()
         self.start_ns, self.end_ns = self._index.start_ns, self._index.end_ns
@@ -44,29 +46,28 @@ class McapFile:
 
     def close(self) -> None:
         """Close the file."""
-        self._file.close()
+        self._closed = True
+        self._source.close()
 
     def extents(self, wanted: Mapping[int, int], first_ns: int) -> list[Extent]:
         """Return the chunks that may hold wanted messages, in file order."""
         extents = []
-        for span in self._index.spans:
-            known = span.channels is None or not span.channels.isdisjoint(wanted)
-            if known and span.end_ns >= first_ns:
-                extents.append(
-                    Extent(span.offset, span.length, max(span.start_ns, first_ns), span.end_ns)
-                )
+        for part in self._index.parts:
+            known = part.channels is None or not part.channels.isdisjoint(wanted)
+            if known and part.end_ns >= first_ns:
+                extents.append(Extent(*part.span, max(part.start_ns, first_ns), part.end_ns))
         return extents
 
     def read(self, extent: Extent, wanted: Mapping[int, int], first_ns: int) -> Iterator[Message]:
         """Yield the wanted messages of a chunk by time, equal times in file order."""
-        yield from self._messages(self._spans[extent.offset], wanted, first_ns)
+        yield from self._messages(self._parts[extent.offset], wanted, first_ns)
 
     def count(self, wanted: Mapping[int, int], first_ns: int) -> int:
         """Return how many wanted messages there are."""
         count = sum(self._index.counts[channel] for channel in wanted)
-        for span in self._index.spans if first_ns > self.start_ns else []:
-            if span.start_ns < first_ns:
-                messages = self._messages(span, wanted, 0)
+        for part in self._index.parts if first_ns > self.start_ns else []:
+            if part.start_ns < first_ns:
+                messages = self._messages(part, wanted, 0)
                 count -= sum(stamp_ns < first_ns for stamp_ns, _, _ in messages)
         return count
 
@@ -77,48 +78,43 @@ class McapFile:
         for extent in sorted(extents, key=lambda extent: extent.end_ns, reverse=True):
             if last_ns is not None and extent.end_ns <= last_ns:
                 break
-            messages = self._messages(self._spans[extent.offset], wanted, first_ns)
+            messages = self._messages(self._parts[extent.offset], wanted, first_ns)
             if messages:
                 last_ns = max(messages[-1][0], last_ns or 0)
         return last_ns
 
-    def _messages(self, span: Span, wanted: Mapping[int, int], first_ns: int) -> list[Message]:
-        if self._file.closed:
+    def _messages(self, part: Part, wanted: Mapping[int, int], first_ns: int) -> list[Message]:
+        if self._closed:
             raise ValueError(f"{self.path} is closed")
         try:
-            if span.is_chunk:
-                data = read_chunk(self._file, span.offset, span.length)
+            if part.is_chunk:
+                records = read_chunk(self._source, part.span, needs_crc=False)
             else:
-                self._file.seek(span.offset)
-                data = self._file.read(span.length)
+                records = self._source.read_at(*part.span)
             messages = cut_messages(
-                data, wanted, first_ns, with_publish_time=self.with_publish_time
+                records, wanted, first_ns, with_publish_time=self.with_publish_time
             )
             # The order of the whole stream rests on these two times.
-            if messages and not (span.start_ns <= messages[0][0] <= messages[-1][0] <= span.end_ns):
-                raise ValueError("messages lie outside the times the index promises")
-        except (ValueError, OSError) as error:
+            if messages and not (part.start_ns <= messages[0][0] <= messages[-1][0] <= part.end_ns):
+                raise Damaged("messages lie outside the times the index promises")
+        except Damaged as error:
             raise BagError(
-                f"{self.path}: {error}, in the {'chunk' if span.is_chunk else 'messages'} at byte "
-                f"{span.offset} (log time {format_seconds(span.start_ns)} to "
-                f"{format_seconds(span.end_ns)}); repair it with 'mcap recover'"
+                f"{self.path}: {error}, in the {'chunk' if part.is_chunk else 'messages'} at byte "
+                f"{part.span.offset} (log time {format_seconds(part.start_ns)} to "
+                f"{format_seconds(part.end_ns)}); repair it with 'mcap recover'"
             ) from None
         return messages
 
     def _read_index(self) -> McapIndex:
-        magic = self._file.read(len(MAGIC))
-        if magic != MAGIC:
-            raise BagError(f"{self.path}: not an MCAP file")
-        size = self._file.seek(0, 2)
         try:
-            index = read_index(self._file, size, recover=self._recover)
-        except CutOffError as error:
+            index = read_index(self._source, recover=self._recover)
+        except CutOff as error:
             raise BagError(
                 f"{self.path}: the recording was cut off, its footer and index are missing: "
                 f"{error}. Repair it with 'mcap recover {self.path.name} -o repaired.mcap' (and "
                 "'ros2 bag reindex' if it belongs to a bag folder)"
             ) from None
-        except (ValueError, OSError) as error:
+        except Damaged as error:
             raise BagError(f"{self.path}: {error}; repair it with 'mcap recover'") from None
         if index.profile not in ("ros2", ""):
             ros1 = index.profile == "ros1"
@@ -129,7 +125,7 @@ class McapFile:
         return index
 
     def _topic(self, channel: Channel) -> StoredTopic:
-        schema = self._index.schemas.get(channel.schema_id)
+        schema = self._index.definitions.schemas.get(channel.schema_id)
         try:
             offered = parse_qos(channel.metadata.get("offered_qos_profiles", ""))
         except ValueError as error:

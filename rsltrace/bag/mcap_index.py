@@ -1,4 +1,4 @@
-"""Where the messages of an MCAP file are: from its summary, or by walking the file without one.
+"""Where the messages of an MCAP recording are: from its summary, or by walking the file.
 
 The summary is taken only if it tells everything: chunks may be indexed without their messages,
 messages may stand outside chunks, and a writer may leave the summary out. What it does not tell
@@ -7,157 +7,108 @@ messages may stand outside chunks, and a writer may leave the summary out. What 
 
 from __future__ import annotations
 
-import struct
-import zlib
-from typing import BinaryIO
-
-from rsltrace.bag.mcap_chunk import iterate_records
-from rsltrace.bag.mcap_records import (
-    CHANNEL,
-    CHUNK_INDEX,
-    FOOTER,
-    FOOTER_BYTES,
-    HEADER,
-    MAGIC,
-    RECORD_HEAD,
-    SCHEMA,
-    STATISTICS,
-    ChunkIndex,
-    Fields,
-    Statistics,
-    parse_channel,
-    parse_chunk_index,
-    parse_schema,
-    parse_statistics,
+from rsltrace.bag.mcap_scan import McapIndex, Part, how_far, scan_file, scan_records
+from rsltrace.mcap.records import CutOff, Damaged
+from rsltrace.mcap.source import ByteSource
+from rsltrace.mcap.summary import (
+    Footer,
+    Summary,
+    data_crc,
+    has_end,
+    read_footer,
+    read_header,
+    read_summary,
 )
-from rsltrace.bag.mcap_scan import McapIndex, Span, how_far, scan_file, scan_records, walk_records
 
 
-class CutOffError(ValueError):
-    """The file has no footer. ``str`` says how far it is good."""
+def read_index(source: ByteSource, *, recover: bool = False) -> McapIndex:
+    """Return the index of an MCAP file.
 
-
-def read_index(file: BinaryIO, size: int, *, recover: bool = False) -> McapIndex:
-    """Return the index of an MCAP file of ``size`` bytes.
-
-    Raises ``ValueError`` saying what is damaged and at which byte, ``CutOffError`` when the end is
-    missing; with ``recover`` the index is then that of what is whole.
+    Raises Damaged saying what is damaged and at which byte, CutOff when the end is missing (how
+    far the file is good); with ``recover`` the index is then that of what is whole.
     """
-    footer_at = size - FOOTER_BYTES
-    file.seek(max(0, footer_at))
-    footer = file.read(FOOTER_BYTES)
-    if footer_at < len(MAGIC) or not footer.endswith(MAGIC):
-        end, text = how_far(file, size)
+    if not has_end(source):
+        end, text = how_far(source)
         if not recover:
-            raise CutOffError(text)
-        profile, data_start = _header(file, end)
+            raise CutOff(text)
+        profile, data_start = _profile(source)
         index = McapIndex(profile, cut_off=text)
-        scan_file(file, data_start, end, index)
+        scan_file(source, data_start, end, index)
         return index
-    profile, data_start = _header(file, footer_at)
-    index = McapIndex(profile)
-    opcode, length = RECORD_HEAD.unpack_from(footer)
-    if (opcode, length) != (FOOTER, 20):
-        raise ValueError(f"the footer at byte {footer_at} is damaged")
-    summary_at, _, crc = struct.unpack_from("<QQI", footer, RECORD_HEAD.size)
-    if summary_at == 0:
-        scan_file(file, data_start, footer_at, index)
-        _check_data_crc(file, index)
-        return index
-    if not data_start <= summary_at <= footer_at:
-        raise ValueError(f"the footer at byte {footer_at} is damaged")
-    file.seek(summary_at)
-    summary = file.read(footer_at - summary_at)
-    if crc and zlib.crc32(footer[: RECORD_HEAD.size + 16], zlib.crc32(summary)) != crc:
-        raise ValueError(f"the CRC of the summary at byte {summary_at} does not match")
+    profile, data_start = _profile(source)
     try:
-        complete = _take_summary(file, summary, data_start, summary_at, index)
-    except (ValueError, struct.error) as error:
-        raise ValueError(f"the summary at byte {summary_at} is damaged ({error})") from None
+        footer = read_footer(source)
+    except Damaged as error:
+        raise Damaged(f"the footer before byte {source.size} is damaged ({error})") from None
+    start = footer.summary_start
+    index = McapIndex(profile)
+    complete = start != 0 and _take_summary(source, footer, data_start, index)
     if not complete:
         index = McapIndex(profile)
-        scan_file(file, data_start, summary_at, index)
-    if not complete or not all(span.is_chunk for span in index.spans):
-        _check_data_crc(file, index)
+        scan_file(source, data_start, start or footer.offset, index)
+    # What no chunk's CRC covers: a file that was walked, messages outside chunks.
+    unchecked = not complete or not all(part.is_chunk for part in index.parts)
+    if unchecked and index.data_crc and index.data_crc != data_crc(source, index.data_size):
+        raise Damaged(f"the CRC of the data section (up to byte {index.data_size}) is wrong")
     return index
 
 
-def _check_data_crc(file: BinaryIO, index: McapIndex) -> None:
-    """Check what no chunk's CRC covers: a file that was walked, messages outside chunks."""
-    if index.data_crc == 0:
-        return
-    file.seek(0)
-    crc, rest = 0, index.data_size
-    while rest:
-        block = file.read(min(rest, 1 << 20))
-        if not block:
-            raise ValueError("the data section is cut off")
-        crc, rest = zlib.crc32(block, crc), rest - len(block)
-    if crc != index.data_crc:
-        raise ValueError(f"the CRC of the data section (up to byte {index.data_size}) is wrong")
-
-
-def _header(file: BinaryIO, end: int) -> tuple[str, int]:
+def _profile(source: ByteSource) -> tuple[str, int]:
     """Return the profile and where the data begins."""
-    for opcode, start, after in walk_records(file, len(MAGIC), end):
-        if opcode != HEADER:
-            break
-        file.seek(start)
-        return Fields(file.read(after - start)).text(), after
-    raise ValueError(f"there is no header record at byte {len(MAGIC)}")
+    try:
+        header, data_start = read_header(source)
+    except Damaged as error:
+        raise Damaged(f"there is no header record ({error})") from None
+    return header.profile, data_start
 
 
-def _take_summary(
-    file: BinaryIO, summary: bytes, data_start: int, data_end: int, index: McapIndex
-) -> bool:
+def _take_summary(source: ByteSource, footer: Footer, data_start: int, index: McapIndex) -> bool:
     """Fill ``index`` from the summary; say whether it tells everything."""
-    chunks: list[ChunkIndex] = []
-    statistics: Statistics | None = None
-    for opcode, start, end in iterate_records(summary):
-        content = summary[start:end]
-        if opcode == SCHEMA:
-            schema = parse_schema(content)
-            index.schemas[schema.id] = schema
-        elif opcode == CHANNEL:
-            channel = parse_channel(content)
-            index.channels[channel.id] = channel
-        elif opcode == CHUNK_INDEX:
-            chunks.append(parse_chunk_index(content))
-        elif opcode == STATISTICS:
-            statistics = parse_statistics(content)
-    if statistics is None or statistics.chunks != len(chunks):
-        return False
-    if not statistics.counts.keys() <= index.channels.keys():
-        return False
-    if statistics.messages != sum(statistics.counts.values()):
-        return False
-    if any(c.schema_id not in index.schemas for c in index.channels.values() if c.schema_id):
-        return False
+    start = footer.summary_start
+    try:
+        if start < data_start:
+            raise Damaged("it would begin in the header")
+        summary = read_summary(source, footer)
+        if not _tells_everything(summary):
+            return False
+        return _take_parts(source, summary, data_start, start, index)
+    except Damaged as error:
+        raise Damaged(f"the summary at byte {start} is damaged ({error})") from None
+
+
+def _tells_everything(summary: Summary) -> bool:
+    statistics, channels = summary.statistics, summary.channels
+    return (
+        statistics is not None
+        and statistics.chunks == sum(1 for _ in summary.chunks())
+        and statistics.counts.keys() <= channels.keys()
+        and statistics.messages == sum(statistics.counts.values())
+        and all(c.schema_id in summary.schemas for c in channels.values() if c.schema_id)
+    )
+
+
+def _take_parts(
+    source: ByteSource, summary: Summary, data_start: int, data_end: int, index: McapIndex
+) -> bool:
+    """Add the indexed chunks and the messages between them; no if there is a chunk the index
+    lacks."""
+    index.definitions = summary
+    at = data_start
+    for chunk in sorted(summary.chunks(), key=lambda chunk: chunk.span.offset):
+        if chunk.span.offset < at or chunk.span.end > data_end:
+            raise Damaged(f"a chunk at byte {chunk.span.offset} lies outside the data")
+        if not scan_records(source, at, chunk.span.offset, index, skip_chunks=True):
+            return False
+        channels = frozenset(channel for channel, _ in chunk.indexes) or None
+        index.parts.append(Part(chunk.span, chunk.start_ns, chunk.end_ns, channels, True))
+        at = chunk.end
+    if at > data_end:
+        raise Damaged(f"the index reaches past byte {data_end}, the end of the data")
+    complete = scan_records(source, at, data_end, index, skip_chunks=True)
+    statistics = summary.statistics
+    assert statistics is not None
+    # The statistics count the messages outside chunks, too.
+    index.counts.clear()
     index.counts.update(statistics.counts)
     index.start_ns, index.end_ns = statistics.start_ns, statistics.end_ns
-
-    at = data_start
-    for chunk in sorted(chunks, key=lambda chunk: chunk.offset):
-        if chunk.offset < at or chunk.offset + chunk.length > data_end:
-            raise ValueError(f"a chunk at byte {chunk.offset} lies outside the data")
-        if not _take_gap(file, at, chunk.offset, index):
-            return False
-        channels = chunk.channels or None
-        index.spans.append(
-            Span(chunk.offset, chunk.length, chunk.start_ns, chunk.end_ns, channels, True)
-        )
-        at = chunk.offset + chunk.length + chunk.index_length
-    return _take_gap(file, at, data_end, index)
-
-
-def _take_gap(file: BinaryIO, start: int, end: int, index: McapIndex) -> bool:
-    """Find messages between indexed chunks; say no when there is a chunk the index lacks."""
-    if start >= end:
-        if start > end:
-            raise ValueError(f"the index reaches past byte {end}, the end of the data")
-        return True
-    counts = index.counts.copy()
-    complete = scan_records(file, start, end, index, skip_chunks=True)
-    # The statistics count these messages already.
-    index.counts = counts
     return complete

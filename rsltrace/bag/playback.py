@@ -8,10 +8,10 @@ from fractions import Fraction
 from heapq import heappop, heappush
 from itertools import count
 
-from rsltrace.bag.mcap_chunk import PUBLISH_TIME_BYTES
 from rsltrace.bag.merge import Message
 from rsltrace.bag.reader import Bag
 from rsltrace.errors import BagError
+from rsltrace.mcap.chunk import PUBLISH_TIME_BYTES
 
 BY_LOG_TIME = "log_time"
 BY_PUBLISH_TIME = "publish_time"

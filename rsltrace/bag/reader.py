@@ -11,12 +11,12 @@ from pathlib import Path
 from types import TracebackType
 
 from rsltrace.bag.files import ZSTD_MAGIC, BagFiles, open_files
-from rsltrace.bag.mcap_chunk import PUBLISH_TIME_BYTES
 from rsltrace.bag.merge import Message, Piece, merge
 from rsltrace.bag.select import select_topics, unmatched
 from rsltrace.bag.storage import Extent, Storage, StoredTopic
 from rsltrace.bag.topic import BagTopic
 from rsltrace.errors import BagError
+from rsltrace.mcap.chunk import PUBLISH_TIME_BYTES
 from rsltrace.model.stamp import format_duration
 
 STAMP_NS_MAX = 2**63 - 1
@@ -60,8 +60,11 @@ class Bag:
         self._files = files
         filled = [storage for storage in files.storages if storage.message_count]
         if not filled:
-            cut = "".join(f"\n  {note}" for note in files.notes)
-            raise BagError(f"{path}: the bag is empty: it holds no messages{cut}")
+            empty = "the bag is empty: it holds no messages"
+            if files.storages and all(storage.cut_off for storage in files.storages):
+                empty = "the recording was cut off before its first whole chunk"
+            notes = "".join(f"\n  {note}" for note in files.notes)
+            raise BagError(f"{path}: {empty}{notes}")
         self.recording_start_ns = min(storage.start_ns for storage in filled)
         self.recording_end_ns = max(storage.end_ns for storage in filled)
         if self.recording_start_ns < 0 or self.recording_end_ns > STAMP_NS_MAX:

@@ -6,32 +6,25 @@ changed environment or job, or events whose hashes are not those of their conten
 
 from __future__ import annotations
 
-from binascii import crc32
-
 import numpy as np
 import numpy.typing as npt
-from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap.records import Damaged
+from rsltrace.mcap.source import ByteSource
+from rsltrace.mcap.summary import check_data
 from rsltrace.trace.chain import hash64, verify_chain
 from rsltrace.trace.format import OUTPUT_DTYPE, OUTPUT_HASHED
-from rsltrace.trace.records import RECORD_HEAD, Span, damaged, read_body
+from rsltrace.trace.pieces import damaged
 from rsltrace.trace.segments import SegmentReader
-from rsltrace.trace.source import ByteSource
-
-_DATA_END_BYTES = RECORD_HEAD.size + 4
-_BLOCK_BYTES = 1 << 20
 
 
 def check_data_section(source: ByteSource, summary_start: int) -> None:
     """Raise TraceError unless the bytes before the summary have the checksum given there."""
-    end = summary_start - _DATA_END_BYTES
-    body = read_body(source, Span(end, _DATA_END_BYTES), Opcode.DATA_END, "the end of the data")
-    crc = 0
-    for offset in range(0, end, _BLOCK_BYTES):
-        crc = crc32(source.read_at(offset, min(_BLOCK_BYTES, end - offset)), crc)
-    if crc != int.from_bytes(body, "little"):
-        raise damaged(source, 0, "the data section", "its checksum does not match")
+    try:
+        check_data(source, summary_start)
+    except Damaged as error:
+        raise damaged(source, 0, "the data section", error) from error
 
 
 def check_hashes(source: ByteSource, segments: SegmentReader) -> None:

@@ -22,7 +22,7 @@ from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rsltrace.errors import TraceError
-from rsltrace.trace.format import SCHEMA_ENCODING
+from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)

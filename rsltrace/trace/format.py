@@ -10,13 +10,11 @@ import struct
 
 import numpy as np
 
+from rsltrace.mcap.layout import MESSAGE_HEADER_DTYPE
 from rsltrace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"
-MCAP_MAGIC = b"\x89MCAP0\r\n"
-SCHEMA_ENCODING = "ros2msg"
-MESSAGE_ENCODING = "cdr"
 
 TOPIC_EVENTS = "/rsltrace/events"
 TOPIC_OUTPUTS = "/rsltrace/outputs"
@@ -144,19 +142,6 @@ OUTPUT_CONTENT = struct.Struct("<QII")
 
 OUTPUT_CONTENT_DTYPE = np.dtype([("hash", "<u8"), ("entity", "<u4"), ("kind", "<u4")])
 OUTPUT_DTYPE = np.dtype([("event", "<u8"), *OUTPUT_CONTENT_DTYPE.descr, ("sequence", "<u4")])
-
-MESSAGE_HEADER_DTYPE = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<u8"),
-        ("channel_id", "<u2"),
-        ("message_sequence", "<u4"),
-        ("log_time", "<u8"),
-        ("publish_time", "<u8"),
-    ]
-)
-"""An MCAP Message record up to its data. ``message_sequence`` is what MCAP calls ``sequence``: an
-output has a field of that name too, and the two stand in one numpy layout below."""
 
 EVENT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *EVENT_DTYPE.descr])
 OUTPUT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *OUTPUT_DTYPE.descr])

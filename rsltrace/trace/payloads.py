@@ -15,19 +15,11 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap.chunk import MessageView, message_at
+from rsltrace.mcap.records import Damaged, Fields, Span
+from rsltrace.mcap.source import ByteSource
 from rsltrace.trace.index import ChunkEntry, TraceIndex
-from rsltrace.trace.records import (
-    Cursor,
-    Damaged,
-    MessageView,
-    Span,
-    damaged,
-    message_at,
-    read_body,
-    read_chunk,
-    walk_messages,
-)
-from rsltrace.trace.source import ByteSource
+from rsltrace.trace.pieces import damaged, messages_in, read_body, read_chunk
 
 _CHUNKS_CACHED = 4
 """Payload chunks have about half a megabyte, so this is memory; two topics read side by side need
@@ -106,16 +98,16 @@ class PayloadReader:
         """Return where in the records of a chunk the messages of a channel are."""
         if index_span is None:
             try:
-                walked = walk_messages(self._records(span))
-                return [offset for offset, view in walked if view.channel_id == channel_id]
+                walked = messages_in(self._records(span))
+                return [offset for channel, offset in walked if channel == channel_id]
             except Damaged as error:
                 raise damaged(self._source, span.offset, "the chunk", error) from error
         body = read_body(self._source, index_span, Opcode.MESSAGE_INDEX, "the message index")
         try:
-            cursor = Cursor(body)
-            if cursor.u16() != channel_id:
+            fields = Fields(body)
+            if fields.u16() != channel_id:
                 raise Damaged("it is that of another channel")
-            entries = cursor.take(cursor.u32())
+            entries = fields.take(fields.u32())
             if len(entries) % _INDEX_DTYPE.itemsize:
                 raise Damaged("an entry is cut off")
         except Damaged as error:

@@ -17,6 +17,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap.place import open_source
+from rsltrace.mcap.records import Header
+from rsltrace.mcap.source import ByteSource
+from rsltrace.mcap.summary import has_end
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.model.finding import Finding, GuardCount
@@ -39,18 +43,11 @@ from rsltrace.trace.format import (
     TOPIC_ROSOUT,
 )
 from rsltrace.trace.guarded import parse_counts
-from rsltrace.trace.index import (
-    ChannelInfo,
-    Header,
-    has_end,
-    read_attachment,
-    read_metadata,
-    read_summary,
-)
+from rsltrace.trace.index import ChannelInfo, read_summary
 from rsltrace.trace.payloads import PayloadReader
+from rsltrace.trace.pieces import read_attachment, read_metadata
 from rsltrace.trace.scan import scan
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
-from rsltrace.trace.source import ByteSource, open_source
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder

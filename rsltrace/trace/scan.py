@@ -1,40 +1,28 @@
 """The index of a trace that has none: its run was killed, or is still going on.
 
 The file is walked from its start as far as its records are whole. What comes after the last whole
-segment (payloads and outputs of events that were never written) belongs to no event. A chunk that
-is whole but does not match its checksum is no cut but damage, and an error.
+segment (payloads and outputs of events that were never written) belongs to no event. What is whole
+but does not match its checksum, or has more behind it, is no cut but damage, and an error.
 """
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Mapping
+
 import numpy as np
 from mcap.opcode import Opcode
 
+from rsltrace.errors import TraceError
+from rsltrace.mcap.chunk import read_chunk
+from rsltrace.mcap.records import Damaged, Fields, Span
+from rsltrace.mcap.source import ByteSource
+from rsltrace.mcap.summary import Summary
+from rsltrace.mcap.walk import read_body, whole_records
 from rsltrace.trace.format import METADATA_FORMAT, SEGMENT_DTYPE, TOPIC_EVENTS, TOPIC_OUTPUTS
-from rsltrace.trace.index import (
-    ChunkEntry,
-    Schemas,
-    TraceIndex,
-    add_channel,
-    add_schema,
-    check_version,
-    not_a_trace,
-    read_header,
-)
-from rsltrace.trace.records import (
-    RECORD_HEAD,
-    Cursor,
-    Damaged,
-    Span,
-    damaged,
-    message_at,
-    read_body,
-    read_chunk,
-    read_head,
-    walk_messages,
-)
+from rsltrace.trace.index import ChunkEntry, TraceIndex, check_version, not_a_trace, read_header
+from rsltrace.trace.pieces import messages_in
 from rsltrace.trace.segments import check_numbered, events_in, outputs_in
-from rsltrace.trace.source import ByteSource
 
 
 def scan(source: ByteSource) -> TraceIndex:
@@ -45,23 +33,38 @@ def scan(source: ByteSource) -> TraceIndex:
 class _Scanner:
     def __init__(self, source: ByteSource) -> None:
         self._source = source
-        header, self._offset = read_header(source)
+        header, self._whole = read_header(source)
         self._index = TraceIndex(complete=False, header=header)
-        self._schemas: Schemas = {}
+        self._summary = Summary()
         self._chunks: list[ChunkEntry] = []
         self._rows: list[np.void] = []
         self._event_channel = -1
         self._output_channel = -1
         self._pending_outputs = (Span(0, 0), 0)
+        self._what = "the record"
 
     def run(self) -> TraceIndex:
         """Walk the file."""
-        if self._take() != Opcode.METADATA or METADATA_FORMAT not in self._index.metadata:
-            raise not_a_trace(self._source, self._index)
-        check_version(self._source, self._index)
-        while self._take() not in (None, Opcode.DATA_END):
-            pass
-        index = self._index
+        index, summary = self._index, self._summary
+        try:
+            for number, (opcode, span) in enumerate(whole_records(self._source)):
+                if number == 0:  # the header
+                    continue
+                if number == 1 and opcode != Opcode.METADATA:
+                    break
+                self._what = "the chunk" if opcode == Opcode.CHUNK else "the record"
+                self._take(opcode, span)
+                if number == 1:
+                    index.metadata = summary.metadata
+                    check_version(self._source, index)
+                if opcode == Opcode.DATA_END:
+                    break
+                self._whole, self._what = span.end, "the record"
+        except Damaged as error:
+            raise self._damaged(error) from error
+        if METADATA_FORMAT not in summary.metadata:
+            raise not_a_trace(self._source, index)
+        index.take(summary)
         if self._rows:
             index.segments = np.array(self._rows, dtype=SEGMENT_DTYPE)
         for entry in self._chunks:
@@ -73,64 +76,46 @@ class _Scanner:
         ]
         return index
 
-    def _take(self) -> int | None:
-        """Take over the next record and return its opcode; None where the file was cut off."""
-        source, offset = self._source, self._offset
-        if offset + RECORD_HEAD.size > source.size:
-            return None
-        opcode, length = read_head(source, offset)
-        # A file system may leave zeros where a crash came before the data; no record begins so.
-        if opcode == 0 or offset + length > source.size:
-            return None
-        span = Span(offset, length)
-        self._offset = sum(span)
-        try:
-            self._take_over(opcode, span)
-        except Damaged as error:
-            raise damaged(source, offset, "the record", error) from error
-        return opcode
-
-    def _take_over(self, opcode: int, span: Span) -> None:
+    def _take(self, opcode: int, span: Span) -> None:
+        """Take over a record. Raises Damaged."""
+        source, summary = self._source, self._summary
         if opcode == Opcode.CHUNK:
             self._chunk(span)
         elif opcode == Opcode.MESSAGE_INDEX:
             self._message_index(span)
         elif opcode in _NAMED_AFTER:
-            cursor = Cursor(read_body(self._source, span, opcode, "the record"))
-            cursor.take(_NAMED_AFTER[opcode])
-            name = cursor.text()
-            target = self._index.metadata if opcode == Opcode.METADATA else self._index.attachments
-            target[name] = span
-        elif opcode == Opcode.SCHEMA:
-            add_schema(self._schemas, read_body(self._source, span, opcode, "the schema"))
-        elif opcode == Opcode.CHANNEL:
-            body = read_body(self._source, span, opcode, "the channel")
-            add_channel(self._index, self._schemas, body)
-            ids = {info.topic: info.id for info in self._index.channels.values()}
+            fields = Fields(read_body(source, span, opcode))
+            fields.take(_NAMED_AFTER[opcode])
+            named = summary.metadata if opcode == Opcode.METADATA else summary.attachments
+            named[fields.text()] = span
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            summary.add(opcode, read_body(source, span, opcode))
+            ids = {channel.topic: channel.id for channel in summary.channels.values()}
             self._event_channel = ids.get(TOPIC_EVENTS, -1)
             self._output_channel = ids.get(TOPIC_OUTPUTS, -1)
+        elif opcode != Opcode.DATA_END:
+            raise Damaged(f"a record of kind {opcode} is where a trace has none")
 
     def _message_index(self, span: Span) -> None:
-        channel_id = Cursor(read_body(self._source, span, Opcode.MESSAGE_INDEX, "the index")).u16()
-        if self._chunks:
-            last = self._chunks[-1]
-            indexes = {**last.indexes, channel_id: span}
-            self._chunks[-1] = ChunkEntry(last.span, last.counts, indexes)
+        fields = Fields(read_body(self._source, span, Opcode.MESSAGE_INDEX))
+        channel_id = fields.u16()
+        fields.take(fields.u32())
+        if not fields.at_end or not self._chunks or channel_id not in self._chunks[-1].counts:
+            raise Damaged("it is not the index of the chunk before it")
+        last = self._chunks[-1]
+        self._chunks[-1] = last._replace(indexes={**last.indexes, channel_id: span})
 
     def _chunk(self, span: Span) -> None:
         records = read_chunk(self._source, span)
-        channel_id = message_at(records, 0).channel_id
+        counts: Mapping[int, int]
+        channel_id, _ = next(messages_in(records), (-1, 0))
         if channel_id == self._event_channel:
-            count = self._events(span, records)
-            counts = {channel_id: count}
+            counts = {channel_id: self._events(span, records)}
         elif channel_id == self._output_channel:
-            count = len(outputs_in(records, channel_id))
-            self._pending_outputs = (span, count)
-            counts = {channel_id: count}
+            counts = {channel_id: len(outputs_in(records, channel_id))}
+            self._pending_outputs = (span, counts[channel_id])
         else:
-            counts = {}
-            for _, message in walk_messages(records):
-                counts[message.channel_id] = counts.get(message.channel_id, 0) + 1
+            counts = Counter(channel_id for channel_id, _ in messages_in(records))
         self._chunks.append(ChunkEntry(span, counts, {}))
 
     def _events(self, span: Span, records: bytes) -> int:
@@ -154,6 +139,14 @@ class _Scanner:
         self._rows.append(row)
         self._pending_outputs = (Span(0, 0), 0)
         return len(events)
+
+    def _damaged(self, why: Damaged) -> TraceError:
+        name, whole, size = self._source.name, self._whole, self._source.size
+        return TraceError(
+            f"{name}: {self._what} at offset {whole} is damaged ({why}): the first {whole} of "
+            f"{size} bytes are whole, and more follows; copy the file again or record it again "
+            f"(head -c {whole} keeps what is whole)"
+        )
 
 
 _NAMED_AFTER = {int(Opcode.METADATA): 0, int(Opcode.ATTACHMENT): 16}

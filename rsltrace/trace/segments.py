@@ -13,6 +13,8 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap.records import RECORD_HEAD, Damaged, Span
+from rsltrace.mcap.source import ByteSource
 from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
 from rsltrace.trace.format import (
     EVENT_DTYPE,
@@ -20,8 +22,7 @@ from rsltrace.trace.format import (
     OUTPUT_DTYPE,
     OUTPUT_MESSAGE_DTYPE,
 )
-from rsltrace.trace.records import RECORD_HEAD, Damaged, Span, damaged, read_chunk
-from rsltrace.trace.source import ByteSource
+from rsltrace.trace.pieces import damaged, read_chunk
 
 _CDR_LITTLE_ENDIAN = b"\x00\x01"
 """The CDR header as numpy gives it: without the zeros at its end."""
@@ -104,7 +105,9 @@ class SegmentReader:
         row = self.table[segment]
         span = Span(int(row["events_offset"]), int(row["events_length"]))
         try:
-            events = events_in(read_chunk(self._source, span), self._event_channel)
+            # What the table says is all the memory there is for it.
+            size_max = int(row["events"]) * EVENT_MESSAGE_DTYPE.itemsize
+            events = events_in(read_chunk(self._source, span, size_max), self._event_channel)
             if len(events) != row["events"] or events["chain_hash"][-1] != row["chain_hash"]:
                 raise Damaged("it is not the one the index speaks of")
             check_numbered(events, int(row["first_event"]))
@@ -119,7 +122,8 @@ class SegmentReader:
             return np.zeros(0, dtype=OUTPUT_DTYPE)
         span = Span(int(row["outputs_offset"]), int(row["outputs_length"]))
         try:
-            outputs = outputs_in(read_chunk(self._source, span), self._output_channel)
+            size_max = int(row["outputs"]) * OUTPUT_MESSAGE_DTYPE.itemsize
+            outputs = outputs_in(read_chunk(self._source, span, size_max), self._output_channel)
             owners = outputs["event"]
             first = int(row["first_event"])
             if (

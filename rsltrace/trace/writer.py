@@ -18,6 +18,10 @@ import numpy.typing as npt
 
 from rsltrace._version import __version__
 from rsltrace.errors import OutputError
+from rsltrace.mcap.chunk_body import Waiting, messages_chunk
+from rsltrace.mcap.limits import MESSAGE_BYTES_MAX
+from rsltrace.mcap.records import MESSAGE_HEAD
+from rsltrace.mcap.writer import McapWriter
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE
 from rsltrace.model.finding import Finding
@@ -28,7 +32,6 @@ from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
-    MESSAGE_HEADER_DTYPE,
     METADATA_ENVIRONMENT,
     METADATA_FORMAT,
     METADATA_RESULT,
@@ -52,9 +55,8 @@ from rsltrace.trace.format import (
     TOPIC_STATES,
 )
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
-from rsltrace.trace.stream import McapStream
 
-_HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
+_HEADER_BYTES = MESSAGE_HEAD.size
 SEGMENT_MEDIA_TYPE = "application/octet-stream"
 
 
@@ -92,9 +94,9 @@ class TraceWriter:
         self.add_output: Callable[[bytes], None] = self._outputs.append
         self._output_sequences = array("I")
         self.add_sequence: Callable[[int], None] = self._output_sequences.append
-        self._payloads: chunks.Waiting = []
+        self._payloads: Waiting = []
         self._payload_bytes = 0
-        self._entities: chunks.Waiting = []
+        self._entities: Waiting = []
         self._entity_bytes = 0
         self._sequences: list[int] = [0]  # by channel id, which counts from 1
         self._channel_ids: dict[tuple[str, str], int] = {}
@@ -103,7 +105,7 @@ class TraceWriter:
         self._outputs_written = 0
         self._last_chain_hash = 0
         self._ros_distro = ""
-        self._stream = McapStream(
+        self._stream = McapWriter(
             path,
             force=force,
             compression=compression,
@@ -274,12 +276,17 @@ class TraceWriter:
                 f"a topic has more than {NO_SEQUENCE} messages, more than a trace can number; "
                 "leave its payloads out (record: exclude: in the job)"
             )
+        if self._payload_bytes > MESSAGE_BYTES_MAX + PAYLOAD_BYTES_PER_CHUNK:
+            raise OutputError(
+                f"a message has more than {MESSAGE_BYTES_MAX} bytes, more than a trace can hold; "
+                "leave its topic out (record: exclude: in the job)"
+            )
         self._write_waiting(self._payloads)
         self._payload_bytes = 0
 
-    def _write_waiting(self, waiting: chunks.Waiting) -> None:
+    def _write_waiting(self, waiting: Waiting) -> None:
         try:
-            self._stream.chunk(chunks.payloads_chunk(waiting))
+            self._stream.chunk(messages_chunk(waiting))
             waiting.clear()
         except BaseException:
             self._stream.poison()

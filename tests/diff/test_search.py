@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.traces.search import first_difference
 from rsltrace.errors import TraceError
+from rsltrace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.source import FileSource
 
 CHAIN = Plan(
     (

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 
 import rsltrace
 from rsltrace.errors import SetupError, TraceError, TraceFormatError
+from rsltrace.mcap.place import open_source
+from rsltrace.mcap.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
+from rsltrace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
-from rsltrace.trace.remote import BLOCK_BYTES, CACHE_BYTES, RemoteSource
-from rsltrace.trace.source import FileSource, open_source
 from tests.range_server import RangeServer
 
 PLAN = Plan(

@@ -227,5 +227,5 @@ def test_a_chunk_that_claims_to_be_huge_costs_no_memory(
         damaged = bytearray(data[:-8])
         damaged[place + 25 : place + 33] = size.to_bytes(8, "little")
         path.write_bytes(damaged)
-        with pytest.raises(TraceError, match="does not unpack to"):
+        with pytest.raises(TraceError, match=r"a chunk of \d+ bytes"):
             Trace.open(path)

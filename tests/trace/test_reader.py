@@ -13,13 +13,14 @@ from mcap.writer import Writer
 from trace_maker import Feeder, Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import TraceError, TraceFormatError
+from rsltrace.mcap.records import Span
+from rsltrace.mcap.source import FileSource
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace import index as index_module
 from rsltrace.trace.format import EVENT_DTYPE, EVENTS_PER_SEGMENT, OUTPUT_DTYPE
+from rsltrace.trace.pieces import read_chunk
 from rsltrace.trace.reader import RUN, Trace
-from rsltrace.trace.records import read_chunk
-from rsltrace.trace.source import FileSource
 
 EVENTS = 2 * EVENTS_PER_SEGMENT + 500
 
@@ -233,9 +234,9 @@ def test_looking_up_neighbours_unpacks_a_segment_once(
     write_run(path, 1000)
     unpacked = []
 
-    def count(source: FileSource, span: tuple[int, int]) -> bytes:
+    def count(source: FileSource, span: Span, size_max: int) -> bytes:
         unpacked.append(span)
-        return read_chunk(source, span)
+        return read_chunk(source, span, size_max)
 
     monkeypatch.setattr("rsltrace.trace.segments.read_chunk", count)
     with Trace.open(path) as trace:

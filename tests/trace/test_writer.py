@@ -94,7 +94,7 @@ def test_a_folder_without_permission_is_an_output_error(
     def refuse(*_: object) -> int:
         raise PermissionError(errno.EACCES, "Permission denied")
 
-    monkeypatch.setattr("rsltrace.trace.sink.os.open", refuse)  # root may write anywhere
+    monkeypatch.setattr("rsltrace.mcap.sink.os.open", refuse)  # root may write anywhere
     with pytest.raises(OutputError, match=r"Permission denied; choose another place with -o"):
         TraceWriter(tmp_path / "run.mcap", force=False)
 
@@ -241,7 +241,7 @@ def test_equal_schemas_are_written_once_and_a_topic_has_one_channel(tmp_path: Pa
 def test_too_many_topics_is_an_output_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("rsltrace.trace.stream.CHANNELS_MAX", 6)
+    monkeypatch.setattr("rsltrace.mcap.writer.CHANNELS_MAX", 6)
     with Opened(tmp_path / "run.mcap") as feeder:
         feeder.writer.add_channel("/a", "x/msg/T", "")
         feeder.writer.add_channel("/b", "x/msg/T", "")

@@ -12,7 +12,7 @@ from typing import Any
 from textual.app import App
 
 from rsltrace.errors import RsltraceError
-from rsltrace.trace.format import MCAP_MAGIC
+from rsltrace.mcap.records import MAGIC
 from rsltrace_viewer.model.run import Run
 
 _EVERY_S = 0.5
@@ -74,6 +74,6 @@ class Follow:
 def _is_finished(path: Path) -> bool:
     """Return whether a recording was closed: then it has a summary and opens at once."""
     with suppress(OSError), path.open("rb") as stream:
-        stream.seek(-len(MCAP_MAGIC), os.SEEK_END)
-        return stream.read() == MCAP_MAGIC
+        stream.seek(-len(MAGIC), os.SEEK_END)
+        return stream.read() == MAGIC
     return False

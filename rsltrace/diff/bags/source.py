@@ -14,15 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.bag import open_bag
-from rsltrace.diff.bags.cut_off import CutOffFile, is_cut_off
 from rsltrace.diff.file_kind import is_trace
 from rsltrace.errors import RsltraceError, TraceError
-from rsltrace.trace.format import (
-    PREFIX_OWN,
-    PREFIX_REQUEST,
-    PREFIX_RESPONSE,
-    SCHEMA_ENCODING,
-)
+from rsltrace.mcap.records import SCHEMA_ENCODING
+from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE
 
 if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
@@ -74,9 +69,8 @@ def open_source(path: str | os.PathLike[str]) -> Source:
     """
     if is_trace(path):
         return _trace_source(path)
-    if is_cut_off(Path(path)):
-        return _cut_off_source(Path(path))
-    bag = open_bag(path)
+    # Of a folder all is wanted; a file that was cut off can be compared as far as it goes.
+    bag = open_bag(path, recover=Path(path).is_file())
     return Source(
         path=os.fspath(path),
         kind=bag.storage_id,
@@ -90,6 +84,8 @@ def open_source(path: str | os.PathLike[str]) -> Source:
         ),
         read=lambda wanted: (m for m in bag.messages() if m[1] in wanted),
         close=bag.close,
+        complete=not bag.notes,
+        notes=bag.notes,
     )
 
 
@@ -141,37 +137,6 @@ def _payload_notes(trace: Trace) -> tuple[str, ...]:
                 "record.exclude)",
             )
     return ()
-
-
-def _cut_off_source(path: Path) -> Source:
-    cut = CutOffFile(path)
-    topics: dict[SourceTopic, int] = {}
-    numbers: dict[int, int] = {}
-    for channel in cut.channels.values():
-        schema = cut.schemas.get(channel.schema_id)
-        usable = schema is not None and schema.encoding == SCHEMA_ENCODING
-        topic = SourceTopic(
-            channel.topic,
-            schema.name if schema is not None else "",
-            schema.text if schema is not None and usable else "",
-        )
-        numbers[channel.id] = topics.setdefault(topic, len(topics))
-
-    def read(wanted: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
-        return cut.messages({i: number for i, number in numbers.items() if number in wanted})
-
-    return Source(
-        path=str(path),
-        kind="mcap",
-        topics=tuple(topics),
-        read=read,
-        close=lambda: None,
-        complete=False,
-        notes=(
-            f"{path} was cut off: {cut.message_count} messages in the first {cut.whole_bytes} of "
-            f"{cut.size} bytes are compared",
-        ),
-    )
 
 
 # -- decoding --------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import zlib
 from pathlib import Path
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.format import MCAP_MAGIC
+from rsltrace.mcap.records import MAGIC
 
 
 class Sink:
@@ -66,10 +66,10 @@ def _may_be_replaced(path: Path) -> bool:
         if not path.is_file():
             return True
         with path.open("rb") as file:
-            begin = file.read(len(MCAP_MAGIC))
+            begin = file.read(len(MAGIC))
     except OSError:
         return True  # opening it to write says what is wrong
-    return MCAP_MAGIC.startswith(begin)
+    return MAGIC.startswith(begin)
 
 
 def _why_not_created(path: Path, error: OSError) -> str:

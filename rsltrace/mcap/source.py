@@ -1,7 +1,7 @@
-"""Where the bytes of a trace come from: the one narrow place between reader and storage.
+"""Where the bytes of a file come from: the one narrow place between readers and storage.
 
-The reader asks for ranges and nothing else, so a source that fetches ranges over the network can
-take the file's place.
+Readers ask for ranges and nothing else, so a source that fetches ranges over the network can take
+the file's place.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 from pathlib import Path
 from typing import Protocol
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import RsltraceError, TraceError
 
 
 class ByteSource(Protocol):
@@ -21,7 +21,7 @@ class ByteSource(Protocol):
 
     @property
     def name(self) -> str:
-        """A path or address."""
+        """A path, or an address without what is secret in it."""
         ...
 
     @property
@@ -35,7 +35,7 @@ class ByteSource(Protocol):
         ...
 
     def read_at(self, offset: int, length: int) -> bytes:
-        """Return exactly ``length`` bytes from ``offset``. Raises TraceError if it cannot."""
+        """Return exactly ``length`` bytes from ``offset``. Raises an error if it cannot."""
         ...
 
     def close(self) -> None:
@@ -43,39 +43,52 @@ class ByteSource(Protocol):
         ...
 
 
-def check_within(source: ByteSource, offset: int, length: int) -> None:
-    """Raise TraceError if a range is not in the file: where it says that something is."""
-    if offset + length > source.size:
-        raise TraceError(
-            f"{source.name}: {length} bytes at offset {offset} reach beyond the end of the file "
-            f"({source.size} bytes); the file is damaged"
-        )
+def beyond_end(source: ByteSource, offset: int, length: int) -> str:
+    """Return what is wrong with a range that is not in the file, "" if it is."""
+    if offset + length <= source.size:
+        return ""
+    return (
+        f"{source.name}: {length} bytes at offset {offset} reach beyond the end of the file "
+        f"({source.size} bytes); the file is damaged"
+    )
+
+
+def not_regular(path: Path) -> str:
+    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if it is nothing.
+
+    To be asked before it is opened: opening a named pipe waits for a writer.
+    """
+    mode = path.stat().st_mode
+    if stat.S_ISREG(mode):
+        return ""
+    if stat.S_ISDIR(mode):
+        return "a folder"
+    return "a named pipe, not a regular file" if stat.S_ISFIFO(mode) else "not a regular file"
 
 
 class FileSource:
     """A file on disk."""
 
-    def __init__(self, path: Path) -> None:
-        """Open ``path``. Raises TraceError if it is missing, not a file or not readable."""
+    def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
+        """Open ``path``. Raises ``error``, as all methods do, if it cannot be read as a file."""
         self._path = path
+        self._error = error
         self._lock = threading.Lock()
         self._bytes_read = 0
         try:
-            # Looked at before it is opened: opening a named pipe would wait for a writer.
-            status = path.stat()
-            if stat.S_ISDIR(status.st_mode):
-                raise TraceError(f"{path} is a folder; {_folder_hint(path)}")
-            if not stat.S_ISREG(status.st_mode):
-                raise TraceError(
-                    f"{path} is not a regular file; a trace is read out of order, so save it to a "
-                    "file first"
+            kind = not_regular(path)
+            if kind == "a folder":
+                raise error(f"{path} is a folder; {_folder_hint(path)}")
+            if kind:
+                raise error(
+                    f"{path} is {kind}; it is read out of order, so save it to a file first"
                 )
             self._file = open(path, "rb", buffering=0)  # noqa: SIM115  # closed by close()
-        except FileNotFoundError as error:
-            raise TraceError(f"{path} does not exist") from error
-        except OSError as error:
-            raise TraceError(f"{path} cannot be read: {error.strerror or error}") from error
-        self._size = status.st_size
+        except FileNotFoundError as reason:
+            raise error(f"{path} does not exist") from reason
+        except OSError as reason:
+            raise error(f"{path} cannot be read: {reason.strerror or reason}") from reason
+        self._size = os.fstat(self._file.fileno()).st_size
 
     @property
     def name(self) -> str:
@@ -93,15 +106,18 @@ class FileSource:
         return self._bytes_read
 
     def read_at(self, offset: int, length: int) -> bytes:
-        """Return ``length`` bytes from ``offset``. Raises TraceError if the file ends before."""
-        check_within(self, offset, length)
+        """Return ``length`` bytes from ``offset``."""
+        if problem := beyond_end(self, offset, length):
+            raise self._error(problem)
         try:
             data = self._read(offset, length)
-        except (OSError, ValueError) as error:
-            raise TraceError(f"{self._path} cannot be read at offset {offset}: {error}") from error
+        except (OSError, ValueError) as reason:
+            raise self._error(
+                f"{self._path} cannot be read at offset {offset}: {reason}"
+            ) from reason
         self._bytes_read += len(data)
         if len(data) < length:
-            raise TraceError(f"{self._path} became shorter while it was read; open it again")
+            raise self._error(f"{self._path} became shorter while it was read; open it again")
         return data
 
     def close(self) -> None:
@@ -124,18 +140,6 @@ class FileSource:
             offset += len(piece)
             length -= len(piece)
         return pieces[0] if len(pieces) == 1 else b"".join(pieces)
-
-
-def open_source(place: Path | str) -> ByteSource:
-    """Open a file, or an address such as ``https://…`` or ``s3://…``. Raises TraceError.
-
-    Raises SetupError for an address when fsspec, which reads it, is not installed.
-    """
-    if isinstance(place, str) and "://" in place:
-        from rsltrace.trace.remote import open_remote  # a library that local files do not need
-
-        return open_remote(place)
-    return FileSource(Path(place))
 
 
 def _folder_hint(path: Path) -> str:

@@ -7,12 +7,18 @@ other, and a reader that goes through the file from front to back gets ever larg
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from rsltrace.errors import SetupError, TraceError
-from rsltrace.trace.source import check_within
+from rsltrace.mcap import limits
+from rsltrace.mcap.address import public, without_secrets
+from rsltrace.mcap.source import beyond_end
+
+T = TypeVar("T")
 
 BLOCK_BYTES = 32 << 10
 """Small: what is fetched around a piece for nothing is half a block on either side."""
@@ -23,9 +29,6 @@ CACHE_BYTES = 24 << 20
 _AHEAD_BYTES_MAX = 4 << 20
 _IN_A_ROW = 4
 """After so many fetches that follow each other the reader is taken to go on like that."""
-
-_WHOLE_BYTES_MAX = 64 << 20
-"""A server may know no ranges and send all; what is larger has to be downloaded by its owner."""
 
 Fetch = Callable[[int, int], bytes]
 """``fetch(begin, end)`` returns the bytes ``begin <= offset < end``; may raise anything."""
@@ -48,7 +51,7 @@ class RemoteSource:
 
     @property
     def name(self) -> str:
-        """The address as it was given."""
+        """The address, without what is secret in it."""
         return self._name
 
     @property
@@ -63,7 +66,8 @@ class RemoteSource:
 
     def read_at(self, offset: int, length: int) -> bytes:
         """Return ``length`` bytes from ``offset``. Raises TraceError if they cannot be had."""
-        check_within(self, offset, length)
+        if problem := beyond_end(self, offset, length):
+            raise TraceError(problem)
         end = offset + length
         if self._whole is not None:
             return self._whole[offset:end]
@@ -123,15 +127,13 @@ class RemoteSource:
         self.requests += 1
         try:
             data = self._fetch(begin, end)
-        except Exception as error:  # whatever the storage's library raises: there are many
-            raise TraceError(
-                f"{self._name} cannot be read at offset {begin}: {_reason(error)}"
-            ) from error
+        except Exception as error:
+            raise TraceError(f"{self._name} cannot be read at offset {begin}: {error}") from None
         self._bytes_read += len(data)
         if len(data) == end - begin:
             return data
         if len(data) == self._size:
-            if self._size > _WHOLE_BYTES_MAX:
+            if self._size > limits.RESPONSE_BYTES_MAX:
                 raise TraceError(
                     f"the server of {self._name} sends the whole file ({self._size} bytes) instead "
                     "of the range asked for; download it and compare the copy"
@@ -149,12 +151,13 @@ def open_remote(address: str) -> RemoteSource:
 
     Raises SetupError if fsspec, or what it needs for this kind of address, is not installed.
     """
+    name = public(address)
     scheme = address.partition("://")[0]
     try:
         import fsspec
     except ImportError as error:
         raise SetupError(
-            f"reading {address} needs fsspec: pip install 'rsltrace[remote]', or download the file"
+            f"reading {name} needs fsspec: pip install 'rsltrace[remote]', or download the file"
         ) from error
     try:
         filesystem, path = fsspec.core.url_to_fs(address)
@@ -164,18 +167,99 @@ def open_remote(address: str) -> RemoteSource:
             "download the file"
         ) from error
     except ValueError as error:
-        raise TraceError(f"{address} is no address that can be read: {error}") from error
+        reason = without_secrets(str(error), address)
+        raise TraceError(f"{name} is no address that can be read: {reason}") from None
+    clock = _Clock(address)
     try:
-        size = filesystem.info(path)["size"]
-    except FileNotFoundError as error:
-        raise TraceError(f"{address} does not exist, or cannot be reached") from error
-    except Exception as error:  # as above
-        raise TraceError(f"{address} cannot be opened: {_reason(error)}") from error
+        size = clock.within(lambda: filesystem.info(path)["size"])
+    except FileNotFoundError:
+        raise TraceError(f"{name} does not exist, or cannot be reached") from None
+    except Exception as error:  # whatever the storage's library raises: there are many
+        raise TraceError(f"{name} cannot be opened: {clock.reason(error)}") from None
     if size is None:
-        raise TraceError(f"{address} does not say how large it is; download it first")
-    fetch: Any = filesystem.cat_file
-    return RemoteSource(address, int(size), lambda begin, end: fetch(path, start=begin, end=end))
+        raise TraceError(f"{name} does not say how large it is; download it first")
+    fetch = _http_fetch(filesystem, address) if scheme in ("http", "https") else None
+
+    def fetch_range(begin: int, end: int) -> bytes:
+        try:
+            if fetch is not None:
+                return clock.within(lambda: fetch(begin, end))
+            return clock.within(lambda: bytes(filesystem.cat_file(path, start=begin, end=end)))
+        except Exception as error:  # as above
+            raise _FetchError(clock.reason(error)) from None
+
+    return RemoteSource(name, int(size), fetch_range)
 
 
-def _reason(error: Exception) -> str:
-    return str(error) or type(error).__name__
+def _http_fetch(filesystem: Any, address: str) -> Fetch:
+    """Return what fetches a range over HTTP, and no more than a limit whatever the server sends:
+    fsspec's own takes all there is, of a server without end until there is no memory left."""
+    from aiohttp import ClientTimeout
+    from fsspec.asyn import sync
+
+    async def fetch(begin: int, end: int) -> bytes:
+        session = await filesystem.set_session()
+        headers = {"Range": f"bytes={begin}-{end - 1}", "Accept-Encoding": "identity"}
+        timeout = ClientTimeout(total=limits.REQUEST_SECONDS_MAX)
+        async with session.get(address, headers=headers, timeout=timeout) as response:
+            if response.status >= 400:
+                raise _FetchError(f"{response.status}, {response.reason}")
+            pieces, length = [], 0
+            most = max(end - begin, limits.RESPONSE_BYTES_MAX)
+            async for piece in response.content.iter_any():
+                pieces.append(piece)
+                length += len(piece)
+                if length > most:
+                    raise _FetchError(
+                        f"the server sends more than {most} bytes where {end - begin} are asked "
+                        "for; download it and compare the copy"
+                    )
+            return b"".join(pieces)
+
+    return lambda begin, end: bytes(sync(filesystem.loop, fetch, begin, end))
+
+
+class _FetchError(Exception):
+    """A range that could not be fetched, in words without secrets."""
+
+
+class _Clock:
+    """Bounds the time that is spent waiting for the server of one address."""
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._left_s = limits.REMOTE_SECONDS_MAX
+
+    def within(self, call: Callable[[], T]) -> T:
+        """Return what ``call`` does, or raise _FetchError when it takes too long.
+
+        It goes on in a thread then, which ends with the process: a library that waits, for a name
+        server or for one byte after the other, cannot be stopped.
+        """
+        answer: list[T | Exception] = []
+
+        def run() -> None:
+            try:
+                answer.append(call())
+            except Exception as error:
+                answer.append(error)
+
+        begin = time.monotonic()
+        allowed_s = min(limits.REQUEST_SECONDS_MAX, self._left_s)
+        thread = threading.Thread(target=run, name="rsltrace-fetch", daemon=True)
+        thread.start()
+        thread.join(max(allowed_s, 0))
+        self._left_s -= time.monotonic() - begin
+        if not answer:
+            which = "one request" if allowed_s == limits.REQUEST_SECONDS_MAX else "all requests"
+            most = limits.REQUEST_SECONDS_MAX if which[0] == "o" else limits.REMOTE_SECONDS_MAX
+            raise _FetchError(
+                f"the server is too slow: {which} took more than {most:g} s; download the file"
+            )
+        if isinstance(answer[0], Exception):
+            raise answer[0]
+        return answer[0]
+
+    def reason(self, error: Exception) -> str:
+        """Return an error of a library in words, without what is secret in the address."""
+        return without_secrets(str(error) or type(error).__name__, self._address)

@@ -15,10 +15,10 @@ import zstandard
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
 
 from rsltrace.errors import OutputError
-from rsltrace.trace.chunks import ChunkBody
-from rsltrace.trace.format import MCAP_MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
-from rsltrace.trace.sink import Sink
-from rsltrace.trace.summary import SummaryBuilder, record_bytes
+from rsltrace.mcap.chunk_body import ChunkBody
+from rsltrace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
+from rsltrace.mcap.sink import Sink
+from rsltrace.mcap.summary_writer import SummaryBuilder, record_bytes
 
 CHANNELS_MAX = 2**16 - 1
 _ZSTD_LEVEL = 1
@@ -32,7 +32,7 @@ seen, which stays in the processor's nearest cache, they take four fifths of the
 room."""
 
 
-class McapStream:
+class McapWriter:
     """Writes records in order. Every method raises OutputError when the disk refuses.
 
     ``progress`` says in words what was written so far, for that message.
@@ -58,7 +58,7 @@ class McapStream:
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._failure: OutputError | None = None
         self._sink = Sink(path, force=force)
-        self._write(MCAP_MAGIC + record_bytes(Header(profile, library)))
+        self._write(MAGIC + record_bytes(Header(profile, library)))
 
     @property
     def bytes_written(self) -> int:
@@ -155,7 +155,7 @@ class McapStream:
     def finish(self) -> None:
         """Write the end of the file and close it."""
         self._write(record_bytes(DataEnd(self._sink.crc)))
-        self._write(self._summary.tail(self._sink.offset) + MCAP_MAGIC)
+        self._write(self._summary.tail(self._sink.offset) + MAGIC)
         try:
             self._sink.close()
         except OSError as error:

@@ -1,0 +1,20 @@
+"""Opening a file or an address, whichever a place is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rsltrace.mcap.address import is_address
+from rsltrace.mcap.source import ByteSource, FileSource
+
+
+def open_source(place: Path | str) -> ByteSource:
+    """Open a file, or an address such as ``https://…`` or ``s3://…``. Raises TraceError.
+
+    Raises SetupError for an address when fsspec, which reads it, is not installed.
+    """
+    if is_address(place):
+        from rsltrace.mcap.remote import open_remote  # a library that local files do not need
+
+        return open_remote(str(place))
+    return FileSource(Path(place))
