@@ -59,9 +59,11 @@ KILTED_TESTS ?=
 test-kilted:
 	@$(MAKE) --no-print-directory $(KILTED) unit PYTEST="$(KILTED_TESTS)"
 
-# docs/jobs.md is made from the models of rsltrace.job; a test fails when it is stale.
+# docs/jobs.md is made from the models of rsltrace.job, the picture in docs/architecture.md from its
+# text; a test fails when one is stale.
 docs: $(INSTALLED)
 	$(BIN)/python -m rsltrace.job.documents.reference > docs/jobs.md
+	$(BIN)/python docs/draw_architecture.py
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +16,7 @@ ROOT = Path(__file__).parent.parent
 DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/*/README.md")])
 _LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(#[^)\s]*)?\)")
 _FILE = re.compile(r"`((?:docs|examples|benchmarks|sample_traces|tests)/[\w./-]*[\w/])`")
+_CODE = re.compile(r"`((?:rsltrace|viewer)/[\w./-]+)`")
 _FENCE = re.compile(r"^```.*?^```", re.M | re.S)
 _OPTION = re.compile(r"(?<=\s)--?[a-zA-Z][\w-]*")
 
@@ -65,3 +67,17 @@ def test_commands_have_the_options_that_are_shown(path: Path) -> None:
 def test_the_options_of_commands_are_looked_at() -> None:
     text = "`rsltrace record job.yaml -o x --frobnicate` and rsltrace diff a b --abs 'x=--y' # --no"
     assert list(commands(text)) == [("record", ["-o", "--frobnicate"]), ("diff", ["--abs"])]
+
+
+def test_the_page_on_the_architecture_names_files_that_are_there() -> None:
+    named = _CODE.findall((ROOT / "docs" / "architecture.md").read_text("utf-8"))
+    assert len(named) > 20
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_the_picture_of_the_architecture_is_current_and_complete() -> None:
+    drawing = runpy.run_path(str(ROOT / "docs" / "draw_architecture.py"))
+    assert drawing["PICTURE"].read_text("utf-8") == drawing["architecture"](), "run make docs"
+    drawn = {name for box in drawing["BOXES"] for name in re.findall(r"\w+", box.name)}
+    packages = {path.parent.name for path in ROOT.glob("rsltrace/*/__init__.py")}
+    assert packages <= drawn

@@ -41,7 +41,9 @@ class _Time(_IntParam):
         """Return nanoseconds, or end with a usage error."""
         if isinstance(value, int):
             return value
-        from rsltrace.job.parts.times import parse_time  # the job package needs pydantic, we do not
+        from rsltrace.job.values.times import (
+            parse_time,  # the job package needs pydantic, we do not
+        )
 
         text = str(value).strip()
         try:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.job.parts.ros_words import split_ros_arguments
+from rsltrace.job.values.ros_arguments import split_ros_arguments
 
 if TYPE_CHECKING:
     from rsltrace.job import Job

@@ -17,11 +17,11 @@ from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
-from rsltrace.guard.recorded.answers import Outside, answered, decoded, numbered
-from rsltrace.guard.recorded.numbering import Descriptors
+from rsltrace.guard.descriptor_table import DescriptorTable
+from rsltrace.guard.random_streams import RandomStreams
+from rsltrace.guard.real_time import RealTimePace
+from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
-from rsltrace.guard.virtual.real_time_pace import Pace
-from rsltrace.guard.virtual.streams import Streams
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
@@ -84,10 +84,10 @@ class Guard:
         self.packages = packages
         self.on_finding = on_finding
         self.counts: Counter[tuple[Source, Mode, str, str]] = Counter()
-        self.streams = Streams(seed)
-        self.outside: Outside = Outside()
-        self.descriptors = Descriptors()
-        self.pace = Pace()
+        self.streams = RandomStreams(seed)
+        self.answers = RecordedAnswers()
+        self.descriptors = DescriptorTable()
+        self.pace = RealTimePace()
         self._policy = policy
         self._thread = _thread_id()
         self._process = _process_id()
@@ -169,14 +169,14 @@ class Guard:
 
         :raises OSError: if that is what was answered.
         """
-        if self.outside.replays:
-            text = self.outside.next_kept(self.context.node(), call, of).text
+        if self.answers.replays:
+            text = self.answers.next_answer(self.context.node(), call, of).text
             assert text is not None or of
             text = text or "null"
         else:
             with engage(None):
-                text = answered(real)
-        self.found(source, Mode.RECORD, call, numbered(of, 0, text) if of else text, frame)
+                text = encoded_answer(real)
+        self.found(source, Mode.RECORD, call, finding_value(of, 0, text) if of else text, frame)
         return decoded(text)
 
     def watched(self, source: Source, call: str, value: object, frame: FrameType) -> None:

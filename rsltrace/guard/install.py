@@ -10,18 +10,18 @@ from rsltrace.guard.recorded.files import recorded_files
 from rsltrace.guard.recorded.polls import recorded_polls
 from rsltrace.guard.recorded.processes import recorded_processes
 from rsltrace.guard.recorded.sockets import recorded_sockets
-from rsltrace.guard.virtual.clocks import clocks
-from rsltrace.guard.virtual.folders import folders
-from rsltrace.guard.virtual.module_caches import memories
-from rsltrace.guard.virtual.randomness import randomness
-from rsltrace.guard.watch import watching
+from rsltrace.guard.virtual.clocks import virtual_clocks
+from rsltrace.guard.virtual.directory_listings import sorted_listings
+from rsltrace.guard.virtual.module_caches import fresh_module_caches
+from rsltrace.guard.virtual.randomness import virtual_randomness
+from rsltrace.guard.watched.functions import watched_calls
 
 _REPLACEMENTS = (
-    memories,
-    clocks,
-    randomness,
-    folders,
-    watching,
+    fresh_module_caches,
+    virtual_clocks,
+    virtual_randomness,
+    sorted_listings,
+    watched_calls,
     recorded_files,
     recorded_descriptors,
     recorded_sockets,

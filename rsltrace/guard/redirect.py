@@ -14,6 +14,7 @@ from __future__ import annotations
 import ctypes
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from types import BuiltinFunctionType, MethodType
 from typing import Any
 
@@ -100,6 +101,17 @@ class RedirectedMethod:
         """Let the method be what it was."""
         _Method.from_address(id(self._method)).function = self._saved
         _count_down(id(self._target))
+
+
+def redirect(stack: ExitStack, function: Any, make: Callable[[Any], Callable[..., Any]]) -> None:
+    """Redirect a built-in function to what ``make`` makes of a copy of it, until ``stack`` ends."""
+    stack.callback(Redirected(function, make(copy_of(function))).restore)
+
+
+def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) -> None:
+    """Set an attribute of a module or class until ``stack`` ends."""
+    stack.callback(setattr, owner, name, getattr(owner, name))
+    setattr(owner, name, value)
 
 
 def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:

@@ -1,6 +1,6 @@
 """What a run is to do: job files and jobs built in Python, strictly validated, never executed.
 
-The names are loaded when first used: ``parts.times`` serves those who need no pydantic.
+The names are loaded when first used: ``values.times`` serves those who need no pydantic.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ if TYPE_CHECKING:
     from rsltrace.job.parts.hooks import HooksSpec
     from rsltrace.job.parts.launch import LaunchSpec
     from rsltrace.job.parts.node import NodeSpec
-    from rsltrace.job.parts.run import RecordSpec, StopSpec, TopicStop
+    from rsltrace.job.parts.record import RecordSpec
+    from rsltrace.job.parts.stop import StopSpec, TopicStop
     from rsltrace.job.reading.load import job_from_text, load_job, locate, showing_line
 
 _HOMES = {
@@ -25,10 +26,10 @@ _HOMES = {
     "LaunchSpec": "parts.launch",
     "NodeSpec": "parts.node",
     "QosSpec": "parts.bag",
-    "RecordSpec": "parts.run",
+    "RecordSpec": "parts.record",
     "SourceSpec": "parts.guard",
-    "StopSpec": "parts.run",
-    "TopicStop": "parts.run",
+    "StopSpec": "parts.stop",
+    "TopicStop": "parts.stop",
     "job_from_text": "reading.load",
     "load_job": "reading.load",
     "locate": "reading.load",

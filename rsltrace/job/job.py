@@ -3,236 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import Any
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from rsltrace.job.parts.bag import BagSpec
-from rsltrace.job.parts.clocks import ClockSpec
-from rsltrace.job.parts.delay import DelaysSpec
-from rsltrace.job.parts.distribution import files_of
-from rsltrace.job.parts.guard import GuardSpec, guard_part
-from rsltrace.job.parts.hooks import HooksSpec
-from rsltrace.job.parts.launch import LaunchSpec
-from rsltrace.job.parts.names import check_topic
-from rsltrace.job.parts.node import NodeSpec, check_path
-from rsltrace.job.parts.part import Part, attach, check, given, items, one_of, parts, text, whole
-from rsltrace.job.parts.run import RecordSpec, StopSpec, TimeLike
-from rsltrace.job.parts.scheduling import (
-    ExecutionSpec,
-    ExecutorSpec,
-    PolicySpec,
-    executors_part,
-    policy_part,
-)
-from rsltrace.job.parts.times import parse_time
-from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
-from rsltrace.job.whole import problems_of
-
-SEED_MAX = 2**64 - 1
-LIVELOCK_LIMIT = 100_000
+from rsltrace.job.consistency import contradictions
+from rsltrace.job.dump import job_resolved, job_yaml
+from rsltrace.job.fields import JobFields
+from rsltrace.job.values.problem import Problems
 
 
-def _folder(value: object) -> Path:
-    return Path(os.path.abspath(check_path(value)))
-
-
-def _word(value: object) -> str:
-    if isinstance(value, bool) or not isinstance(value, (str, int, float)):
-        raise Problem(f"expected a word of a command line, got {describe(value)}")
-    return str(getattr(value, "text", value))
-
-
-attach(_word, schema={"type": ["string", "number"]})
-
-
-class Job(Part):
+class Job(JobFields):
     """A job, from ``load_job`` or built in Python. Frozen; raises ``JobError`` when wrong.
 
     Times are integer nanoseconds of simulated time; ``start_ns`` and ``construct_time_ns`` are
     ``None`` where the run decides (first bag message or 0; the start). Paths in it are relative to
     ``base_dir`` (an absolute path; the current folder when built in Python): see ``resolve``.
     """
-
-    TIMES: ClassVar[dict[str, str]] = {
-        "start": "start_ns",
-        "construct_time": "construct_time_ns",
-        "min_time_step": "min_time_step_ns",
-    }
-
-    nodes: Annotated[tuple[NodeSpec, ...], parts()] = Field(
-        default=(),
-        description="The nodes to run, constructed in this order.",
-        examples=[[{"node": "my_robot.ekf:EkfNode", "parameters": {"frequency": 50.0}}]],
-    )
-    launch: Annotated[tuple[LaunchSpec, ...], parts("file")] = Field(
-        default=(),
-        description="Launch files whose nodes are part of the job, after those of `nodes`; a path "
-        "stands for `{file: ...}`.",
-        examples=[["bringup.launch.xml", {"file": "nav.launch.yaml", "arguments": {"map": "lab"}}]],
-    )
-    ros_arguments: Annotated[tuple[str, ...], check(items(_word))] = Field(
-        default=(),
-        description="ROS arguments for all nodes, which have the last word: what would follow "
-        "`--ros-args` on a command line.",
-        examples=[["-p", "ekf:rate:=50", "-r", "scan:=/front/scan"]],
-    )
-    search_path: Annotated[tuple[str, ...], check(items(check_path))] = Field(
-        default=(".",),
-        description="Folders in which the nodes' modules are, before Python's own path.",
-        examples=[[".", "../src"]],
-    )
-    start_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None,
-        alias="start",
-        description="Simulated time at which the run starts. Without it, the time of the first "
-        "message of the bags, else 0.",
-        examples=["10s"],
-    )
-    construct_time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
-        default=None,
-        alias="construct_time",
-        description="Simulated time at which the nodes are constructed; the clock then jumps to "
-        "the start. Without it, the start.",
-        examples=["0s"],
-    )
-    stop: StopSpec = Field(
-        default=StopSpec(),
-        description="What ends the run; the first condition that holds does. Without any, the end "
-        "of the bags, or that nothing is left to do.",
-        examples=[{"duration": "60s"}],
-    )
-    seed: Annotated[int, check(whole(0, SEED_MAX))] = Field(
-        default=0,
-        description="Seed of everything that is random in a run, each in a stream of its own.",
-        examples=[7],
-    )
-    timer_ties: Annotated[Literal["creation", "heap"], check(one_of("creation", "heap"))] = Field(
-        default="creation",
-        description="Which of the timers due at one instant comes first: in the order of "
-        "`creation`, or as in the `heap` of RSLCPP's C++ library.",
-        examples=["heap"],
-    )
-    livelock_limit: Annotated[int, check(whole(1))] = Field(
-        default=LIVELOCK_LIMIT,
-        description="How many events may follow each other without simulated time moving on "
-        "before the run ends with an error that names them.",
-        examples=[1000000],
-    )
-    bags: Annotated[tuple[BagSpec, ...], parts("path")] = Field(
-        default=(),
-        description="rosbag2 recordings (MCAP or sqlite3) to play in; a path stands for "
-        "`{path: ...}`. Messages of equal time play in the order of this list, those of one bag "
-        "in the order of the recording. Of a bag that was cut off, or has no index or no "
-        "metadata.yaml, what is there plays, and a note says what is not; recorded services and "
-        "actions never play, a note names them.",
-        examples=[["../bags/outdoor", {"path": "lidar.mcap", "topics": ["/scan"]}]],
-    )
-    progress: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
-        default=None,
-        description="Topic on which the bags' progress is published as `std_msgs/msg/Float32`, "
-        "from 0 to 1 in steps of a hundredth.",
-        examples=["/rslcpp/progress"],
-    )
-    hooks: HooksSpec = Field(
-        default=HooksSpec(),
-        description="Functions that are called around the construction of the nodes.",
-        examples=[{"after": "my_robot.setup:wire"}],
-    )
-    record: RecordSpec = Field(
-        default=RecordSpec(),
-        description="Which payloads the trace keeps.",
-        examples=[{"exclude": ["/camera/*"]}],
-    )
-    guard: Annotated[GuardSpec, guard_part()] = Field(
-        default=GuardSpec(),
-        description="What is done about sources of nondeterminism outside of ROS; `false` leaves "
-        "them all as they are.",
-        examples=[{"clock": "virtual", "thread": "warn"}, False],
-    )
-    delay: Annotated[DelaysSpec | None, given] = Field(
-        default=None,
-        description="How long messages take, which are lost, and who is cut off when.",
-        examples=[{"default": "1ms", "topics": {"/scan": {"uniform": {"min": 0, "max": "5ms"}}}}],
-    )
-
-    policy: Annotated[PolicySpec | None, policy_part()] = Field(
-        default=None,
-        description="Which of the callbacks that are ready runs next; without it, first come, "
-        "first served, and timers last.",
-        examples=["rate_monotonic", {"recorded": "run1.mcap"}],
-    )
-    min_time_step_ns: Annotated[int, check(parse_time)] = Field(
-        default=0,
-        alias="min_time_step",
-        description="Simulated time moves on by this much at least; what is due in between runs "
-        "late.",
-        examples=["1ms"],
-    )
-    executors: Annotated[tuple[ExecutorSpec, ...] | None, executors_part()] = Field(
-        default=None,
-        description="Simulated executors, whose workers a callback occupies while it runs or "
-        "waits. `single_threaded`: one with one worker for all nodes; `per_node`: one for each, "
-        "which nodes that are not listed have, too.",
-        examples=["single_threaded", [{"nodes": ["/camera", "/detector"], "workers": 2}]],
-    )
-    execution: Annotated[ExecutionSpec | None, given] = Field(
-        default=None,
-        description="How long callbacks take: their executor is busy for so long, and what they "
-        "send leaves when they are over.",
-        examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
-    )
-    clocks: Annotated[tuple[ClockSpec, ...], parts()] = Field(
-        default=(),
-        description="Clocks of nodes that do not show simulated time, as real ones do not.",
-        examples=[[{"node": "/lidar", "offset": "-20ms", "drift": "50ppm"}]],
-    )
-
-    # Not keys of a job file, hence ``exclude``: where the job came from.
-    base_dir: Annotated[Path, check(_folder)] = Field(
-        default_factory=Path.cwd, exclude=True, repr=False
-    )
-    source_name: Annotated[str, check(text())] = Field(default="<python>", exclude=True, repr=False)
-    given_text: Annotated[str | None, check(text(), optional=True)] = Field(
-        default=None, alias="source_text", exclude=True, repr=False
-    )
-    composed: Any = Field(default=None, exclude=True, repr=False)
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            *,
-            nodes: Sequence[NodeSpec | dict[str, Any]] = (),
-            launch: Sequence[LaunchSpec | dict[str, Any] | str] = (),
-            ros_arguments: Sequence[str] = (),
-            search_path: Sequence[str | os.PathLike[str]] = (".",),
-            start: TimeLike | None = None,
-            start_ns: int | None = None,
-            construct_time: TimeLike | None = None,
-            construct_time_ns: int | None = None,
-            stop: StopSpec | dict[str, Any] = ...,
-            seed: int = 0,
-            timer_ties: Literal["creation", "heap"] = "creation",
-            livelock_limit: int = LIVELOCK_LIMIT,
-            bags: Sequence[BagSpec | dict[str, Any] | str] = (),
-            progress: str | None = None,
-            hooks: HooksSpec | dict[str, Any] = ...,
-            record: RecordSpec | dict[str, Any] = ...,
-            guard: GuardSpec | dict[str, Any] | bool = ...,
-            delay: DelaysSpec | dict[str, Any] | None = None,
-            policy: PolicySpec | dict[str, Any] | str | None = None,
-            min_time_step: TimeLike = 0,
-            min_time_step_ns: int = 0,
-            executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,
-            execution: ExecutionSpec | dict[str, Any] | None = None,
-            clocks: Sequence[ClockSpec | dict[str, Any]] = (),
-            base_dir: str | os.PathLike[str] = ...,
-            source_name: str = "<python>",
-            source_text: str | None = None,
-        ) -> None: ...
 
     @property
     def source_text(self) -> str:
@@ -241,10 +28,6 @@ class Job(Part):
         if self.composed is not None:
             return f"{self.composed.header()}{self.to_yaml()}"
         return self.to_yaml() if self.given_text is None else self.given_text
-
-    def resolve(self, path: str) -> Path:
-        """Return a path of the job as an absolute path."""
-        return Path(os.path.normpath(self.base_dir / path))
 
     def shown(self, path: str) -> str:
         """Return a path of the job as messages show it: beside the job file as it was named."""
@@ -256,8 +39,6 @@ class Job(Part):
         Classes and functions appear as ``module:qualname``, other Python objects among
         ``arguments`` by the name of their class; a job with local ones does not load again.
         """
-        from rsltrace.job.documents.dump import job_yaml
-
         return job_yaml(self)
 
     def resolved(self) -> dict[str, Any]:
@@ -266,20 +47,11 @@ class Job(Part):
         Times are in nanoseconds under the fields' names, paths relative to ``base_dir``, so that
         the result is the same on every machine.
         """
-        from rsltrace.job.documents.dump import job_resolved
-
         return job_resolved(self)
-
-    def model_files(self) -> Iterator[tuple[Loc, str]]:
-        """Yield (place in the job, path) of the files that its delays come from."""
-        yield from files_of(self.delay, ("delay",))
-        yield from files_of(self.execution, ("execution",))
-        if self.policy is not None and self.policy.recorded is not None:
-            yield ("policy", "recorded"), self.policy.recorded
 
     @model_validator(mode="after")
     def _check_whole(self) -> Job:
-        problems = list(problems_of(self))
+        problems = list(contradictions(self))
         if problems:
             raise Problems(problems)
         return self

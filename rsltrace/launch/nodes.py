@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import shlex
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace.launch.element import Element
+from rsltrace.launch.evaluation import Evaluation
 from rsltrace.launch.model import LaunchedNode
 from rsltrace.launch.parameter_files import substituted_parameters
 from rsltrace.launch.scope import ParameterFile, Parameters, joined_namespace
-
-if TYPE_CHECKING:
-    from rsltrace.launch.reader import Reader
 
 _WITHOUT_MEANING = (
     "output",
@@ -39,25 +37,27 @@ _COMPONENT = ("pkg", "plugin", "name", "namespace")
 class Nodes:
     """Makes ``LaunchedNode`` values of elements, with the defaults of the groups around them."""
 
-    def __init__(self, reader: Reader) -> None:
-        self._reader = reader
+    def __init__(self, evaluation: Evaluation) -> None:
+        self._evaluation = evaluation
 
     def node(self, element: Element) -> None:
         """Do ``<node>`` and ``<lifecycle_node>``."""
         self._check_process(element, ["param", "remap"])
-        reader = self._reader
-        executable = reader.needed(element, "exec")
-        package = reader.optional(element, "pkg")
+        evaluation = self._evaluation
+        executable = evaluation.needed(element, "exec")
+        package = evaluation.optional(element, "pkg")
         if package is None:
-            reader.refuse(element, f"process {executable!r}", "it belongs to no package (pkg=)")
+            evaluation.refuse(element, f"process {executable!r}", "it belongs to no package (pkg=)")
             return
-        if element.get("autostart") is not None and reader.flag(element.get("autostart"), False):
-            reader.refuse(
+        if element.get("autostart") is not None and evaluation.flag(
+            element.get("autostart"), False
+        ):
+            evaluation.refuse(
                 element,
                 f"autostart of {package}/{executable}",
                 "nobody changes the states of lifecycle nodes here: let a node of the job do it",
             )
-        reader.launched.nodes.append(
+        evaluation.launched.nodes.append(
             LaunchedNode(
                 where=_where(element),
                 package=package,
@@ -79,16 +79,16 @@ class Nodes:
         self._components(element)
 
     def _components(self, element: Element) -> None:
-        reader = self._reader
+        evaluation = self._evaluation
         for child in element.named("composable_node"):
             child.check(_COMPONENT, ["param", "remap", "extra_arg"])
-            if not reader.holds(child):
+            if not evaluation.holds(child):
                 continue
-            reader.launched.nodes.append(
+            evaluation.launched.nodes.append(
                 LaunchedNode(
                     where=_where(child),
-                    package=reader.needed(child, "pkg"),
-                    plugin=reader.needed(child, "plugin"),
+                    package=evaluation.needed(child, "pkg"),
+                    plugin=evaluation.needed(child, "plugin"),
                     **self._common(child),
                 )
             )
@@ -96,29 +96,29 @@ class Nodes:
     def _check_process(self, element: Element, children: list[str]) -> None:
         element.check([*_NODE, *_WITHOUT_MEANING, *_LOST], [*children, "env"])
         lost = [name for name in _LOST if element.get(name) is not None]
-        lost += [f"env {self._reader.needed(e, 'name')}" for e in element.named("env")]
+        lost += [f"env {self._evaluation.needed(e, 'name')}" for e in element.named("env")]
         if lost:
-            self._reader.launched.ignored.append(
+            self._evaluation.launched.ignored.append(
                 f"{_where(element)}: {', '.join(lost)}: all nodes run in one process"
             )
 
     def _common(self, element: Element) -> dict[str, Any]:
-        reader = self._reader
-        values = reader.values
-        namespace = joined_namespace(values.namespace, reader.optional(element, "namespace"))
+        evaluation = self._evaluation
+        scope = evaluation.scope
+        namespace = joined_namespace(scope.namespace, evaluation.optional(element, "namespace"))
         if namespace and not namespace.startswith("/"):
             namespace = f"/{namespace}"
-        name = reader.optional(element, "name") or reader.optional(element, "node-name")
+        name = evaluation.optional(element, "name") or evaluation.optional(element, "node-name")
         remappings = []
         for remap in element.named("remap"):
             remap.check(["from", "to"])
-            remappings.append((reader.needed(remap, "from"), reader.needed(remap, "to")))
+            remappings.append((evaluation.needed(remap, "from"), evaluation.needed(remap, "to")))
         full_name = None if name is None else f"{namespace.rstrip('/')}/{name}"
         return {
             "name": name,
             "namespace": namespace or None,
-            "parameters": values.parameters + self._parameters(element, full_name),
-            "remappings": values.remappings + tuple(remappings),
+            "parameters": scope.parameters + self._parameters(element, full_name),
+            "remappings": scope.remappings + tuple(remappings),
         }
 
     def _words(self, element: Element, name: str) -> tuple[str, ...]:
@@ -126,7 +126,7 @@ class Nodes:
         if attribute is None:
             return ()
         try:
-            return tuple(shlex.split(self._reader.text(attribute)))
+            return tuple(shlex.split(self._evaluation.text(attribute)))
         except ValueError as error:
             raise attribute.place.error(f"{name}: {error}") from None
 
@@ -139,26 +139,26 @@ class Nodes:
                 found.append(self._mapping([param]))
                 continue
             param.check(["from", "allow_substs"])
-            path = self._reader.file(param.need("from"))
-            if self._reader.flag(param.get("allow_substs"), False):
+            path = self._evaluation.existing_file(param.need("from"))
+            if self._evaluation.flag(param.get("allow_substs"), False):
                 place = param.need("from").place
-                replaced = partial(self._reader.replaced, place=place)
+                replaced = partial(self._evaluation.replaced, place=place)
                 found.append(substituted_parameters(path, replaced, full_name))
             else:
                 found.append(ParameterFile(path))
         return tuple(found)
 
     def _mapping(self, params: list[Element]) -> dict[str, Any]:
-        reader = self._reader
+        evaluation = self._evaluation
         values: dict[str, Any] = {}
         for param in params:
             param.check(["name", "value", "type", "value-sep"], ["param"])
-            name, value = reader.needed(param, "name"), param.get("value")
+            name, value = evaluation.needed(param, "name"), param.get("value")
             nested = param.named("param")
             if (value is None) == (not nested):
                 raise param.place.error("a parameter has either a value or parameters within it")
             if value is not None:
-                values[name] = reader.value(value, reader.optional(param, "type"))
+                values[name] = evaluation.value(value, evaluation.optional(param, "type"))
             else:
                 values[name] = self._mapping(nested)
         return values

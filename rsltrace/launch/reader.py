@@ -7,19 +7,16 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job.reading.yaml_source import Place
-from rsltrace.launch.element import Attribute, Element
-from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, Unsupported
+from rsltrace.launch.element import Element
+from rsltrace.launch.evaluation import Evaluation
+from rsltrace.launch.model import ENVIRONMENT, Argument, Launched
 from rsltrace.launch.nodes import Nodes
-from rsltrace.launch.scope import ParameterFile, Values, joined_namespace
-from rsltrace.launch.substitution import Substitutions, truth
-from rsltrace.launch.values import typed
+from rsltrace.launch.scope import ParameterFile, Scope, joined_namespace
 from rsltrace.launch.xml_file import parse_xml
 from rsltrace.launch.yaml_file import parse_launch_yaml
 
@@ -36,21 +33,19 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
 
     :raises JobError: with file, line and column, if something in it is wrong or missing.
     """
-    reader = Reader(dict(arguments))
+    reader = ActionReader(dict(arguments))
     reader.include(path, None)
     return reader.launched
 
 
-class Reader:
-    """The state of reading: the values of the innermost group, the files that are open."""
+class ActionReader(Evaluation):
+    """Does the actions of launch files one by one; ``_files`` are those that are open."""
 
     def __init__(self, arguments: dict[str, str]) -> None:
-        self.launched = Launched()
-        self.values = Values(configurations=arguments)
-        self._environment = dict(self.values.environment)
+        super().__init__(arguments)
+        self._environment = dict(self.scope.environment)
         self._files: list[Path] = []
-        self._substitutions = Substitutions(self.values, Path())
-        self._nodes = Nodes(self)
+        nodes = Nodes(self)
         self._actions: dict[str, Callable[[Element], None]] = {
             "arg": self._arg,
             "let": self._let,
@@ -70,10 +65,10 @@ class Reader:
             "set_ros_log_dir": lambda element: None,
             "log": lambda element: None,
             "log_info": lambda element: None,
-            "node": self._nodes.node,
-            "lifecycle_node": self._nodes.node,
-            "node_container": self._nodes.container,
-            "load_composable_node": self._nodes.load,
+            "node": nodes.node,
+            "lifecycle_node": nodes.node,
+            "node_container": nodes.container,
+            "load_composable_node": nodes.load,
             "executable": self._process,
             "timer": self._timer,
             "ros_timer": self._timer,
@@ -81,70 +76,6 @@ class Reader:
                 element, "shutdown", "a run ends by the job's stop: conditions"
             ),
         }
-
-    # -- values ------------------------------------------------------------------------------------
-
-    def text(self, attribute: Attribute) -> str:
-        """Return an attribute as text. Raises ``JobError`` at its place."""
-        value = attribute.value
-        if isinstance(value, bool):
-            value = str(value).lower()
-        return self.replaced(str(value), attribute.place)
-
-    def optional(self, element: Element, name: str) -> str | None:
-        """Return an attribute as text, or None if it is not given."""
-        attribute = element.get(name)
-        return None if attribute is None else self.text(attribute)
-
-    def needed(self, element: Element, name: str) -> str:
-        """Return an attribute as text. Raises ``JobError`` if it is missing."""
-        return self.text(element.need(name))
-
-    def replaced(self, written: str, place: Place) -> str:
-        """Return a text with its substitutions replaced."""
-        try:
-            return self._substitutions.text(written)
-        except ValueError as error:
-            raise place.error(str(error)) from None
-
-    def value(self, attribute: Attribute, kind: str | None) -> Any:
-        """Return an attribute as the value of a parameter."""
-        value = attribute.value
-        if isinstance(value, list):
-            value = [
-                self.replaced(item, attribute.place) if isinstance(item, str) else item
-                for item in value
-            ]
-            if kind is None and all(isinstance(item, str) for item in value):
-                found = [typed(item, None) for item in value]
-                value = found if len({type(item) for item in found}) == 1 else value
-        elif isinstance(value, str):
-            value = self.replaced(value, attribute.place)
-        try:
-            return typed(value, kind)
-        except ValueError as error:
-            raise attribute.place.error(str(error)) from None
-
-    def flag(self, attribute: Attribute | None, default: bool) -> bool:
-        """Return an attribute that is true or false."""
-        if attribute is None:
-            return default
-        try:
-            return truth(self.text(attribute))
-        except ValueError as error:
-            raise attribute.place.error(str(error)) from None
-
-    def holds(self, element: Element) -> bool:
-        """Return whether an element's conditions hold."""
-        yes, no = element.get("if"), element.get("unless")
-        if yes is not None and no is not None:
-            raise no.place.error("give either 'if' or 'unless', not both")
-        return self.flag(yes, True) and not self.flag(no, False)
-
-    def refuse(self, element: Element, what: str, why: str) -> None:
-        """Note that something cannot be simulated."""
-        where = element.place.source.where(element.place.mark)
-        self.launched.unsupported.append(Unsupported(where, what, why))
 
     # -- files and groups --------------------------------------------------------------------------
 
@@ -156,11 +87,9 @@ class Reader:
         root = _parse(path, place)
         self._note_arguments(root)
         self._files.append(path)
-        outer_file = self._substitutions.file
-        self._substitutions.file = path
         root.check(["version"], None)
-        self._children(root)
-        self._substitutions.file = outer_file
+        with self.within(file=path):
+            self._children(root)
         self._files.pop()
 
     def _note_arguments(self, element: Element) -> None:
@@ -186,26 +115,17 @@ class Reader:
             if self.holds(child):
                 action(child)
 
-    @contextmanager
-    def _scope(self, values: Values) -> Iterator[None]:
-        outer = self.values
-        self.values = self._substitutions.values = values
-        try:
-            yield
-        finally:
-            self.values = self._substitutions.values = outer
-
     def _group(self, element: Element) -> None:
         element.check(["scoped", "forwarding"], None)
         keeps = {self.needed(k, "name"): self.needed(k, "value") for k in element.named("keep")}
         if not self.flag(element.get("scoped"), True):
             self._children(element, ("keep",))
             return
-        values = self.values.copy()
+        scope = self.scope.copy()
         if not self.flag(element.get("forwarding"), True):
-            values = Values(environment=dict(self._environment))
-        values.configurations.update(keeps)
-        with self._scope(values):
+            scope = Scope(environment=dict(self._environment))
+        scope.configurations.update(keeps)
+        with self.within(scope=scope):
             self._children(element, ("keep",))
 
     def _include(self, element: Element) -> None:
@@ -214,8 +134,8 @@ class Reader:
         for child in (*element.named("arg"), *element.named("let")):
             child.check(["name", "value"])
             name = self.needed(child, "name")
-            self.values.configurations[name] = self.needed(child, "value")
-        path = self._substitutions.file.parent / file
+            self.scope.configurations[name] = self.needed(child, "value")
+        path = self.file.parent / file
         if path.suffix == ".py":
             self.refuse(element, f"include of {path.name}", _PYTHON)
             return
@@ -226,7 +146,7 @@ class Reader:
     def _arg(self, element: Element) -> None:
         element.check(["name", "default", "description"], ["choice"])
         name = self.needed(element, "name")
-        configurations = self.values.configurations
+        configurations = self.scope.configurations
         if name not in configurations:
             default = self.optional(element, "default")
             if default is None:
@@ -244,19 +164,19 @@ class Reader:
             )
 
     def _misspelt(self, name: str) -> str:
-        given = [n for n in self.values.configurations if n not in self.launched.arguments]
+        given = [n for n in self.scope.configurations if n not in self.launched.arguments]
         near = difflib.get_close_matches(name, given, n=1)
         return f" (there is a {near[0]!r})" if near else ""
 
     def _let(self, element: Element) -> None:
         element.check(["name", "value"])
         name = self.needed(element, "name")
-        self.values.configurations[name] = self.needed(element, "value")
+        self.scope.configurations[name] = self.needed(element, "value")
 
     def _set_env(self, element: Element) -> None:
         element.check(["name", "value"])
         name = self.needed(element, "name")
-        self.values.environment[name] = self.needed(element, "value")
+        self.scope.environment[name] = self.needed(element, "value")
         self._note_environment(element, name)
 
     def _note_environment(self, element: Element, name: str) -> None:
@@ -265,56 +185,52 @@ class Reader:
 
     def _append_env(self, element: Element) -> None:
         element.check(["name", "value", "prepend", "separator"])
-        name, value = self.needed(element, "name"), self.needed(element, "value")
+        name, value = (
+            self.needed(element, "name"),
+            self.needed(element, "value"),
+        )
         separator = self.optional(element, "separator") or os.pathsep
-        old = self.values.environment.get(name)
+        old = self.scope.environment.get(name)
         parts = [value] if old is None else [old, value]
         if self.flag(element.get("prepend"), False):
             parts.reverse()
-        self.values.environment[name] = separator.join(parts)
+        self.scope.environment[name] = separator.join(parts)
         self._note_environment(element, name)
 
     def _unset_env(self, element: Element) -> None:
         element.check(["name"])
         name = self.needed(element, "name")
-        self.values.environment.pop(name, None)
+        self.scope.environment.pop(name, None)
         self._note_environment(element, name)
 
     def _reset_env(self, element: Element) -> None:
-        self.values.environment.clear()
-        self.values.environment.update(self._environment)
+        self.scope.environment.clear()
+        self.scope.environment.update(self._environment)
 
     def _reset(self, element: Element) -> None:
         element.check([], ["keep"])
         keeps = {self.needed(k, "name"): self.needed(k, "value") for k in element.named("keep")}
-        self.values.configurations.clear()
-        self.values.configurations.update(keeps)
+        self.scope.configurations.clear()
+        self.scope.configurations.update(keeps)
 
     def _push_namespace(self, element: Element) -> None:
         element.check(["namespace"])
         own = self.needed(element, "namespace")
-        self.values.namespace = joined_namespace(self.values.namespace, own)
+        self.scope.namespace = joined_namespace(self.scope.namespace, own)
 
     def _set_parameter(self, element: Element) -> None:
         element.check(["name", "value", "type"])
         value = self.value(element.need("value"), self.optional(element, "type"))
-        self.values.parameters += ({self.needed(element, "name"): value},)
+        self.scope.parameters += ({self.needed(element, "name"): value},)
 
     def _set_parameters_from_file(self, element: Element) -> None:
         element.check(["filename"])
-        path = self.file(element.need("filename"))
-        self.values.parameters += (ParameterFile(path),)
+        path = self.existing_file(element.need("filename"))
+        self.scope.parameters += (ParameterFile(path),)
 
     def _set_remap(self, element: Element) -> None:
         element.check(["from", "to"])
-        self.values.remappings += ((self.needed(element, "from"), self.needed(element, "to")),)
-
-    def file(self, attribute: Attribute) -> str:
-        """Return the path of a file that must be there; relative to the launch file's folder."""
-        path = self._substitutions.file.parent / self.text(attribute)
-        if not path.is_file():
-            raise attribute.place.error(f"there is no such file: {path}")
-        return str(path)
+        self.scope.remappings += ((self.needed(element, "from"), self.needed(element, "to")),)
 
     # -- what cannot be simulated ------------------------------------------------------------------
 

@@ -19,8 +19,8 @@ Parameters = tuple["ParameterFile | dict[str, Any]", ...]
 
 
 @dataclass(slots=True)
-class Values:
-    """The values of one group; ``copy`` gives an inner group its own."""
+class Scope:
+    """What one group can see; ``copy`` gives an inner group its own."""
 
     configurations: dict[str, str] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=lambda: dict(os.environ))
@@ -28,7 +28,7 @@ class Values:
     parameters: Parameters = ()
     remappings: tuple[tuple[str, str], ...] = ()
 
-    def copy(self) -> Values:
+    def copy(self) -> Scope:
         """Return a copy that can be changed without changing this."""
         return replace(
             self, configurations=dict(self.configurations), environment=dict(self.environment)

@@ -8,7 +8,7 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
-from rsltrace.job.parts.ros_words import split_ros_arguments
+from rsltrace.job.values.ros_arguments import split_ros_arguments
 from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import flat, parameters_for
 from rsltrace.launch.scope import ParameterFile

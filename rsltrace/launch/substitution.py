@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rsltrace.job.reading.substitute import package_prefix
 from rsltrace.launch.expression import evaluate
-from rsltrace.launch.scope import Values
+from rsltrace.launch.scope import Scope
 from rsltrace.launch.template import Call, Template, parse_template
 
 _TRUE, _FALSE = ("true", "1"), ("false", "0")
@@ -37,10 +37,10 @@ def truth(text: str) -> bool:
 
 
 class Substitutions:
-    """Replaces ``$(…)`` by the ``values`` of the moment; ``file`` is the launch file being read."""
+    """Replaces ``$(…)`` by what ``scope`` holds; ``file`` is the launch file being read."""
 
-    def __init__(self, values: Values, file: Path) -> None:
-        self.values = values
+    def __init__(self, scope: Scope, file: Path) -> None:
+        self.scope = scope
         self.file = file
         self._anonymous: dict[str, str] = {}
         self._known: dict[str, tuple[int, int, Callable[..., str]]] = {
@@ -99,9 +99,9 @@ class Substitutions:
             raise ValueError(said if said.startswith("$(") else f"{call.written}: {said}") from None
 
     def _var(self, name: str, default: str | None = None) -> str:
-        value = self.values.configurations.get(name, default)
+        value = self.scope.configurations.get(name, default)
         if value is None:
-            names = sorted(self.values.configurations)
+            names = sorted(self.scope.configurations)
             near = difflib.get_close_matches(name, names, n=1)
             there = f"there are {', '.join(names)}" if names else "none is declared"
             hint = f"did you mean {near[0]!r}?" if near else there
@@ -109,7 +109,7 @@ class Substitutions:
         return value
 
     def _env(self, name: str, default: str | None = None) -> str:
-        value = self.values.environment.get(name, default)
+        value = self.scope.environment.get(name, default)
         if value is None:
             raise ValueError(
                 f"the environment variable {name} is not set: set it, or give a default, "

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.job.parts.times import ExactFloat
 from rsltrace.job.reading.yaml_source import Item, parse_yaml
+from rsltrace.job.values.times import ExactFloat
 from rsltrace.launch.element import Attribute, Element, not_a_launch_file
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from rsltrace._version import __version__
 from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
-from rsltrace.job.parts.node import Target
+from rsltrace.job.values.target import Target
 from rsltrace.run.numerics import numerics
 from rsltrace.run.process import is_of_pytest, user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE

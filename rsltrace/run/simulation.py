@@ -11,8 +11,8 @@ from typing import Any
 
 from rsltrace.errors import DeadlockError, RunError
 from rsltrace.job import Job, load_job
-from rsltrace.job.parts.names import check_topic
-from rsltrace.job.parts.times import parse_time
+from rsltrace.job.values.names import check_topic
+from rsltrace.job.values.times import parse_time
 from rsltrace.loop.loop import NOTHING_LEFT
 from rsltrace.loop.stop import Stop
 from rsltrace.model.stamp import format_seconds

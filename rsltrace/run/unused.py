@@ -13,7 +13,7 @@ from fnmatch import fnmatchcase
 from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.job import Job, locate
-from rsltrace.job.reading.problems import Loc
+from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.census import Met, Parameters
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator
 
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.job import Job, locate
-from rsltrace.job.reading.problems import Loc, nearest
+from rsltrace.job.values.problem import Loc, nearest
 from rsltrace.middleware.census import Asker, Met
 from rsltrace.run.plans.guarding import entry_key
 

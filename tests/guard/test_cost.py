@@ -18,10 +18,10 @@ COUNT = """
 import json, os, sys
 from collections import Counter
 from rsltrace import load_job, record
-from rsltrace.guard.virtual import ordering
+from rsltrace.guard.virtual import set_order
 from rsltrace.guard.redirect import copy_of
 
-GUARD = os.path.dirname(ordering.__file__)
+GUARD = os.path.dirname(set_order.__file__)
 events, calls = Counter(), Counter()
 
 def profile(frame, event, argument):
@@ -82,5 +82,5 @@ def test_a_callback_that_does_nothing_nasty_costs_nothing(tmp_path: Path) -> Non
 
     assert more("events") == {}, "audit hooks are told of it"
     # The example makes a text of a number in one of its callbacks, and numbers have no order.
-    assert set(more("calls")) <= {"ordering.py:shown"}
-    assert more("calls")["ordering.py:shown"] == 100, "the calls are counted"
+    assert set(more("calls")) <= {"set_order.py:shown"}
+    assert more("calls")["set_order.py:shown"] == 100, "the calls are counted"

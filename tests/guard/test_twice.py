@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.guard.watch import watching
+from rsltrace.guard.watched.functions import watched_calls
 
 pytestmark = pytest.mark.ros
 
@@ -194,7 +194,7 @@ def test_reads_of_the_environment_are_met_however_many_runs_there_were(tmp_path:
 
     kind = type(os.environ)
     for _ in range(600):  # Python 3.13 trusts what it has cached after 1000 changes of a class
-        with watching():
+        with watched_calls():
             assert not os.environ.get("NOTHING")
         assert not any(os.environ.get("NOTHING") for _ in range(3))
     (tmp_path / "cold.py").write_text(READS)
@@ -217,7 +217,7 @@ from rsltrace import Trace, load_job, record
 
 record(load_job(sys.argv[1]), sys.argv[2])
 core = sys.modules["rsltrace.doors.rclpy.core"]  # was loaded in the run, and stays
-assert type(core.__loader__).__module__ != "rsltrace.guard.virtual.ordering", "it is not user code"
+assert type(core.__loader__).__module__ != "rsltrace.guard.virtual.set_order", "it is not user code"
 with Trace.open(sys.argv[2]) as trace:
     assert list(trace.metadata("rsltrace:sources")) == ["cold"], trace.metadata("rsltrace:sources")
 """

@@ -210,7 +210,7 @@ def test_the_yaml_of_a_job_is_short_and_readable() -> None:
         "      nested.a: 1\n"
         "    arguments:\n"
         "      a:\n"
-        "      type: rsltrace.job.parts.run:StopSpec\n"
+        "      type: rsltrace.job.parts.stop:StopSpec\n"
         "start: 1.5s\n"
         "stop:\n"
         "  duration: 120s\n"

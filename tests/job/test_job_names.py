@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.job.parts.names import (
+from rsltrace.job.values.names import (
     check_field_path,
     check_glob,
     check_namespace,

@@ -36,6 +36,8 @@ def test_times_are_given_in_seconds_with_units_or_in_nanoseconds() -> None:
 def test_none_means_not_given() -> None:
     assert StopSpec(duration=None, time_ns=None, topic=None, events=None) == StopSpec()
     assert NodeSpec(node="m:N", name=None) == NodeSpec(node="m:N")
+    job = Job(nodes=[NODE], executors=None, policy={"order": "fifo", "priority": None})
+    assert job == Job(nodes=[NODE], policy="fifo")
 
 
 def test_parts_may_be_plain_values() -> None:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.job import load_job
-from rsltrace.job.parts.times import TIME_NS_MAX, UNITS_NS, Nanoseconds, format_time, parse_time
+from rsltrace.job.values.times import TIME_NS_MAX, UNITS_NS, Nanoseconds, format_time, parse_time
 
 times_ns = st.integers(0, TIME_NS_MAX)
 

@@ -185,7 +185,7 @@ def test_loading_imports_no_ros_no_numpy_and_no_user_code(folder: Path) -> None:
 def test_times_are_read_without_pydantic() -> None:
     code = (
         f"import sys; sys.path.insert(0, {str(ROOT)!r})\n"
-        "from rsltrace.job.parts.times import parse_time\n"
+        "from rsltrace.job.values.times import parse_time\n"
         "sys.exit('pydantic' in sys.modules or parse_time('5ms') != 5_000_000)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
@@ -452,10 +452,10 @@ GOLDEN = {
     "nodes without a value": (
         "seed: 1\nnodes:\n\nbags:\n",
         """
-        job.yaml:2:1: nodes: expected a list, got nothing
+        job.yaml:2:1: nodes: no value is given: give one, or leave the key out
             2 | nodes:
               | ^
-        job.yaml:4:1: bags: expected a list, got nothing
+        job.yaml:4:1: bags: no value is given: give one, or leave the key out
             4 | bags:
               | ^
         """,

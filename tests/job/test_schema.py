@@ -15,12 +15,12 @@ from pydantic import BaseModel, TypeAdapter
 from pydantic.fields import FieldInfo
 from ruamel.yaml import YAML
 
-from rsltrace.job.documents.keys import file_fields, models_in
 from rsltrace.job.documents.reference import reference, undocumented
 from rsltrace.job.documents.schema import field_schema, job_schema
 from rsltrace.job.job import Job
-from rsltrace.job.parts.part import FROM_FILE
+from rsltrace.job.parts.keys import file_fields, models_in
 from rsltrace.job.reading.compose import Composition
+from rsltrace.job.values.checks import FROM_FILE
 
 ROOT = Path(__file__).parents[2]
 JOBS = sorted([*ROOT.glob("examples/*/*job*.yaml"), *ROOT.glob("sample_traces/*/*job*.yaml")])

@@ -10,13 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.launch.expression import evaluate
-from rsltrace.launch.scope import Values
+from rsltrace.launch.scope import Scope
 from rsltrace.launch.substitution import Substitutions
 from rsltrace.launch.template import Call, parse_template
 
 
 def text(written: str) -> str:
-    values = Values(
+    values = Scope(
         configurations={"a": "1", "b": "two words", "yes": "True", "name": "a"},
         environment={"HOME": "/home/me"},
     )

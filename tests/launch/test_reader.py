@@ -373,14 +373,14 @@ def test_a_bad_name_is_told_at_its_node(read: Any, prefix: Path) -> None:
 
 
 def test_the_document_names_all_that_is_read() -> None:
-    from rsltrace.launch.reader import Reader
-    from rsltrace.launch.scope import Values
+    from rsltrace.launch.reader import ActionReader
+    from rsltrace.launch.scope import Scope
     from rsltrace.launch.substitution import Substitutions
 
     text = (Path(__file__).parents[2] / "docs" / "launch.md").read_text(encoding="utf-8")
     silent = {"push-ros-namespace", "reset_env", "set_use_sim_time", "set_ros_log_dir", "log",
               "log_info", "executable", "timer", "ros_timer", "shutdown"}  # fmt: skip
-    for action in set(Reader({})._actions) - silent:
+    for action in set(ActionReader({})._actions) - silent:
         assert f"`{action}`" in text, action
-    for name in set(Substitutions(Values(), Path())._known) - {"optenv"}:
+    for name in set(Substitutions(Scope(), Path())._known) - {"optenv"}:
         assert f"`$({name})`" in text or f"`$({name} …)`" in text, name

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.errors import JobError
-from rsltrace.job.reading.problems import nearest
+from rsltrace.job.values.problem import nearest
 from rsltrace.loop.stop import Stop
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.doors.rclpy.boundary.pubsub import PublisherHandle
-from rsltrace.guard.watch import text_with_address
+from rsltrace.guard.addresses import text_with_address
 from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_seconds

@@ -19,10 +19,10 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard.callers import user_frame
+from rsltrace.guard.descriptor_table import Descriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.recorded.numbering import Descriptor, number_of
-from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.virtual.waiting import awaited, is_patient, patiently, when_readable
+from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
 from rsltrace.model.finding import Mode, Source
 
 _MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)
@@ -141,9 +141,9 @@ def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
         found = tracked(fd)
         if found is None:
-            patient = is_patient(sys._getframe(1))
+            patient = waiting_guard(sys._getframe(1))
             if patient is not None and _blocks(fd):
-                return patiently(patient, when_readable(fd, lambda: real(fd, size)))
+                return wait_unrecorded(patient, when_readable(fd, lambda: real(fd, size)))
             return real(fd, size)
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 
@@ -189,7 +189,7 @@ def _read(
 ) -> Any:
     if _get_blocking(fd) and guard.context.is_aside():
         look = when_readable(fd, real)
-        return awaited(guard, known.source, call, look, frame, of=known.number)
+        return wait_recorded(guard, known.source, call, look, frame, of=known.number)
     return guard.recorded(known.source, call, real, frame, known.number)
 
 
@@ -366,5 +366,5 @@ def recorded_descriptors() -> Iterator[None]:
         for module, name, make in makers:
             function = getattr(module, name, None)  # some are of later versions of Python
             if function is not None:
-                stack.callback(Redirected(function, make(copy_of(function))).restore)
+                redirect(stack, function, make)
         yield

@@ -20,7 +20,7 @@ from rsltrace.guard.recorded.descriptors import (
     stand_in,
     tracked,
 )
-from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.model.finding import Source
 
 BYTES_MAX = 64 << 20
@@ -122,12 +122,8 @@ def _looking(name: str, real: Callable[..., Any]) -> Any:
 def recorded_files() -> Iterator[None]:
     """Let files that are read, and their times, answer from the trace in a re-run."""
     with ExitStack() as stack:
-
-        def redirect(function: Any, make: Callable[[Any], Any]) -> None:
-            stack.callback(Redirected(function, make(copy_of(function))).restore)
-
-        redirect(io.open, _opening)
+        redirect(stack, io.open, _opening)
         for name in ("stat", "lstat"):
             # Outermost: what is recorded here is no finding of the watch below.
-            redirect(getattr(os, name), partial(_looking, f"os.{name}"))
+            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}"))
         yield

@@ -15,15 +15,14 @@ from contextlib import ExitStack, contextmanager
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.descriptor_table import number_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.recorded.descriptors import recording
-from rsltrace.guard.recorded.numbering import number_of
-from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.virtual.waiting import NOT_YET, awaited, is_patient, patiently
+from rsltrace.guard.redirect import redirect, replace_attribute
+from rsltrace.guard.waiting import NOT_YET, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.model.finding import Source
 
 _RECORDED = (Source.SOCKET, Source.PROCESS, Source.FILE)
-_NS_PER_S = 1_000_000_000
 _ALL_EVENTS = select.POLLIN | select.POLLPRI | select.POLLOUT
 _real_epoll = select.epoll
 
@@ -49,12 +48,13 @@ def _answer(
     """Return what is ready; whoever can be set aside is, while nothing is."""
     if timeout_s == 0 or (step is None and not guard.context.is_aside()):
         return list(guard.recorded(source, call, lambda: real(timeout_s), frame, of) or ())
-    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
 
     def look(seconds: float) -> Any:
         return real(seconds) or NOT_YET
 
-    return awaited(guard, source, call, look, frame, of=of, for_ns=for_ns, step=step) or []
+    return (
+        wait_recorded(guard, source, call, look, frame, of=of, timeout_s=timeout_s, step=step) or []
+    )
 
 
 class RecordedPoll:
@@ -114,16 +114,16 @@ class RecordedPoll:
         unit = 1 if self._seconds else 1000
         timeout_s = None if timeout is None or timeout < 0 else timeout / unit
         if guard is None or self._source is None or not self.has_outside():
-            patient = guard if self.step else is_patient(_past_selectors(frame))
+            patient = guard if self.step else waiting_guard(_past_selectors(frame))
             if timeout_s == 0:
                 patient = None
             if patient is None:
                 return self._real.poll(timeout, *limits)  # type: ignore[no-any-return]
             return (
-                patiently(
+                wait_unrecorded(
                     patient,
                     lambda seconds: self._real.poll(seconds * unit, *limits) or NOT_YET,
-                    None if timeout_s is None else int(timeout_s * _NS_PER_S),
+                    timeout_s,
                     self.step,
                 )
                 or []
@@ -187,7 +187,7 @@ def _selecting(real: Callable[..., Any]) -> Any:
         found = _recording(frame)
         things = [thing for kind in kinds for thing in kind]
         if found is None or not any(map(guard.descriptors.is_outside, things)):
-            patient = None if timeout == 0 else is_patient(frame)
+            patient = None if timeout == 0 else waiting_guard(frame)
             if patient is None:
                 return real(*kinds, timeout)
 
@@ -195,8 +195,7 @@ def _selecting(real: Callable[..., Any]) -> Any:
                 ready = real(*kinds, seconds)
                 return ready if any(ready) else NOT_YET
 
-            for_ns = None if timeout is None else int(timeout * _NS_PER_S)
-            return patiently(patient, look, for_ns) or ([], [], [])
+            return wait_unrecorded(patient, look, timeout) or ([], [], [])
 
         def places(seconds: float | None) -> list[Any]:
             chosen = real(*kinds, seconds)
@@ -231,11 +230,8 @@ def _number(guard: Guard, things: list[Any]) -> int:
 def recorded_polls() -> Iterator[None]:
     """Let waiting for descriptors be answered from the trace in a re-run."""
     with ExitStack() as stack:
-        for function, make in ((select.poll, _polling), (select.select, _selecting)):
-            real: Any = function
-            stack.callback(Redirected(real, make(copy_of(real))).restore)
-        for place, name in ((select, "epoll"), (selectors.EpollSelector, "_selector_cls")):
-            stack.callback(setattr, place, name, getattr(place, name))
-            value = _epolling if place is select else staticmethod(_epolling)
-            setattr(place, name, value)
+        redirect(stack, select.poll, _polling)
+        redirect(stack, select.select, _selecting)
+        replace_attribute(stack, select, "epoll", _epolling)
+        replace_attribute(stack, selectors.EpollSelector, "_selector_cls", staticmethod(_epolling))
         yield

@@ -20,8 +20,8 @@ from typing import Any
 from rsltrace.guard.extension_types import exchange
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.recorded.descriptors import recording, stand_in
-from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.virtual.waiting import NOT_YET, again_and_again, awaited, is_patient, patiently
+from rsltrace.guard.redirect import redirect, replace_attribute
+from rsltrace.guard.waiting import NOT_YET, polled, wait_recorded, wait_unrecorded, waiting_guard
 from rsltrace.model.finding import Source
 
 _KEPT_OPEN = 3
@@ -62,15 +62,15 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
             return found if found[0] else NOT_YET
 
         if guard is None or process not in guard.descriptors.processes:
-            patient = None if options & os.WNOHANG else is_patient(frame)
+            patient = None if options & os.WNOHANG else waiting_guard(frame)
             if patient is not None:
-                return patiently(patient, again_and_again(ended))
+                return wait_unrecorded(patient, polled(ended))
             return real(process, options)
         if options & os.WNOHANG or not guard.context.is_aside():
             return guard.recorded(
                 Source.PROCESS, call, lambda: real(process, options), frame, process
             )
-        return awaited(guard, Source.PROCESS, call, again_and_again(ended), frame, of=process)
+        return wait_recorded(guard, Source.PROCESS, call, polled(ended), frame, of=process)
 
     return waitpid
 
@@ -123,14 +123,14 @@ def sleep_for_process(seconds: float, real: Callable[[float], None], frame: Fram
     elif guard.context.is_aside():
         call = "time.sleep() of subprocess"
         # What is left of a timeout may be less than its clock can show: time must go on.
-        for_ns = max(int(seconds * 1e9), 1000)
-        awaited(guard, Source.PROCESS, call, _never, frame, of=0, for_ns=for_ns)
-    elif not guard.outside.replays:
+        timeout_s = max(seconds, 1e-6)
+        wait_recorded(guard, Source.PROCESS, call, _never, frame, of=0, timeout_s=timeout_s)
+    elif not guard.answers.replays:
         real(seconds)
 
 
 def _never(seconds: float) -> Any:
-    return again_and_again(lambda: NOT_YET)(seconds)
+    return polled(lambda: NOT_YET)(seconds)
 
 
 def _acquiring(real: Callable[..., bool]) -> Any:
@@ -139,9 +139,8 @@ def _acquiring(real: Callable[..., bool]) -> Any:
         guard = engaged()
         if guard is None or not block or not guard.context.can_step():
             return real(self, block, timeout)
-        look = again_and_again(lambda: real(self, False) or NOT_YET)
-        for_ns = None if timeout is None else int(timeout * 1e9)
-        return patiently(guard, look, for_ns) is True
+        look = polled(lambda: real(self, False) or NOT_YET)
+        return wait_unrecorded(guard, look, timeout) is True
 
     return acquire
 
@@ -150,19 +149,14 @@ def _acquiring(real: Callable[..., bool]) -> Any:
 def recorded_processes() -> Iterator[None]:
     """Let processes answer from the trace in a re-run."""
     with ExitStack() as stack:
-
-        def redirect(function: Any, make: Callable[[Any], Any]) -> None:
-            stack.callback(Redirected(function, make(copy_of(function))).restore)
-
-        redirect(_posixsubprocess.fork_exec, _starting)
-        redirect(os.system, _running)
-        redirect(os.waitpid, _waiting)
+        redirect(stack, _posixsubprocess.fork_exec, _starting)
+        redirect(stack, os.system, _running)
+        redirect(stack, os.waitpid, _waiting)
         for name in ("kill", "pidfd_open"):
-            redirect(getattr(os, name), partial(_of_process, name))
+            redirect(stack, getattr(os, name), partial(_of_process, name))
         acquire: Any = _multiprocessing.SemLock.acquire
         exchange(stack, _multiprocessing.SemLock, "acquire", _acquiring)
         exchange(stack, _multiprocessing.SemLock, "__enter__", lambda real: _acquiring(acquire))
-        module: Any = subprocess
-        stack.callback(setattr, module, "_USE_POSIX_SPAWN", module._USE_POSIX_SPAWN)
-        module._USE_POSIX_SPAWN = False  # a second way to do the same, that is not recorded
+        # A second way to do the same, which is not recorded.
+        replace_attribute(stack, subprocess, "_USE_POSIX_SPAWN", False)
         yield

@@ -19,11 +19,10 @@ from typing import Any
 from rsltrace.guard.extension_types import exchange
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded.descriptors import joining, recording
-from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.guard.virtual.waiting import awaited, is_patient, patiently, when_readable
+from rsltrace.guard.redirect import redirect
+from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
 from rsltrace.model.finding import Source
 
-_NS_PER_S = 1_000_000_000
 _RECEIVING = ("recv", "recvfrom", "recvmsg")
 _RECEIVING_INTO = ("recv_into", "recvfrom_into")
 _PLAIN = (
@@ -57,14 +56,14 @@ def _answer(
         return guard.recorded(Source.SOCKET, call, real, frame, number)
     timeout_s = sock.gettimeout()
     look = when_readable(sock.fileno(), lambda: [real()])
-    found = awaited(
+    found = wait_recorded(
         guard,
         Source.SOCKET,
         call,
         look,
         frame,
         of=number,
-        for_ns=None if timeout_s is None else int(timeout_s * _NS_PER_S),
+        timeout_s=timeout_s,
     )
     if found is None:
         raise TimeoutError("timed out")
@@ -73,11 +72,10 @@ def _answer(
 
 def _wait_for(sock: Any, frame: FrameType) -> None:
     """Let others go on until there is something to read; what it is is not recorded."""
-    guard, timeout_s = is_patient(frame), sock.gettimeout()
+    guard, timeout_s = waiting_guard(frame), sock.gettimeout()
     if guard is None or timeout_s == 0 or sock.fileno() < 0:
         return
-    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
-    if patiently(guard, when_readable(sock.fileno(), lambda: True), for_ns) is None:
+    if wait_unrecorded(guard, when_readable(sock.fileno(), lambda: True), timeout_s) is None:
         raise TimeoutError("timed out")
 
 
@@ -215,8 +213,7 @@ def _answer_tls(
     def look(seconds: float) -> Any:
         return [receive()] if tls.pending() else wire(seconds)
 
-    for_ns = None if timeout_s is None else int(timeout_s * _NS_PER_S)
-    found = awaited(guard, Source.SOCKET, call, look, frame, of=number, for_ns=for_ns)
+    found = wait_recorded(guard, Source.SOCKET, call, look, frame, of=number, timeout_s=timeout_s)
     if found is None:
         raise TimeoutError("The read operation timed out")
     return found[0]
@@ -239,10 +236,8 @@ def recorded_sockets() -> Iterator[None]:
     """Let sockets answer from the trace in a re-run."""
     with ExitStack() as stack:
         for name in _RESOLVING:
-            function = getattr(_socket, name)
-            stack.callback(Redirected(function, _resolving(name, copy_of(function))).restore)
-        pair: Any = _socket.socketpair
-        stack.callback(Redirected(pair, joining(copy_of(pair))).restore)
+            redirect(stack, getattr(_socket, name), partial(_resolving, name))
+        redirect(stack, _socket.socketpair, joining)
         kind: Any = socket.socket
         makers: list[tuple[str, Any]] = [
             *((name, partial(_of_socket, name)) for name in _PLAIN),

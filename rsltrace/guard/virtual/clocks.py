@@ -19,7 +19,7 @@ from typing import Any
 
 from rsltrace.guard.extension_types import put_member
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.redirect import Redirected, copy_of, redirect
 from rsltrace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
@@ -209,41 +209,42 @@ def numpy_now(function: Any, text: str, *more: Any) -> Any:
 
 def opencv_clock(stack: ExitStack) -> None:
     """Redirect the clock of OpenCV, which is loaded: its unit is a nanosecond."""
-    count: Any = sys.modules["cv2"].getTickCount
-    real = copy_of(count)
 
-    def read() -> Any:
-        guard = engaged()
-        if guard is None:
-            return real()
-        return clock_call(guard, sys._getframe(1), "cv2.getTickCount()", lambda ns: ns, real)
+    def reading(real: Callable[[], Any]) -> Any:
+        def read() -> Any:
+            guard = engaged()
+            if guard is None:
+                return real()
+            return clock_call(guard, sys._getframe(1), "cv2.getTickCount()", lambda ns: ns, real)
 
-    stack.callback(Redirected(count, read).restore)
+        return read
+
+    redirect(stack, sys.modules["cv2"].getTickCount, reading)
 
 
 @contextmanager
-def clocks() -> Iterator[None]:
+def virtual_clocks() -> Iterator[None]:
     """Redirect every clock; which guard answers is asked at each call."""
     with ExitStack() as stack:
 
-        def redirect(name: str, make: Callable[[Any], Any]) -> None:
+        def redirect_time(name: str, make: Callable[[Any], Any]) -> None:
             function = getattr(time, name, None)
             if isinstance(function, BuiltinFunctionType):
-                stack.callback(Redirected(function, make(copy_of(function))).restore)
+                redirect(stack, function, make)
 
         for name, virtual in _readers().items():
-            redirect(name, partial(_reading, name, virtual))
+            redirect_time(name, partial(_reading, name, virtual))
         localtime = copy_of(time.localtime)  # type: ignore[arg-type]
-        redirect(
+        redirect_time(
             "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)
         )
-        redirect(
+        redirect_time(
             "clock_gettime_ns", lambda real: _clock_gettime("clock_gettime_ns", lambda ns: ns, real)
         )
         for name in ("localtime", "gmtime", "ctime"):
-            redirect(name, partial(_broken_down, name))
-        redirect("strftime", lambda real: _formatting("strftime", 1, real, localtime))
-        redirect("asctime", lambda real: _formatting("asctime", 0, real, localtime))
+            redirect_time(name, partial(_broken_down, name))
+        redirect_time("strftime", lambda real: _formatting("strftime", 1, real, localtime))
+        redirect_time("asctime", lambda real: _formatting("asctime", 0, real, localtime))
         bound_before = _bound_before("now", "utcnow")
         for name, make in (("now", _now), ("utcnow", _utcnow)):
             _exchange(stack, name, make, bound_before[name])

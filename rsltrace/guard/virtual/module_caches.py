@@ -16,6 +16,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any
 
 from rsltrace.guard.guard import engage, engaged
+from rsltrace.guard.redirect import replace_attribute
 
 _tempfile: Any = tempfile
 _platform: Any = platform
@@ -70,23 +71,20 @@ def _asking(real: Any, cache: str, empty: Callable[[], object]) -> Any:
 
 
 @contextmanager
-def memories() -> Iterator[None]:
+def fresh_module_caches() -> Iterator[None]:
     """Let nothing be remembered from before, and put it back afterwards."""
     with ExitStack() as stack:
         for name, (cache, empty) in _ASKED_ONCE.items():
             if hasattr(platform, cache):
-                _exchange(stack, platform, cache, empty())
-                _exchange(stack, platform, name, _asking(getattr(platform, name), cache, empty))
+                replace_attribute(stack, platform, cache, empty())
+                replace_attribute(
+                    stack, platform, name, _asking(getattr(platform, name), cache, empty)
+                )
         find = _tempfile._get_default_tempdir
         chosen = tempfile.tempdir
         if chosen is not None and chosen == find():
             chosen = None  # nobody has chosen it
-        _exchange(stack, tempfile, "tempdir", chosen)
-        _exchange(stack, tempfile, "_get_default_tempdir", _unseen(find))
-        _exchange(stack, tempfile, "_name_sequence", _Names(_tempfile._name_sequence))
+        replace_attribute(stack, tempfile, "tempdir", chosen)
+        replace_attribute(stack, tempfile, "_get_default_tempdir", _unseen(find))
+        replace_attribute(stack, tempfile, "_name_sequence", _Names(_tempfile._name_sequence))
         yield
-
-
-def _exchange(stack: ExitStack, module: Any, name: str, value: object) -> None:
-    stack.callback(setattr, module, name, getattr(module, name))
-    setattr(module, name, value)

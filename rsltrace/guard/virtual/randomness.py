@@ -14,11 +14,18 @@ import sys
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
 from typing import Any
 
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.redirect import Redirected, RedirectedMethod, copy_of
+from rsltrace.guard.redirect import (
+    Redirected,
+    RedirectedMethod,
+    copy_of,
+    redirect,
+    replace_attribute,
+)
 from rsltrace.model.finding import Mode, Source
 
 _NODE_ID = 0x02_00_00_00_00_01
@@ -71,12 +78,11 @@ def _shown(value: object) -> str:
 
 
 @contextmanager
-def randomness() -> Iterator[None]:
+def virtual_randomness() -> Iterator[None]:
     """Redirect what answers by chance; which guard answers is asked at each call."""
     with ExitStack() as stack:
         _module_functions(stack, random, random._inst, "random", _random_of)
-        stack.callback(setattr, random, "_inst", random._inst)
-        random._inst = _Shared()
+        replace_attribute(stack, random, "_inst", _Shared())
         _entropy(stack)
         _unseeded(stack)
         _uuids(stack)
@@ -85,8 +91,7 @@ def randomness() -> Iterator[None]:
 
             _module_functions(stack, np.random, np.random.mtrand._rand, "numpy.random", _numpy_of)
             _shared_numpy(stack, np.random)
-            empty: Any = np.empty
-            stack.callback(Redirected(empty, _emptying(copy_of(empty))).restore)
+            redirect(stack, np.empty, _emptying)
         yield
 
 
@@ -145,8 +150,7 @@ def _entropy(stack: ExitStack) -> None:
     for name in ("urandom", "getrandom"):
         function = getattr(os, name, None)
         if isinstance(function, BuiltinFunctionType):
-            draw = _drawn(f"os.{name}()", copy_of(function), bytes_of)
-            stack.callback(Redirected(function, draw).restore)
+            redirect(stack, function, partial(_drawn, f"os.{name}()", virtual=bytes_of))
 
 
 def _unseeded(stack: ExitStack) -> None:
@@ -160,8 +164,7 @@ def _unseeded(stack: ExitStack) -> None:
                 a = int.from_bytes(os.urandom(32), "big")
         real(self, a, version)
 
-    random.Random.seed = seed  # type: ignore[method-assign]
-    stack.callback(setattr, random.Random, "seed", real)
+    replace_attribute(stack, random.Random, "seed", seed)
 
 
 def _uuids(stack: ExitStack) -> None:
@@ -172,11 +175,9 @@ def _uuids(stack: ExitStack) -> None:
         ("_last_timestamp", None),
     ):
         if hasattr(uuid, name):
-            stack.callback(setattr, uuid, name, getattr(uuid, name))
-            setattr(uuid, name, value)
+            replace_attribute(stack, uuid, name, value)
     saved = uuid.uuid1.__code__
-    uuid.uuid1.__code__ = _uuid1_code.__code__  # wherever the function is bound
-    stack.callback(setattr, uuid.uuid1, "__code__", saved)
+    replace_attribute(stack, uuid.uuid1, "__code__", _uuid1_code.__code__)  # wherever it is bound
     _real_uuid1[:] = [FunctionType(saved, vars(uuid), "uuid1", uuid.uuid1.__defaults__)]
 
 
@@ -214,8 +215,7 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
 
     draw = _drawn("numpy.random.seed()", real, seeding)
     for place in (module, module.mtrand):
-        stack.callback(setattr, place, "seed", place.seed)
-        place.seed = draw
+        replace_attribute(stack, place, "seed", draw)
 
 
 def _emptying(real: Callable[..., Any]) -> Any:

@@ -1,1 +1,1 @@
-"""A job written down: as YAML, as JSON Schema, as reference."""
+"""What is made from the models for readers and editors: JSON Schema, and `docs/jobs.md`."""

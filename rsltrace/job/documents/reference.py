@@ -15,11 +15,11 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from ruamel.yaml import YAML
 
-from rsltrace.job.documents.keys import attached, file_fields, models_in
 from rsltrace.job.documents.schema import field_schema, file_default, summary
 from rsltrace.job.job import Job
-from rsltrace.job.parts.times import TIME_SCHEMA
+from rsltrace.job.parts.keys import attached, file_fields, models_in
 from rsltrace.job.reading.compose import Composition
+from rsltrace.job.values.times import TIME_SCHEMA
 
 _HEAD = """\
 # Jobs: every key

@@ -15,11 +15,11 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from rsltrace.job.documents.keys import attached, file_fields
 from rsltrace.job.job import Job
+from rsltrace.job.parts.keys import attached, file_fields
 from rsltrace.job.parts.part import Part
-from rsltrace.job.parts.times import TIME_SCHEMA, format_time
 from rsltrace.job.reading.compose import Composition
+from rsltrace.job.values.times import TIME_SCHEMA, format_time
 
 Schema = dict[str, Any]
 

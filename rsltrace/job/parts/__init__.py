@@ -1,1 +1,1 @@
-"""The parts of a job: one model for each key of a job file."""
+"""The parts of a job: one model for each key of a job file, and how models are walked."""

@@ -8,22 +8,23 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rsltrace.job.parts.names import check_glob, check_topic
-from rsltrace.job.parts.node import check_path, names_to_names
-from rsltrace.job.parts.part import (
-    Part,
+from rsltrace.job.parts.node import names_to_names
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import (
+    Globs,
     attach,
     check,
+    check_names,
     from_file,
+    number,
     one_of,
-    positive_number,
     positive_time,
-    text,
     whole,
 )
-from rsltrace.job.parts.run import Globs, TimeLike
-from rsltrace.job.parts.times import parse_time
-from rsltrace.job.reading.problems import Problem, Problems, describe
+from rsltrace.job.values.names import check_glob, check_topic
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.times import TimeLike, parse_time
 
 
 class QosSpec(Part):
@@ -69,14 +70,7 @@ attach(
 def _check_qos(value: object) -> object:
     if not isinstance(value, dict):
         raise Problem(f"expected a mapping of topics to QoS, got {describe(value)}")
-    problems = []
-    for name in value:
-        try:
-            text(check_glob)(name)
-        except ValueError as error:
-            problems.append(Problem(str(error), (str(name),), at_key=True))
-    if problems:
-        raise Problems(problems)
+    check_names(value, check_glob)
     return value
 
 
@@ -135,7 +129,7 @@ class BagSpec(Part):
         "one. Stamps within messages stay as they are.",
         examples=["0s"],
     )
-    rate: Annotated[float, check(positive_number)] = Field(
+    rate: Annotated[float, check(number(0, open_below=True))] = Field(
         default=1.0,
         description="How many times as fast as recorded it plays.",
         examples=[0.5],

@@ -8,10 +8,11 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.names import check_node_glob
-from rsltrace.job.parts.part import Part, attach, check, given, parts, positive_time, text
-from rsltrace.job.parts.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
-from rsltrace.job.reading.problems import Problem, describe
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, given, parts, positive_time, text
+from rsltrace.job.values.names import check_node_glob
+from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
 
 DRIFT_MAX_PPM = 100_000
 JUMPS_EVERY_NS_MIN = 1_000_000

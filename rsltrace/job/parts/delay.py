@@ -6,12 +6,22 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field, model_validator
 
-from rsltrace.job.parts.distribution import DistributionSpec, named, number, shorthand
-from rsltrace.job.parts.names import check_glob, check_node_glob, check_service_glob
-from rsltrace.job.parts.node import check_path
-from rsltrace.job.parts.part import Part, check, given, parts, positive_time, text
-from rsltrace.job.parts.times import parse_time
-from rsltrace.job.reading.problems import Problem
+from rsltrace.job.parts.distribution import DistributionSpec
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import (
+    check,
+    given,
+    named_parts,
+    number,
+    part,
+    parts,
+    positive_time,
+    text,
+)
+from rsltrace.job.values.names import check_glob, check_node_glob, check_service_glob
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.times import parse_time
 
 Probability = Annotated[float, check(number(0, 1))]
 
@@ -135,13 +145,13 @@ class DelaysSpec(Part):
 
     MEANT: ClassVar[str] = "default"
 
-    default: Annotated[DelaySpec | None, shorthand("constant")] = Field(
+    default: Annotated[DelaySpec | None, part("constant")] = Field(
         default=None,
         description="For every topic (except /rosout and /parameter_events) and service without a "
         "model of its own.",
         examples=["1ms"],
     )
-    topics: Annotated[dict[str, DelaySpec], named("constant", check_glob)] = Field(
+    topics: Annotated[dict[str, DelaySpec], named_parts("constant", check_glob)] = Field(
         default_factory=dict,
         description="By topic, a glob. Each link of a topic draws from a stream of its own.",
         examples=[{"/scan": {"constant": "5ms"}}],
@@ -151,7 +161,7 @@ class DelaysSpec(Part):
         description="From some publishers to some subscriptions.",
         examples=[[{"topic": "/scan", "to": "/slam", "constant": "20ms"}]],
     )
-    services: Annotated[dict[str, DelaySpec], named("constant", check_service_glob)] = Field(
+    services: Annotated[dict[str, DelaySpec], named_parts("constant", check_service_glob)] = Field(
         default_factory=dict,
         description="By service, a glob; for requests and responses alike.",
         examples=[{"/set_mode": "2ms"}],

@@ -2,26 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from decimal import Decimal, InvalidOperation
-from typing import Annotated, Any, ClassVar
+from collections.abc import Iterator
+from typing import Annotated, ClassVar
 
-from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic import Field, model_validator
 
 from rsltrace.chance.distribution import LONGEST_NS
-from rsltrace.job.parts.node import check_path
-from rsltrace.job.parts.part import (
-    Part,
-    attach,
-    check,
-    from_file,
-    given,
-    items,
-    one_of,
-    positive_time,
-)
-from rsltrace.job.parts.times import TIME_SCHEMA, UNITS_NS, parse_time
-from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, given, items, number, one_of, positive_time
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Loc, Problem
+from rsltrace.job.values.times import TIME_SCHEMA, UNITS_NS, parse_time
 
 SAMPLE_UNITS = tuple(UNITS_NS)
 
@@ -39,77 +30,6 @@ def check_short(time_ns: int, shown: object) -> int:
 
 
 attach(parse_short_time, schema=TIME_SCHEMA)
-
-
-def number(least: float, most: float | None = None, *, open_below: bool = False) -> Any:
-    """Return a check for a number within bounds (``open_below``: greater than ``least``)."""
-
-    def function(value: object) -> float:
-        if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise Problem(f"expected a number, got {describe(value)}{_as_number(value)}")
-        low = value > least if open_below else value >= least
-        if not low or (most is not None and not value <= most) or value in (float("inf"),):
-            above = f"greater than {least:g}" if open_below else f"at least {least:g}"
-            below = f" and at most {most:g}" if most is not None else ""
-            raise Problem(f"must be {above}{below}, got {getattr(value, 'text', value)}")
-        return float(value)
-
-    schema: dict[str, object] = {"type": "number"}
-    schema["exclusiveMinimum" if open_below else "minimum"] = least
-    if most is not None:
-        schema["maximum"] = most
-    return attach(function, schema=schema)
-
-
-def _as_number(value: object) -> str:
-    """Say how to write a number that was written in another way: ``10%``, ``"0.1"``."""
-    if not isinstance(value, str):
-        return ""
-    try:
-        number = Decimal(value.strip().removesuffix("%"))
-    except InvalidOperation:
-        return ""
-    percent = value.strip().endswith("%") and number.is_finite()
-    return f"; write {number / 100:f}" if percent else "; take the quotes away"
-
-
-def shorthand(key: str) -> BeforeValidator:
-    """Let a plain time stand for ``{key: time}``."""
-
-    def validate(value: object, info: ValidationInfo) -> object:
-        if value is None and from_file(info):
-            raise Problem("no value is given: give one, or leave the key out")
-        return expand(value, key)
-
-    return BeforeValidator(attach(validate, shorthand=key))
-
-
-def expand(value: object, key: str) -> object:
-    """Return ``{key: value}`` for a plain time, anything else as it is."""
-    plain = isinstance(value, (str, int, float)) and not isinstance(value, bool)
-    return {key: value} if plain else value
-
-
-def named(key: str, rule: Callable[[str], None]) -> BeforeValidator:
-    """Prepare a mapping of names to parts for pydantic; a plain time stands for ``{key: time}``."""
-
-    def validate(values: object) -> object:
-        if not isinstance(values, dict):
-            raise Problem(f"expected a mapping of names to models, got {describe(values)}")
-        problems = []
-        for name in values:
-            try:
-                if not isinstance(name, str):
-                    raise Problem(f"expected a name, got {describe(name)}")
-                rule(name)
-            except ValueError as error:
-                problems.append(Problem(str(error), (str(name),), at_key=True))
-        if problems:
-            raise Problems(problems)
-        return {name: expand(value, key) for name, value in values.items()}
-
-    names = {"pattern": rule.pattern}  # type: ignore[attr-defined]
-    return BeforeValidator(attach(validate, value_shorthand=key, names=names))
 
 
 class UniformSpec(Part):

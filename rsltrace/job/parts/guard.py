@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic import BeforeValidator, Field
 
-from rsltrace.job.parts.part import Part, attach, check, flag, from_file, items, text
-from rsltrace.job.reading.problems import Problem, as_flag, describe
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, flag, items, text
+from rsltrace.job.values.problem import Problem, as_flag, describe
 from rsltrace.model.finding import DEFAULT_MODES, MODES, Mode, Policy, Source
 
 ModeName = Literal["virtual", "record", "warn", "error", "allow"]
@@ -43,11 +44,7 @@ def _source(source: Source) -> BeforeValidator:
     """Prepare one source: its mode as plain text, or a mapping with its mode and exemptions."""
     valid = [mode.value for mode in MODES[source]]
 
-    def validate(value: object, info: ValidationInfo) -> object:
-        if value is None:
-            if from_file(info):
-                raise Problem("no value is given: give one, or leave the key out")
-            return None
+    def mode_alone(value: object) -> object:
         given = value.get("mode") if isinstance(value, dict) else getattr(value, "mode", value)
         if given is not None and given not in valid:
             hint = ""
@@ -66,8 +63,8 @@ def _source(source: Source) -> BeforeValidator:
         "properties": {"mode": mode, "allow": allow},
         "additionalProperties": False,
     }
-    attach(validate, schema={"anyOf": [mode, whole]})
-    return BeforeValidator(validate)
+    attach(mode_alone, schema={"anyOf": [mode, whole]})
+    return check(mode_alone, optional=True)
 
 
 def _about(source: Source, what: str) -> Any:
@@ -169,19 +166,15 @@ class GuardSpec(Part):
         return self.enabled and self.pin is not False
 
 
-def guard_part() -> BeforeValidator:
-    """Prepare a ``guard:`` for pydantic; true and false stand for ``{enabled: …}``."""
+def _guard(value: object) -> object:
+    """Let true and false stand for ``{enabled: …}``."""
+    if isinstance(value, str):
+        hint = as_flag(value)
+        raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
+    return {"enabled": value} if isinstance(value, bool) else value
 
-    def validate(value: object, info: ValidationInfo) -> object:
-        if value is None and from_file(info):
-            raise Problem("no value is given: give one, or leave the key out")
-        if isinstance(value, str):
-            hint = as_flag(value)
-            raise Problem(f"expected true, false or a mapping, got {describe(value)}{hint}")
-        return {"enabled": value} if isinstance(value, bool) else value
 
-    attach(validate, shorthand="enabled")
-    return BeforeValidator(validate)
+guard_part = check(_guard, optional=True, shorthand="enabled")
 
 
 def resolved_guard(*guards: GuardSpec) -> dict[str, Any]:

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field
 
-from rsltrace.job.parts.node import Target, check_callable_target
-from rsltrace.job.parts.part import Part, check
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import check
+from rsltrace.job.values.target import Target, check_callable_target
 
 
 class HooksSpec(Part):

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import Field
 
-from rsltrace.job.parts.node import check_path
-from rsltrace.job.parts.part import Part, attach, check, flag
-from rsltrace.job.reading.problems import Problem, describe
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, flag
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Problem, describe
 
 
 def _check_arguments(value: object) -> dict[str, str]:

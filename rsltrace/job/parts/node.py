@@ -9,54 +9,20 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
-from rsltrace.job.parts.names import (
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, items, one_of, text
+from rsltrace.job.values.names import (
     check_executable,
     check_namespace,
     check_node_name,
     check_remap_from,
     check_remap_to,
-    check_target,
 )
-from rsltrace.job.parts.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.parts.part import Part, attach, check, items, one_of, text
-from rsltrace.job.parts.times import ExactFloat
-from rsltrace.job.reading.problems import Problem, Problems, describe
-from rsltrace.job.reading.tree import FileText, from_its_folder
-
-Target = str | Callable[..., object]
-"""``module:attribute`` as text, or (in Python) the class or function itself."""
-
-
-def target_text(target: Target) -> str:
-    """Return ``module:qualname`` of a target."""
-    if isinstance(target, str):
-        return target
-    kind = type(target)
-    module = getattr(target, "__module__", kind.__module__)
-    return f"{module}:{getattr(target, '__qualname__', kind.__qualname__)}"
-
-
-def check_callable_target(value: object) -> Target:
-    """Check a class or function, given itself or as ``module:attribute``."""
-    if callable(value):
-        return value
-    if not isinstance(value, str):
-        raise Problem(f"expected module:Class or module:function, got {describe(value)}")
-    return text(check_target)(value)
-
-
-def check_path(value: object) -> str:
-    """Check a path given as text or (in Python) as a path object."""
-    if isinstance(value, os.PathLike):
-        value = os.fspath(value)
-    if isinstance(value, str) and not value:
-        raise Problem("a path cannot be empty")
-    text()(value)
-    return from_its_folder(value)  # type: ignore[arg-type]  # text, as just checked
-
-
-attach(check_path, schema={"type": "string", "minLength": 1})
-attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]
+from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
+from rsltrace.job.values.paths import FileText, check_path
+from rsltrace.job.values.problem import Collected, Problem, Problems, describe
+from rsltrace.job.values.target import Target, check_callable_target, target_text
+from rsltrace.job.values.times import ExactFloat
 
 
 def names_to_names(
@@ -65,15 +31,13 @@ def names_to_names(
     """Check a mapping of names to names, each side by a rule of its own."""
     if not isinstance(value, dict):
         raise Problem(f"expected a mapping of names to names (from: to), got {describe(value)}")
-    problems: list[Problem] = []
+    problems = Collected()
     for name, to in value.items():
-        for rule, side, at_key in ((rule_from, name, True), (rule_to, to, False)):
-            try:
-                text(rule)(side)
-            except ValueError as error:
-                problems.append(Problem(str(error), (str(name),), at_key=at_key))
-    if problems:
-        raise Problems(problems)
+        with problems.at(str(name), at_key=True):
+            text(rule_from)(name)
+        with problems.at(str(name)):
+            text(rule_to)(to)
+    problems.check()
     return {str(name): str(to) for name, to in value.items()}
 
 
@@ -232,7 +196,7 @@ class NodeSpec(Part):
         "constructor that raises always ends the run.",
         examples=["log"],
     )
-    guard: Annotated[GuardSpec | None, guard_part()] = Field(
+    guard: Annotated[GuardSpec | None, guard_part] = Field(
         default=None,
         description="What is done about sources of nondeterminism in this node, where that differs "
         "from the job's `guard`.",

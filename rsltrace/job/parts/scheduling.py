@@ -5,23 +5,15 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any, ClassVar
 
-from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic import Field, model_validator
 
-from rsltrace.job.parts.distribution import DistributionSpec, named, shorthand
-from rsltrace.job.parts.names import check_node_glob
-from rsltrace.job.parts.node import Target, check_callable_target, check_path
-from rsltrace.job.parts.part import (
-    Part,
-    attach,
-    check,
-    from_file,
-    items,
-    one_of,
-    parts,
-    text,
-    whole,
-)
-from rsltrace.job.reading.problems import Problem, describe, meant_by, nearest
+from rsltrace.job.parts.distribution import DistributionSpec
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
+from rsltrace.job.values.names import check_node_glob
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Problem, describe, meant_by, nearest
+from rsltrace.job.values.target import Target, check_callable_target
 
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
@@ -69,7 +61,7 @@ class PolicySpec(Part):
         "ready at one instant in an order that the seed decides).",
         examples=["rate_monotonic"],
     )
-    priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts()] = Field(
+    priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts(optional=True)] = Field(
         default=None,
         description="Highest priority first; the first rule that fits counts.",
         examples=[[{"node": "/controller", "priority": 10}]],
@@ -121,10 +113,10 @@ class ExecutionSpec(Part):
 
     MEANT: ClassVar[str] = "default"
 
-    default: Annotated[DistributionSpec | None, shorthand("constant")] = Field(
+    default: Annotated[DistributionSpec | None, part("constant")] = Field(
         default=None, description="For every callback without a time of its own.", examples=["1ms"]
     )
-    nodes: Annotated[dict[str, DistributionSpec], named("constant", check_node_glob)] = Field(
+    nodes: Annotated[dict[str, DistributionSpec], named_parts("constant", check_node_glob)] = Field(
         default_factory=dict,
         description="By node, a glob.",
         examples=[{"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}],
@@ -136,46 +128,46 @@ class ExecutionSpec(Part):
     )
 
 
-def policy_part() -> BeforeValidator:
+def _policy(value: object) -> object:
     """Let a word stand for ``{order: word}``."""
-
-    def validate(value: object, info: ValidationInfo) -> object:
-        if value is None and from_file(info):
-            raise Problem("no value is given: give one, or leave the key out")
-        if isinstance(value, str) and value in PolicySpec.ONE_OF:
-            example = PolicySpec.model_fields[value].examples or [None]
-            shown = json.dumps({value: example[0]}).replace('"', "")
-            raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
-        if isinstance(value, str) and value not in ORDERS:
-            word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
-            near = meant_by(word, names) or nearest(word, names)
-            hint = f"; did you mean {near}?" if near else ""
-            raise Problem(
-                f"expected {' or '.join(ORDERS)}, or a mapping with "
-                f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
-            )
-        return {"order": value} if isinstance(value, str) else value
-
-    return BeforeValidator(attach(validate, shorthand="order"))
+    if not isinstance(value, str):
+        return value
+    if value in PolicySpec.ONE_OF:
+        example = PolicySpec.model_fields[value].examples or [None]
+        shown = json.dumps({value: example[0]}).replace('"', "")
+        raise Problem(f"{value!r} alone does not say enough; write for example {shown}")
+    if value not in ORDERS:
+        word, names = value.lower(), [*ORDERS, *PolicySpec.ONE_OF]
+        near = meant_by(word, names) or nearest(word, names)
+        hint = f"; did you mean {near}?" if near else ""
+        raise Problem(
+            f"expected {' or '.join(ORDERS)}, or a mapping with "
+            f"{' or '.join(PolicySpec.ONE_OF[1:])}, got {describe(value)}{hint}"
+        )
+    return {"order": value}
 
 
-def executors_part() -> BeforeValidator:
+policy_part = check(_policy, optional=True, shorthand="order")
+
+_EXECUTORS: dict[str, list[dict[str, Any]]] = {
+    "single_threaded": [{"nodes": ["*"], "workers": 1}],
+    "per_node": [],
+}
+
+
+def _executors(value: object) -> object:
     """Let ``single_threaded`` and ``per_node`` stand for the lists they mean."""
-    words: dict[str, list[dict[str, Any]]] = {
-        "single_threaded": [{"nodes": ["*"], "workers": 1}],
-        "per_node": [],
-    }
+    if isinstance(value, str) and value in _EXECUTORS:
+        value = _EXECUTORS[value]
+    if not isinstance(value, (list, tuple)):
+        hint = ""
+        if isinstance(value, str) and value.startswith("multi"):
+            hint = "; write [{workers: 4}]"
+        raise Problem(
+            f"expected {' or '.join(_EXECUTORS)} or a list of executors, got "
+            f"{describe(value)}{hint}"
+        )
+    return tuple(value)
 
-    def validate(value: object) -> object:
-        if isinstance(value, str) and value in words:
-            value = words[value]
-        if not isinstance(value, (list, tuple)):
-            hint = ""
-            if isinstance(value, str) and value.startswith("multi"):
-                hint = "; write [{workers: 4}]"
-            raise Problem(
-                f"expected {' or '.join(words)} or a list of executors, got {describe(value)}{hint}"
-            )
-        return tuple(value)
 
-    return BeforeValidator(attach(validate, words=tuple(words)))
+executors_part = check(_executors, optional=True, words=tuple(_EXECUTORS))

@@ -16,16 +16,16 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from rsltrace.errors import JobError
-from rsltrace.job.documents.keys import shorthand_at, without_alternatives
-from rsltrace.job.parts.names import check_variable
-from rsltrace.job.parts.node import check_path
-from rsltrace.job.parts.part import Part, attach, check, items, text
-from rsltrace.job.reading.override import apply_override, is_shorthand
-from rsltrace.job.reading.paths import near_path
-from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
+from rsltrace.job.job import Job
+from rsltrace.job.parts.keys import shorthand_at, without_alternatives
+from rsltrace.job.parts.part import Part
+from rsltrace.job.reading.override import apply_override
 from rsltrace.job.reading.substitute import Substitution
-from rsltrace.job.reading.tree import Item, Place
-from rsltrace.job.reading.yaml_source import Mark, YamlSource
+from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource
+from rsltrace.job.values.checks import attach, check, check_names, is_plain, items, text
+from rsltrace.job.values.names import check_variable
+from rsltrace.job.values.paths import check_path, near_path
+from rsltrace.job.values.problem import Collected, Loc, Problem, describe
 
 DEPTH_MAX = 20
 _WHAT = frozenset(("node", "main", "executable", "launch"))
@@ -43,17 +43,13 @@ attach(_paths, schema={"anyOf": [_PATH, {"type": "array", "items": _PATH}]})
 def _variables(value: object) -> dict[str, Any]:
     if not isinstance(value, dict):
         raise Problem(f"expected a mapping of names to values, got {describe(value)}")
-    problems = []
+    check_names(value, check_variable)
+    problems = Collected()
     for name, inner in value.items():
-        try:
-            text(check_variable)(name)
-        except ValueError as error:
-            problems.append(Problem(str(error), (str(name),), at_key=True))
-        if inner is None or isinstance(inner, (dict, list)):
-            message = f"a variable is text, a number, true or false, got {describe(inner)}"
-            problems.append(Problem(message, (str(name),)))
-    if problems:
-        raise Problems(problems)
+        with problems.at(name):
+            if inner is None or isinstance(inner, (dict, list)):
+                raise Problem(f"a variable is text, a number, true or false, got {describe(inner)}")
+    problems.check()
     return value
 
 
@@ -236,9 +232,7 @@ def merge(
     are added up.
     Everything else is replaced. ``strict`` refuses a change to a node that is not there.
     """
-    from rsltrace.job.job import Job
-
-    if _is_mapping(over) and is_shorthand(under.value):
+    if _is_mapping(over) and is_plain(under.value):
         key = shorthand_at(Job, loc)
         if key is not None:
             under = replace(under, value={key: replace(under, key_place=under.place)})

@@ -11,13 +11,14 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from rsltrace.errors import JobError
-from rsltrace.job.documents.keys import file_fields, keys_with
 from rsltrace.job.job import Job
-from rsltrace.job.parts.part import FROM_FILE
+from rsltrace.job.parts.keys import file_fields, keys_with
+from rsltrace.job.parts.validation import worded_problems
 from rsltrace.job.reading.compose import Composition, compose
-from rsltrace.job.reading.problems import Problem, format_loc, nearest, problems_of, unknown_key
-from rsltrace.job.reading.tree import Item, Place, YamlSource, place_at, plain
-from rsltrace.job.reading.yaml_source import Mark, parse_yaml
+from rsltrace.job.reading.tree import place_at, plain
+from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
+from rsltrace.job.values.checks import FROM_FILE
+from rsltrace.job.values.problem import Problem, format_loc, nearest, unknown_key
 
 Overrides = Sequence["str | tuple[str, str]"]
 
@@ -77,7 +78,7 @@ def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides
     try:
         job = Job.model_validate(values, context=FROM_FILE)
     except ValidationError as error:
-        problems += problems_of(error, Job)
+        problems += worded_problems(error, Job)
     if problems:
         raise _job_error(composed.root, problems)
     return job
@@ -92,7 +93,7 @@ def _composition_problems(values: dict[str, object]) -> list[Problem]:
     try:
         Composition.model_validate(values, context=FROM_FILE)
     except ValidationError as error:
-        return problems_of(error, Composition)
+        return worded_problems(error, Composition)
     return []
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError
-from rsltrace.job.parts.names import check_node_name, check_target
+from rsltrace.job.values.names import check_node_name, check_target
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"

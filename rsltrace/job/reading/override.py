@@ -8,15 +8,13 @@ from __future__ import annotations
 import difflib
 import re
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rsltrace.job.documents.keys import is_list_at, shorthand_at, without_alternatives
-from rsltrace.job.reading.problems import Loc, describe
-from rsltrace.job.reading.tree import Item, Place, YamlSource
-from rsltrace.job.reading.yaml_source import Mark, parse_yaml
-
-if TYPE_CHECKING:
-    from rsltrace.job.job import Job
+from rsltrace.job.job import Job
+from rsltrace.job.parts.keys import is_list_at, shorthand_at, without_alternatives
+from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
+from rsltrace.job.values.checks import is_plain
+from rsltrace.job.values.problem import Loc, describe
 
 _STEP = re.compile(r'"([^"]*)"|\'([^\']*)\'|([^.=\'"\[\]]+)|\[([0-9]+|\+)\]')
 _APPEND = "+"
@@ -86,12 +84,12 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
     step = steps[0]
     if item is None or item.value is None:
         starts_list = not step.quoted and step.text == _APPEND
-        if not step.quoted and step.text.isdecimal() and is_list_at(_job(), loc):
+        if not step.quoted and step.text.isdecimal() and is_list_at(Job, loc):
             name = ".".join(map(str, loc))
             raise step.place.error(f"{name} has no entries yet: write {name}.+ for a new one")
         item = Item([] if starts_list else {}, step.place, step.place)
     inner: Any = item.value
-    if is_shorthand(inner) and (key := shorthand_at(_job(), loc)) is not None:
+    if is_plain(inner) and (key := shorthand_at(Job, loc)) is not None:
         inner = {key: replace(item, key_place=item.place)}
     if isinstance(inner, list):
         return replace(item, value=_set_in_list(inner, steps, value, loc))
@@ -100,7 +98,7 @@ def _set(item: Item | None, steps: list[_Step], value: Item, loc: Loc) -> Item:
             f"{'.'.join(map(str, loc))} is {describe(inner)}: there is nothing below it to set"
         )
     name, used = _key(inner, steps)
-    values = without_alternatives(inner, (name,), _job(), loc)
+    values = without_alternatives(inner, (name,), Job, loc)
     new = _set(values.get(name), steps[used:], value, (*loc, name))
     if new.value is None and used == len(steps):
         if name not in values:
@@ -168,14 +166,3 @@ def _names(item: Item) -> list[str]:
             text = inner.value.rstrip("/")
             return [text.rpartition(separator)[2] if separator else text]
     return []
-
-
-def is_shorthand(value: object) -> bool:
-    """Say whether a value may stand for a part: a bag's path, a topic's name, a plain time."""
-    return isinstance(value, (str, int, float)) and not isinstance(value, bool)
-
-
-def _job() -> type[Job]:
-    from rsltrace.job.job import Job
-
-    return Job

@@ -14,8 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from rsltrace.errors import JobError
-from rsltrace.job.reading.tree import Item, Place
-from rsltrace.job.reading.yaml_source import Mark, bare_value
+from rsltrace.job.reading.yaml_source import Item, Mark, Place, bare_value
 
 SUBSTITUTIONS = {
     "env": "env NAME [default]",

@@ -8,26 +8,9 @@ from __future__ import annotations
 
 import os
 
-from rsltrace.job.reading.problems import Loc
-from rsltrace.job.reading.yaml_source import Item, Place, YamlSource
-
-
-class FileText(str):
-    """Text from a file of another folder than the job's: a path in it starts at ``folder``."""
-
-    folder: str
-
-    def __new__(cls, value: str, folder: str) -> FileText:
-        self = super().__new__(cls, value)
-        self.folder = folder
-        return self
-
-
-def from_its_folder(path: str) -> str:
-    """Return a path as the job's folder sees it, whichever file it was written in."""
-    if not isinstance(path, FileText) or os.path.isabs(path):
-        return str(path)
-    return os.path.normpath(os.path.join(path.folder, path)).replace(os.sep, "/")
+from rsltrace.job.reading.yaml_source import Item, Place
+from rsltrace.job.values.paths import FileText
+from rsltrace.job.values.problem import Loc
 
 
 def item_at(root: Item, loc: Loc) -> tuple[Item, int]:
@@ -72,15 +55,3 @@ def _child(item: Item, part: str | int) -> Item | None:
     else:
         found = []
     return found[0] if found else None
-
-
-__all__ = [
-    "FileText",
-    "Item",
-    "Place",
-    "YamlSource",
-    "from_its_folder",
-    "item_at",
-    "place_at",
-    "plain",
-]

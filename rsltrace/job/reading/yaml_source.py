@@ -16,7 +16,7 @@ from ruamel.yaml.nodes import MappingNode, Node, ScalarNode, SequenceNode
 from ruamel.yaml.reader import ReaderError
 
 from rsltrace.errors import JobError
-from rsltrace.job.parts.times import ExactFloat
+from rsltrace.job.values.times import ExactFloat
 
 VALUES_MAX = 100_000
 """Aliases can make a small file mean an enormous one; no job needs this many values."""

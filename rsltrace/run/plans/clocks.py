@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from rsltrace.chance.clock import ClockModel
 from rsltrace.job import Job, locate
-from rsltrace.job.reading.problems import Loc
+from rsltrace.job.values.problem import Loc
 from rsltrace.model.stamp import format_duration
 
 

@@ -13,8 +13,8 @@ from rsltrace.doors.rclpy.entry import Entry, ros_arguments
 from rsltrace.doors.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError
 from rsltrace.job import Job, locate, policy_of, showing_line
-from rsltrace.job.parts.node import Target, target_text
-from rsltrace.job.reading.problems import Loc, nearest
+from rsltrace.job.values.problem import Loc, nearest
+from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import Mains
 from rsltrace.run.plans.guarding import entry_key
 from rsltrace.run.plans.target import load_target

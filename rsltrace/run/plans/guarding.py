@@ -16,8 +16,8 @@ from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
-from rsltrace.guard.virtual.ordering import ordered_sets
 from rsltrace.guard.virtual.randomness import begin_shared
+from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.virtual.torch_streams import torch_streams
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount, Source
@@ -67,7 +67,7 @@ class Guarding:
             if replay is not None:
                 with Trace.open(replay) as trace:
                     kept = [one for found in trace.findings.values() for one in found]
-                self.guard.outside.replay(kept, str(replay))
+                self.guard.answers.replay(kept, str(replay))
         core.default_policy = policy_of(job.guard)
         if self.guard is not None and self.guard.is_virtual(Source.CLOCK):
             self._begin_log_time(core.loop.now_ns)

@@ -16,8 +16,8 @@ from rsltrace.chance.distribution import (
 from rsltrace.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
 from rsltrace.job import Job
 from rsltrace.job.parts.delay import DelaySpec
-from rsltrace.job.parts.delay_files import read_rslcpp, read_samples, read_series
 from rsltrace.job.parts.distribution import DistributionSpec
+from rsltrace.job.reading.delay_files import read_rslcpp, read_samples, read_series
 
 
 def network_plan(job: Job, start_ns: int) -> NetworkPlan | None:

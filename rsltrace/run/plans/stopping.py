@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from rsltrace.job import Job, locate, showing_line
-from rsltrace.job.parts.sizes import format_size
+from rsltrace.job.values.sizes import format_size
 from rsltrace.loop.stop import (
     Progress,
     Stop,

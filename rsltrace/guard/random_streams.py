@@ -7,7 +7,7 @@ from random import Random
 from typing import Any
 
 
-class Streams:
+class RandomStreams:
     """The generators of one run, by name: made when first used, seeded by the job's seed."""
 
     def __init__(self, seed: int) -> None:

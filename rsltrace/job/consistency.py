@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
-from rsltrace.job.parts.run import StopSpec
-from rsltrace.job.parts.times import format_time
-from rsltrace.job.reading.paths import near_path
-from rsltrace.job.reading.problems import Problem
-
-if TYPE_CHECKING:
-    from rsltrace.job.job import Job
+from rsltrace.job.fields import JobFields
+from rsltrace.job.parts.stop import StopSpec
+from rsltrace.job.values.paths import near_path
+from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.times import format_time
 
 
-def problems_of(job: Job) -> Iterator[Problem]:
+def contradictions(job: JobFields) -> Iterator[Problem]:
     """Yield what is wrong with a job each of whose parts is right, with its place in the job."""
     yield from _something_to_run(job)
     yield from _times_in_order(job)
@@ -25,7 +22,7 @@ def problems_of(job: Job) -> Iterator[Problem]:
     yield from _ties_are_decided_once(job)
 
 
-def _bags_progress(job: Job) -> Iterator[Problem]:
+def _bags_progress(job: JobFields) -> Iterator[Problem]:
     if job.progress is None:
         return
     if not job.bags:
@@ -34,7 +31,7 @@ def _bags_progress(job: Job) -> Iterator[Problem]:
         yield Problem("a bag that plays for ever makes no progress", ("progress",))
 
 
-def _bags_end(job: Job) -> Iterator[Problem]:
+def _bags_end(job: JobFields) -> Iterator[Problem]:
     if job.stop != StopSpec():
         return
     for index, bag in enumerate(job.bags):
@@ -45,7 +42,7 @@ def _bags_end(job: Job) -> Iterator[Problem]:
             )
 
 
-def _something_to_run(job: Job) -> Iterator[Problem]:
+def _something_to_run(job: JobFields) -> Iterator[Problem]:
     if not job.nodes and not job.bags and not job.launch:
         place = ("nodes",) if "nodes" in job.model_fields_set else ()
         yield Problem(
@@ -54,7 +51,7 @@ def _something_to_run(job: Job) -> Iterator[Problem]:
         )
 
 
-def _times_in_order(job: Job) -> Iterator[Problem]:
+def _times_in_order(job: JobFields) -> Iterator[Problem]:
     start_ns, construct_ns, stop_ns = job.start_ns, job.construct_time_ns, job.stop.time_ns
     if start_ns is None:
         return
@@ -72,7 +69,7 @@ def _times_in_order(job: Job) -> Iterator[Problem]:
         )
 
 
-def _distinct_names(job: Job) -> Iterator[Problem]:
+def _distinct_names(job: JobFields) -> Iterator[Problem]:
     first: dict[tuple[str, str], int] = {}
     for index, node in enumerate(job.nodes):
         if node.name is None:
@@ -88,12 +85,12 @@ def _distinct_names(job: Job) -> Iterator[Problem]:
         first.setdefault(key, index)
 
 
-def _near(job: Job, path: str) -> str:
+def _near(job: JobFields, path: str) -> str:
     """Say what there is instead of a path that does not lead anywhere."""
     return near_path(job.resolve(path), path)
 
 
-def _ties_are_decided_once(job: Job) -> Iterator[Problem]:
+def _ties_are_decided_once(job: JobFields) -> Iterator[Problem]:
     if job.timer_ties == "heap" and not (
         (job.policy is None or job.policy.order == "fifo")
         and job.executors is None
@@ -106,7 +103,7 @@ def _ties_are_decided_once(job: Job) -> Iterator[Problem]:
         )
 
 
-def _paths_exist(job: Job) -> Iterator[Problem]:
+def _paths_exist(job: JobFields) -> Iterator[Problem]:
     for index, folder in enumerate(job.search_path):
         path = job.resolve(folder)
         if not path.is_dir():

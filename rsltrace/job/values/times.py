@@ -13,6 +13,9 @@ from fractions import Fraction
 
 from rsltrace.model.stamp import NS_PER_S, format_seconds
 
+TimeLike = str | int | float
+"""A time in Python as in YAML: seconds as a number, or text with a unit."""
+
 TIME_NS_MAX = 2**63 - 1
 """ROS keeps a time in a signed 64-bit count of nanoseconds."""
 

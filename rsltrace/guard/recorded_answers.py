@@ -52,7 +52,7 @@ _TLS_DETAILS = ("reason", "library", "verify_code", "verify_message")
 
 
 @dataclass(frozen=True, slots=True)
-class Kept:
+class RecordedAnswer:
     """What an earlier run has of one call: the answer, and how many steps it took to come.
 
     ``text`` is None if the run ended before the answer came.
@@ -62,11 +62,11 @@ class Kept:
     steps: int
 
 
-class Outside:
+class RecordedAnswers:
     """Answers of recorded sources: the real ones, or (in a re-run) those of an earlier run."""
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[str, str, int], deque[Kept]] | None = None
+        self._kept: dict[tuple[str, str, int], deque[RecordedAnswer]] | None = None
         self._trace = ""
 
     def replay(self, findings: Iterable[Finding], trace: str) -> None:
@@ -82,7 +82,7 @@ class Outside:
         """Whether the answers are those of an earlier run."""
         return self._kept is not None
 
-    def next_kept(self, node: str, call: str, of: int = 0) -> Kept:
+    def next_answer(self, node: str, call: str, of: int = 0) -> RecordedAnswer:
         """Return the earlier run's next answer to a call, to that object's if it has a number.
 
         :raises GuardError: if there is no further one.
@@ -98,7 +98,7 @@ class Outside:
         )
 
 
-def answered(real: Callable[[], Any]) -> str:
+def encoded_answer(real: Callable[[], Any]) -> str:
     """Return what a real call answers as text, be it an error of the operating system."""
     try:
         return encoded(real())
@@ -106,7 +106,7 @@ def answered(real: Callable[[], Any]) -> str:
         return _error_text(error)
 
 
-def numbered(of: int, steps: int, text: str | None) -> str:
+def finding_value(of: int, steps: int, text: str | None) -> str:
     """Return a value for the trace that says whose answer it is and how long it took to come."""
     fields: dict[str, Any] = {"of": of}
     if steps:
@@ -116,13 +116,13 @@ def numbered(of: int, steps: int, text: str | None) -> str:
     return json.dumps(fields, ensure_ascii=False)
 
 
-def _parsed(value: str) -> tuple[int, Kept]:
+def _parsed(value: str) -> tuple[int, RecordedAnswer]:
     if not value.startswith('{"of"'):
-        return 0, Kept(value, 0)
+        return 0, RecordedAnswer(value, 0)
     try:
         fields = json.loads(value)
         then = json.dumps(fields["then"], ensure_ascii=False) if "then" in fields else None
-        return int(fields["of"]), Kept(then, int(fields.get("waited", 0)))
+        return int(fields["of"]), RecordedAnswer(then, int(fields.get("waited", 0)))
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise GuardError(f"a recorded answer cannot be read: {error}") from error
 

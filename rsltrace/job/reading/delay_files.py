@@ -15,9 +15,9 @@ from rsltrace.chance.distribution import LONGEST_NS
 from rsltrace.errors import JobError
 from rsltrace.job.parts.delay import DelaySpec
 from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec, check_series, check_short
-from rsltrace.job.parts.names import check_topic
-from rsltrace.job.parts.times import parse_measured
 from rsltrace.job.reading.yaml_source import Mark, YamlSource
+from rsltrace.job.values.names import check_topic
+from rsltrace.job.values.times import parse_measured
 
 _MEASURED = (
     "MEASURED takes the delay from how long the callback ran on the wall clock, which is different "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from fractions import Fraction
 
-from rsltrace.job.reading.problems import Problem, describe
+from rsltrace.job.values.problem import Problem, describe
 
 UNITS = {
     "B": 1,

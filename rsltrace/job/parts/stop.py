@@ -1,24 +1,17 @@
-"""The smaller parts of a job: when the run stops, what is recorded."""
+"""``stop:`` of a job: what ends the run."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from pydantic import Field, field_validator
+from pydantic import Field
 
-from rsltrace.job.parts.names import check_field_path, check_glob, check_topic
-from rsltrace.job.parts.node import Target, check_callable_target
-from rsltrace.job.parts.part import Part, check, flag, items, part, positive_time, text, whole
-from rsltrace.job.parts.sizes import parse_size
-from rsltrace.job.parts.times import parse_time
-from rsltrace.job.reading.problems import Problem
-from rsltrace.model.event import SEGMENT_EVENTS
-
-TimeLike = str | int | float
-"""A time in Python as in YAML: seconds as a number, or text with a unit."""
-
-Globs = Annotated[tuple[str, ...], check(items(text(check_glob)))]
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import check, part, positive_time, text, whole
+from rsltrace.job.values.names import check_field_path, check_topic
+from rsltrace.job.values.sizes import parse_size
+from rsltrace.job.values.target import Target, check_callable_target
+from rsltrace.job.values.times import TimeLike, parse_time
 
 
 class TopicStop(Part):
@@ -107,47 +100,3 @@ class StopSpec(Part):
             quiescence_ns: int | None = None,
             size: int | str | None = None,
         ) -> None: ...
-
-
-class RecordSpec(Part):
-    """Which payloads the trace keeps. Hashes are kept in any case."""
-
-    payloads: Annotated[bool, check(flag)] = Field(
-        default=True,
-        description="Whether messages are kept at all; their hashes are in any case.",
-        examples=[False],
-    )
-    topics: Globs = Field(
-        default=("*",),
-        description="Topics and services whose messages are kept, globs.",
-        examples=[["/odom", "/robot1/*"]],
-    )
-    exclude: Globs = Field(
-        default=(),
-        description="Topics and services whose messages are not kept, globs.",
-        examples=[["/camera/*"]],
-    )
-    segment_events: Annotated[int, check(whole(1, SEGMENT_EVENTS))] = Field(
-        default=SEGMENT_EVENTS,
-        description="After how many events they are written to the file; what a killed or crashed "
-        "run loses is fewer. 1 is slow, and right for finding out what happened before a crash.",
-        examples=[1],
-    )
-
-    if TYPE_CHECKING:
-
-        def __init__(
-            self,
-            *,
-            payloads: bool = True,
-            topics: Sequence[str] = ("*",),
-            exclude: Sequence[str] = (),
-            segment_events: int = SEGMENT_EVENTS,
-        ) -> None: ...
-
-    @field_validator("topics")
-    @classmethod
-    def _not_empty(cls, value: tuple[str, ...]) -> tuple[str, ...]:
-        if not value:
-            raise Problem("an empty list would keep no payload: write 'payloads: false' for that")
-        return value

@@ -29,7 +29,7 @@ class Descriptor:
     is_folder: bool = False
 
 
-class Descriptors:
+class DescriptorTable:
     """What one run has open. One that was closed behind our back is noticed by its inode."""
 
     def __init__(self) -> None:

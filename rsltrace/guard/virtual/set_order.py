@@ -19,10 +19,10 @@ from contextlib import contextmanager
 from types import CodeType, ModuleType
 from typing import Any
 
+from rsltrace.guard.addresses import is_by_address
 from rsltrace.guard.callers import is_own
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.virtual.clocks import numpy_now
-from rsltrace.guard.watch import is_by_address
 from rsltrace.model.finding import Mode, Source
 
 _ORDERED = "__rsltrace_ordered__"

@@ -14,7 +14,7 @@ _LAG_NS_MAX = 100_000_000
 _real_ns = copy_of(time.monotonic_ns)  # type: ignore[arg-type]
 
 
-class Pace:
+class RealTimePace:
     """Tells how far simulated time has got ahead of real time since somebody began to wait."""
 
     def __init__(self) -> None:

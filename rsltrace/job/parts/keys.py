@@ -8,7 +8,7 @@ from typing import Any, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from rsltrace.job.reading.problems import Loc
+from rsltrace.job.values.problem import Loc
 
 
 def file_fields(model: type[BaseModel]) -> Iterator[tuple[str, FieldInfo]]:

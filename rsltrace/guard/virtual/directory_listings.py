@@ -6,10 +6,11 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from typing import Any
 
 from rsltrace.guard.guard import engaged
-from rsltrace.guard.redirect import Redirected, copy_of
+from rsltrace.guard.redirect import redirect
 from rsltrace.model.finding import Mode, Source
 
 
@@ -59,14 +60,12 @@ def _listing(name: str, arrange: Callable[[Any], Any], real: Callable[..., Any])
 
 
 @contextmanager
-def folders() -> Iterator[None]:
+def sorted_listings() -> Iterator[None]:
     """Sort what ``os.listdir`` and ``os.scandir`` give, and so glob, pathlib and ``os.walk``."""
     with ExitStack() as stack:
         for name, arrange in (
             ("listdir", lambda value: sorted(value, key=os.fsencode)),
             ("scandir", SortedScan),
         ):
-            function: Any = getattr(os, name)
-            listed = _listing(name, arrange, copy_of(function))
-            stack.callback(Redirected(function, listed).restore)
+            redirect(stack, getattr(os, name), partial(_listing, name, arrange))
         yield

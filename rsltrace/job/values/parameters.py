@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.job.reading.problems import Loc, Problem, Problems, describe
+from rsltrace.job.values.problem import Loc, Problem, Problems, describe
 
 Scalar = bool | int | float | str
 ParameterValue = Scalar | tuple[bool, ...] | tuple[int, ...] | tuple[float, ...] | tuple[str, ...]

@@ -5,18 +5,17 @@ from __future__ import annotations
 import math
 import os
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.guard import resolved_guard
-from rsltrace.job.parts.node import NodeSpec, target_text
+from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import Part
-from rsltrace.job.parts.times import format_time
-
-if TYPE_CHECKING:
-    from rsltrace.job.job import Job
+from rsltrace.job.values.target import target_text
+from rsltrace.job.values.times import format_time
 
 
-def job_yaml(job: Job) -> str:
+def job_yaml(job: JobFields) -> str:
     """Return a job file with every key that differs from its default."""
     from ruamel.yaml import YAML
 
@@ -42,7 +41,7 @@ def _quoted(value: Any) -> Any:
     return value
 
 
-def job_resolved(job: Job) -> dict[str, Any]:
+def job_resolved(job: JobFields) -> dict[str, Any]:
     """Return the complete job as JSON-compatible values, the same on every machine."""
     values = _complete(job)
     values["search_path"] = [_relative(job, path) for path in job.search_path]
@@ -59,7 +58,7 @@ def job_resolved(job: Job) -> dict[str, Any]:
     return values
 
 
-def _relative(job: Job, path: str) -> str:
+def _relative(job: JobFields, path: str) -> str:
     return os.path.relpath(job.resolve(path), job.base_dir).replace(os.sep, "/")
 
 

@@ -12,31 +12,31 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.guard import Guard, engage, engaged
-from rsltrace.guard.recorded.answers import answered, decoded, numbered
+from rsltrace.guard.guard import Context, Guard, engage, engaged
+from rsltrace.guard.real_time import STEP_NS
+from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
-from rsltrace.guard.virtual.real_time_pace import STEP_NS
 from rsltrace.model.finding import Mode, Source
 
 NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""
 
-Look = Callable[[float], Any]
+Attempt = Callable[[float], Any]
 """Waits for real, at most so many seconds, and returns the answer or ``NOT_YET``."""
 
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
 _sleep = copy_of(time.sleep)  # type: ignore[arg-type]
 
 
-def awaited(
+def wait_recorded(
     guard: Guard,
     source: Source,
     call: str,
-    look: Look,
+    look: Attempt,
     frame: FrameType,
     *,
     of: int,
-    for_ns: int | None = None,
+    timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
     """Return the answer to a call that waits for it, or None if it does not come in time.
@@ -47,9 +47,9 @@ def awaited(
     """
     context = guard.context
     step = step or context.step
-    deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
+    deadline_ns = _deadline_ns(context, timeout_s)
     steps = 0
-    kept = guard.outside.next_kept(context.node(), call, of) if guard.outside.replays else None
+    kept = guard.answers.next_answer(context.node(), call, of) if guard.answers.replays else None
     text: str | None = None
     try:
         while True:
@@ -75,14 +75,14 @@ def awaited(
                 break
     finally:
         # None: the run ends before the answer has come, and a re-run will wait as long for it.
-        guard.found(source, Mode.RECORD, call, numbered(of, steps, text), frame)
+        guard.found(source, Mode.RECORD, call, finding_value(of, steps, text), frame)
     return decoded(text)
 
 
-def patiently(
+def wait_unrecorded(
     guard: Guard,
-    look: Look,
-    for_ns: int | None = None,
+    look: Attempt,
+    timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
     """Wait likewise for what is not recorded; return it, or None if it does not come in time.
@@ -91,7 +91,7 @@ def patiently(
     """
     context, steps = guard.context, 0
     step = step or context.step
-    deadline_ns = None if for_ns is None else context.now_ns() + max(for_ns, 0)
+    deadline_ns = _deadline_ns(context, timeout_s)
     while True:
         with engage(None):
             found = look(guard.pace.ahead_s(context.now_ns()) if steps else 0.0)
@@ -111,7 +111,11 @@ def patiently(
         steps += 1
 
 
-def is_patient(frame: FrameType) -> Guard | None:
+def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
+    return None if timeout_s is None else context.now_ns() + max(int(timeout_s * 1e9), 0)
+
+
+def waiting_guard(frame: FrameType) -> Guard | None:
     """Return the guard if whoever calls from ``frame`` is to wait like that.
 
     Threads are, and multiprocessing anywhere: it has threads of its own that must go on.
@@ -125,18 +129,18 @@ def is_patient(frame: FrameType) -> Guard | None:
     return None
 
 
-def _looked(look: Look, seconds: float) -> str | None:
+def _looked(look: Attempt, seconds: float) -> str | None:
     found: list[Any] = []
 
     def real() -> Any:
         found.append(look(seconds))
         return None if found[0] is NOT_YET else found[0]
 
-    text = answered(real)
+    text = encoded_answer(real)
     return None if found and found[0] is NOT_YET else text
 
 
-def when_readable(fd: int, real: Callable[[], Any]) -> Look:
+def when_readable(fd: int, real: Callable[[], Any]) -> Attempt:
     """Return a look that does ``real`` as soon as there is something to read."""
 
     def look(seconds: float) -> Any:
@@ -147,7 +151,7 @@ def when_readable(fd: int, real: Callable[[], Any]) -> Look:
     return look
 
 
-def again_and_again(real: Callable[[], Any]) -> Look:
+def polled(real: Callable[[], Any]) -> Attempt:
     """Return a look at something that nobody can wait for: ``real`` returns it, or ``NOT_YET``."""
 
     def look(seconds: float) -> Any:

@@ -1,0 +1,48 @@
+"""Addresses of objects, where a program can see them: in hashes and in texts."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from types import FrameType
+
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.model.finding import Source
+
+_ADDRESS = re.compile(r"\S* at 0x[0-9a-f]{6,}")
+_ALIKE = object.__hash__
+_SEEDED = os.environ.get("PYTHONHASHSEED", "random") == "random"
+
+
+def is_by_address(thing: object) -> bool:
+    """Return whether an object's hash differs from process to process."""
+    kind = type(thing)
+    if kind in (int, float, bool, complex):
+        return False
+    if kind in (str, bytes):
+        return _SEEDED
+    if kind in (tuple, frozenset):
+        return any(map(is_by_address, thing))  # type: ignore[call-overload]
+    if thing is None:
+        return sys.version_info < (3, 12)
+    return getattr(kind, "__hash__", None) is _ALIKE
+
+
+def text_with_address(text: str) -> None:
+    """Report a text for others to see in which an object's address stands."""
+    guard = engaged()
+    if guard is not None:
+        match = _ADDRESS.search(text)
+        if match is not None:
+            report_here(guard, Source.ADDRESS, "an address in a log record", match.group())
+
+
+def report_here(guard: Guard, source: Source, call: str, value: str) -> None:
+    """Report something that user code did through our own middleware."""
+    frame: FrameType | None = sys._getframe(1)
+    while frame is not None:
+        if guard.is_user(frame):
+            guard.watched(source, call, value, frame)
+            return
+        frame = frame.f_back
