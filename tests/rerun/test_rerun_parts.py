@@ -23,7 +23,8 @@ from rsltrace_viewer.rerun_export.rates import step_for
 from rsltrace_viewer.rerun_export.shapes import SHAPES, Paint
 from rsltrace_viewer.rerun_export.tracks import Track
 
-from rsltrace.diff.traces.model import Diff, Side, Verdict
+from rsltrace.diff.result.divergence import Verdict
+from rsltrace.diff.result.traces import Diff, Side
 
 S = 1_000_000_000
 

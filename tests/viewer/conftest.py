@@ -71,7 +71,7 @@ def long_run(long: Path) -> Iterator[Run]:
 
 @pytest.fixture
 def pair() -> tuple[Path, Path]:
-    """Two runs of one job that part, from the samples."""
+    """Two runs of one job that diverge, from the samples."""
     folder = SAMPLES / "nondeterministic_callback"
     return folder / "a.mcap", folder / "b.mcap"
 

@@ -61,7 +61,7 @@ class ViewerApp(Stepping):
     # Asking.
 
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
-        """Some keys come before the part that has the focus, but not while one types."""
+        """Some keys come before the pane that has the focus, but not while one types."""
         if action == "ask":
             return not self.prompt.asking and len(self.screen_stack) == 1
         if action == "pane":
@@ -195,7 +195,7 @@ class ViewerApp(Stepping):
         self._show_lanes()
 
     def action_maximise(self) -> None:
-        """Give the whole screen to the current part."""
+        """Give the whole screen to the current pane."""
         screen = self.screen_stack[0]
         if any(screen.has_class(name) for name in _ONLY):
             screen.remove_class(*_ONLY)

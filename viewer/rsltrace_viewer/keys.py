@@ -24,8 +24,8 @@ class Key:
 
     @property
     def first(self) -> bool:
-        """Whether the key is looked at before the focused part gets it. Questions are opened so:
-        what is typed right after must not reach that part any more."""
+        """Whether the key is looked at before the focused pane gets it. Questions are opened so:
+        what is typed right after must not reach that pane any more."""
         return self.action.startswith(("ask", "pane"))
 
 
@@ -90,8 +90,8 @@ KEYS: tuple[Key, ...] = (
     ),
     Key("escape", "Esc", "escape", "end search, filter, zoom, following", FIND),
     Key("enter", "Enter", "enter", "open or close a field; follow a link", LOOK, "open", 11),
-    Key("tab", "Tab", "pane(1)", "next part: events, event, lanes", LOOK, "part", 7),
-    Key("shift+tab", "⇧Tab", "pane(-1)", "previous part", LOOK),
+    Key("tab", "Tab", "pane(1)", "next pane: events, event, lanes", LOOK, "pane", 7),
+    Key("shift+tab", "⇧Tab", "pane(-1)", "previous pane", LOOK),
     Key(
         "plus,equals_sign",
         "+",
@@ -103,11 +103,11 @@ KEYS: tuple[Key, ...] = (
     ),
     Key("minus", "-", "zoom(-1)", "lanes: zoom out", LOOK),
     Key("0", "0", "zoom(0)", "lanes: the whole run", LOOK),
-    Key("z", "z", "maximise", "this part over the whole screen, and back", LOOK),
+    Key("z", "z", "maximise", "this pane over the whole screen, and back", LOOK),
     Key("p", "p", "plot", "plot fields, rates and latencies", LOOK, "plot", 13),
     Key("R", "R", "follow", "follow a file that is still recorded", LOOK),
     Key("d", "d", "theme", "dark or light", LOOK),
-    Key("v", "v", "verdict", "why the runs part: the whole report", COMPARE, "why", 3, True),
+    Key("v", "v", "verdict", "why the runs diverge: the whole report", COMPARE, "why", 3, True),
     Key("o", "o", "other", "inspect run a, run b, or the differences", COMPARE, "a/b", 7, True),
     Key("question_mark", "?", "help", "all keys", LOOK, "help", 0),
     Key("q", "q", "quit", "quit", LOOK, "quit", 0),

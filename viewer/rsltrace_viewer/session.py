@@ -27,7 +27,7 @@ from rsltrace_viewer.model.timeline import Columns, EventText, EventTexts, Sign,
 from rsltrace_viewer.model.view import SingleView, View
 
 if TYPE_CHECKING:
-    from rsltrace.diff.traces.stretches import Stretch
+    from rsltrace.diff.alignment.blocks import AlignedBlock
     from rsltrace_viewer.model.compare import Comparison  # the diff is loaded for two traces only
 
 SEEK: dict[str, tuple[Condition, str]] = {
@@ -77,13 +77,13 @@ class Session:
         if self.b is not None:
             self.b.close()
 
-    def take_stretch(self, stretch: Stretch | None) -> None:
-        """Show another stretch of two runs; the selected event stays selected."""
+    def take_block(self, block: AlignedBlock | None) -> None:
+        """Show another block of two runs; the selected event stays selected."""
         comparison = self.comparison
         if comparison is None:
             return
         a, b = comparison.a(self.place), comparison.b(self.place)
-        comparison.take(stretch)
+        comparison.take(block)
         if a is not None:
             self.place = comparison.place_of(a)
         elif b is not None:

@@ -128,12 +128,12 @@ class Shell(App[None]):
         shown = perf_counter()
         while not comparison.done and not worker.is_cancelled:
             try:
-                stretch = comparison.fetch()
+                block = comparison.fetch()
             except RsltraceError as error:
                 self.call_from_thread(self.notify, str(error), severity="error")
                 return
             # On the app's thread: the view must not change while a screen is drawn from it.
-            self.call_from_thread(self.session.take_stretch, stretch)
+            self.call_from_thread(self.session.take_block, block)
             if comparison.done or perf_counter() - shown > _REPORT_S:
                 self.call_from_thread(self._show_rows)
                 shown = perf_counter()

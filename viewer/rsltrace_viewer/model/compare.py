@@ -1,7 +1,7 @@
 """Two runs next to each other: which events belong together, what differs in them, and why.
 
 Up to the first difference a place is an event of both runs and nothing is read. From there on
-events are matched by the diff, a stretch at a time, as far as one has come; what has not been
+events are matched by the diff, a block at a time, as far as one has come; what has not been
 matched yet stands at the end, unmatched, and says so.
 """
 
@@ -11,18 +11,18 @@ from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 
+from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EventPair
+from rsltrace.diff.alignment.entity_matching import match_entities
+from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.diff.alignment.rows import Run as DiffRun
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.engine import diff_traces
-from rsltrace.diff.traces.identity import identify
-from rsltrace.diff.traces.model import Diff
-from rsltrace.diff.traces.rows import Run as DiffRun
-from rsltrace.diff.traces.search import first_difference
-from rsltrace.diff.traces.stretches import Item, Stretch, Stretches
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.lanes import Window
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline import Sign
 
-_EVENTS_PER_STRETCH = 2000
+_EVENTS_PER_BLOCK = 2000
 _ALIGNED_MAX = 2_000_000
 """Events after the first difference that are matched; beyond, rows are not compared."""
 
@@ -32,7 +32,7 @@ _UNMATCHED = -1
 
 
 class Comparison:
-    """The view of two runs (see ``View``). ``advance`` matches another stretch."""
+    """The view of two runs (see ``View``). ``advance`` matches another block."""
 
     def __init__(self, a: Run, b: Run) -> None:
         """Find the first difference and match the events around it. Raises TraceError."""
@@ -47,19 +47,19 @@ class Comparison:
         self._signs = array("B")
         self._place_a = array("q")
         self._place_b = array("q")
-        self._blocks: list[int] = []
+        self._divergences: list[int] = []
         """Places where rows begin to differ, after one that does not."""
         self._first_place: int | None = None if first is None else first
         self._end_a = self._end_b = self.agreeing
-        self._stretches: Iterator[Stretch] = iter(())
-        identity = identify(a.trace, b.trace)
-        self.diff_run_a = DiffRun(a.trace, identity, False)
-        self.diff_run_b = DiffRun(b.trace, identity, True)
+        self._aligned_blocks: Iterator[AlignedBlock] = iter(())
+        matching = match_entities(a.trace, b.trace)
+        self.diff_run_a = DiffRun(a.trace, matching, False)
+        self.diff_run_b = DiffRun(b.trace, matching, True)
         if first is not None:
-            stretches = Stretches(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_STRETCH)
-            self._stretches = (part for part in stretches if isinstance(part, Stretch))
+            blocks = AlignedBlocks(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_BLOCK)
+            self._aligned_blocks = (part for part in blocks if isinstance(part, AlignedBlock))
             self.advance()
-            self._first_place = self._blocks[0] if self._blocks else first
+            self._first_place = self._divergences[0] if self._divergences else first
 
     # The view.
 
@@ -113,28 +113,28 @@ class Comparison:
         return 1.0 if self.done else (self._end_a + self._end_b) / max(total, 1)
 
     def advance(self) -> None:
-        """Match the next stretch."""
+        """Match the next block."""
         self.take(self.fetch())
 
-    def fetch(self) -> Stretch | None:
-        """Match the next stretch without showing it yet, in any thread. Raises TraceError."""
-        return next(self._stretches, None)
+    def fetch(self) -> AlignedBlock | None:
+        """Match the next block without showing it yet, in any thread. Raises TraceError."""
+        return next(self._aligned_blocks, None)
 
-    def take(self, stretch: Stretch | None) -> None:
-        """Show a stretch (None: there is no more)."""
-        if stretch is None:
+    def take(self, block: AlignedBlock | None) -> None:
+        """Show a block (None: there is no more)."""
+        if block is None:
             self.done = True
             return
-        for item in stretch.items:
-            self._add(item, _sign(item, stretch))
-        self._end_a, self._end_b = stretch.end_a, stretch.end_b
-        self.done = stretch.at_end or len(self._a) > _ALIGNED_MAX
+        for item in block.items:
+            self._add(item, _sign(item, block))
+        self._end_a, self._end_b = block.end_a, block.end_b
+        self.done = block.at_end or len(self._a) > _ALIGNED_MAX
 
-    def _add(self, item: Item, sign: Sign) -> None:
+    def _add(self, item: EventPair, sign: Sign) -> None:
         place = self.agreeing + len(self._a)
         plain = sign is Sign.MATCH
         if not plain and (not self._signs or self._signs[-1] == _CODES[Sign.MATCH]):
-            self._blocks.append(place)
+            self._divergences.append(place)
         self._a.append(item.a)
         self._b.append(item.b)
         self._signs.append(_CODES[sign])
@@ -142,7 +142,7 @@ class Comparison:
         _enter(self._place_b, item.b - self.agreeing, place)
 
     def finish_diff(self) -> None:
-        """Let the diff say why the runs part. Takes a while; meant for a thread."""
+        """Let the diff say why the runs diverge. Takes a while; meant for a thread."""
         self.diff = diff_traces(self.run_a.trace, self.run_b.trace, DiffOptions())
 
     # What it says.
@@ -179,13 +179,13 @@ class Comparison:
     def next_divergence(self, place: int, step: int) -> int | None:
         """Return where the runs next begin to differ after (or before) a place."""
         if step > 0:
-            found = bisect_right(self._blocks, place)
+            found = bisect_right(self._divergences, place)
         else:
-            found = bisect_left(self._blocks, place) - 1
-        return self._blocks[found] if 0 <= found < len(self._blocks) else None
+            found = bisect_left(self._divergences, place) - 1
+        return self._divergences[found] if 0 <= found < len(self._divergences) else None
 
 
-def _sign(item: Item, stretch: Stretch) -> Sign:
+def _sign(item: EventPair, block: AlignedBlock) -> Sign:
     if item.b < 0:
         return Sign.ONLY_A
     if item.a < 0:
@@ -194,7 +194,7 @@ def _sign(item: Item, stretch: Stretch) -> Sign:
         return Sign.MATCH
     if item.same:
         return Sign.MOVED
-    a, b = stretch.rows_a, stretch.rows_b
+    a, b = block.rows_a, block.rows_b
     i, j = item.a - a.first, item.b - b.first
     did_the_same = (a.input[i], a.content[i], a.flags[i]) == (b.input[j], b.content[j], b.flags[j])
     did_the_same = did_the_same and a.state[i] == b.state[j]

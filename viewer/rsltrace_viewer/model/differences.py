@@ -4,17 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from rsltrace.diff.causes.event_views import EventViews
+from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.model import (
+from rsltrace.diff.result.divergence import (
     ENDED_BY_EXCEPTION,
-    ULP_TOLD_MAX,
     Divergence,
-    EventView,
-    FieldDifference,
     MessageDifference,
 )
-from rsltrace.diff.traces.views import Viewer
-from rsltrace.diff.why.evidence import message_differences
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.fields import ULP_TOLD_MAX, FieldDifference
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
@@ -112,9 +111,9 @@ def _title(
 
 def _view(comparison: Comparison, a: int | None, b: int | None) -> EventView:
     if a is not None:
-        return Viewer(comparison.diff_run_a).view(a)
+        return EventViews(comparison.diff_run_a).view(a)
     assert b is not None  # a place stands for something
-    return Viewer(comparison.diff_run_b).view(b)
+    return EventViews(comparison.diff_run_b).view(b)
 
 
 def _why(comparison: Comparison) -> Iterator[Line]:
@@ -160,8 +159,8 @@ def _difference_lines(
     comparison: Comparison, a: int | None, b: int | None, openness: Openness, *, first: bool
 ) -> Iterator[Line]:
     runs = comparison.diff_run_a, comparison.diff_run_b
-    view_a = Viewer(runs[0]).view(a) if a is not None else None
-    view_b = Viewer(runs[1]).view(b) if b is not None else None
+    view_a = EventViews(runs[0]).view(a) if a is not None else None
+    view_b = EventViews(runs[1]).view(b) if b is not None else None
     found = message_differences(*runs, view_a, view_b, DiffOptions())
     divergences = comparison.diff.divergences if first and comparison.diff is not None else ()
     known = divergences[0] if divergences else None

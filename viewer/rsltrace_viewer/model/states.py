@@ -9,9 +9,14 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from rsltrace.diff.traces.model import CallDifference, Divergence, EventView, StateDifference
-from rsltrace.diff.traces.rows import Run as DiffRun
-from rsltrace.diff.why.states import state_differences
+from rsltrace.diff.alignment.rows import Run as DiffRun
+from rsltrace.diff.causes.state_differences import state_differences
+from rsltrace.diff.result.divergence import (
+    CallDifference,
+    Divergence,
+    StateDifference,
+)
+from rsltrace.diff.result.events import EventView
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import Event

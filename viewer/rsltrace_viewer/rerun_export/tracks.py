@@ -1,7 +1,7 @@
 """The way something took, as one line through the whole run.
 
 A line that is there from the start shows in one look where a robot went and, of two runs, where
-they part. It is thinned out as it grows, so it costs the same for an hour as for a minute.
+they diverge. It is thinned out as it grows, so it costs the same for an hour as for a minute.
 """
 
 from __future__ import annotations

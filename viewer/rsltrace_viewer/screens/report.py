@@ -14,7 +14,7 @@ from textual.widgets import Static
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
-from rsltrace.diff.traces.model import Diff
+from rsltrace.diff.result.traces import Diff
 
 _STYLES = {
     TITLE: "bold $text-primary",
@@ -50,6 +50,6 @@ class ReportScreen(ModalScreen[None]):
             for line in lines
         )
         with VerticalScroll() as box:
-            box.border_title = "why the runs part"
+            box.border_title = "why the runs diverge"
             box.border_subtitle = "Esc closes, ↓ scrolls"
             yield Static(text)

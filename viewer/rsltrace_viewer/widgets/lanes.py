@@ -84,7 +84,7 @@ class LanesView(Widget, can_focus=True):
     def show(self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None) -> None:
         """Show lanes with the cursor at a time (or index), in the lane named ``own``.
 
-        ``divergence`` is the time (or index) where two runs part.
+        ``divergence`` is the time (or index) where two runs diverge.
         """
         before = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
         axis = self._position
