@@ -1,5 +1,5 @@
 # Two commands do everything on a fresh machine, set-up included:
-#   make demo   record the sample job twice and compare; show where two other runs part
+#   make demo   record the sample job twice and compare; show where two other runs diverge
 #   make test   lint, types, architecture and tests
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 

@@ -3,10 +3,10 @@
     python benchmarks/diff.py            1e4, 1e5 and 1e6 events, about three minutes
     python benchmarks/diff.py --large    1e7 events, too (3.5 GB of files, some minutes more)
 
-Each run is compared with itself and with runs that part from it at 10, 50 and 99 %. "diff" is what
-a user waits for: a new process, from start to exit, the best of nine; "cpu" is its time on a CPU
-(of all threads: numpy's BLAS starts some), which a busy machine changes less. "linear" is the mcap
-package's reader going through the messages of both files in its usual order until they differ,
+Each run is compared with itself and with runs that diverge from it at 10, 50 and 99 %. "diff" is
+what a user waits for: a new process, from start to exit, the best of nine; "cpu" is its time on a
+CPU (of all threads: numpy's BLAS starts some), which a busy machine changes less. "linear" is the
+mcap package's reader going through the messages of both files in its usual order until they differ,
 without the start of a process; "events" the same with the events only, for somebody who knows what
 these are. What is marked with ~ was not waited for, but scaled from the half of 1e6 events. All
 files are in the page cache. They are kept in the temporary folder for the next time.
@@ -25,7 +25,7 @@ from pathlib import Path
 from mcap.reader import make_reader
 from synthetic import Shape, write_trace
 
-from rsltrace.diff.traces.engine import diff_traces
+from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.trace.format import TOPIC_EVENTS
 from rsltrace.trace.reader import Trace
 
@@ -41,16 +41,16 @@ _TRIES = 9
 
 
 def traces(count: int) -> list[tuple[str, Path, Path]]:
-    """Return (where they part, one trace, the other), written now if they are not there yet."""
+    """Return (where they diverge, one trace, the other), written now if they are not there yet."""
     folder = Path(tempfile.gettempdir()) / f"rsltrace-benchmark-diff-{_VERSION}"
     folder.mkdir(exist_ok=True)
     payload_bytes = 0 if count <= PAYLOADS_MAX else None
     places = {"same": None, **{f"{p:.0%}": int(count * p) for p in PLACES}}
     paths = {}
-    for name, parts_at in places.items():
+    for name, diverges_at in places.items():
         path = paths[name] = folder / f"{count}-{name.rstrip('%')}.mcap"
         if not path.exists():
-            write_trace(path, Shape(count, parts_at, payload_bytes))
+            write_trace(path, Shape(count, diverges_at, payload_bytes))
     return [(name, paths["same"], path) for name, path in paths.items()]
 
 
@@ -109,7 +109,7 @@ class Linear:
 
 
 HEAD = (
-    "   events  part at   diff s   cpu s  peak MB  read kB    of kB"
+    "   events  diverge   diff s   cpu s  peak MB  read kB    of kB"
     "  linear s   ratio  events s   ratio"
 )
 
@@ -121,12 +121,12 @@ def measure(count: int, linear: Linear) -> None:
         with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
             found = diff_traces(trace_a, trace_b)
             whole = trace_a.size + trace_b.size
-        parts_at = count if name == "same" else int(count * float(name[:-1]) / 100)
-        assert found.agreeing == parts_at, (found.agreeing, parts_at)
+        diverges_at = count if name == "same" else int(count * float(name[:-1]) / 100)
+        assert found.agreeing == diverges_at, (found.agreeing, diverges_at)
         row = f"{count:>9}  {name:>7}  {taken:>7.3f}  {cpu:>6.3f}  {peak:>7.0f}"
         row += f"  {found.bytes_read / 1e3:>7.0f}  {whole / 1e3:>7.0f}"
         for what in ("all", "events"):
-            seconds, measured = linear.seconds(a, b, what, parts_at)
+            seconds, measured = linear.seconds(a, b, what, diverges_at)
             text = f"{'' if measured else '~'}{seconds:.2f}"
             row += f"  {text:>8}  {seconds / taken:>6.0f}"
         print(row, flush=True)

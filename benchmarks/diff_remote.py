@@ -2,7 +2,7 @@
 
     python benchmarks/diff_remote.py     (9 GB of files, kept in the temporary folder; minutes)
 
-The server is on this machine and counts. Three kinds of traces, which part at 10, 50 and 99 %:
+The server is on this machine and counts. Three kinds of traces, which diverge at 10, 50 and 99 %:
 "small" messages (1e7 events, their index is the most there is to fetch), "large" ones (2e5 events
 with messages of 5 kB, which do not compress), and "cut" the large ones compared with a trace whose
 segments end elsewhere, so that each step of the search has to fetch a segment.
@@ -52,7 +52,7 @@ def main() -> None:
     folder = Path(tempfile.gettempdir()) / f"rsltrace-benchmark-diff-remote-{_VERSION}"
     folder.mkdir(exist_ok=True)
     server = RangeServer(folder)
-    print("  kind  part at  MB whole  requests  MB sent       s")
+    print("  kind  diverge  MB whole  requests  MB sent       s")
     for kind, (shape, segment) in KINDS.items():
         a = folder / f"{kind}-a.mcap"
         if not a.exists():
@@ -61,8 +61,8 @@ def main() -> None:
             name = "same" if place is None else f"{place:.0%}"
             b = folder / f"{kind}-{name.rstrip('%')}.mcap"
             if not b.exists():
-                parts_at = None if place is None else int(shape.events * place)
-                write_trace(b, Shape(shape.events, parts_at, shape.payload_bytes, segment))
+                diverges_at = None if place is None else int(shape.events * place)
+                write_trace(b, Shape(shape.events, diverges_at, shape.payload_bytes, segment))
             measure(server, kind, name, a, b)
     server.close()
 

@@ -60,14 +60,14 @@ class BulkWriter(TraceWriter):
 
 @dataclass(frozen=True)
 class Shape:
-    """What a trace is like. From event ``parts_at`` on all values are others.
+    """What a trace is like. From event ``diverges_at`` on all values are others.
 
     ``payload_bytes`` is the length of the messages' arrays, None to record no payloads; ``segment``
     how many events a segment has.
     """
 
     events: int
-    parts_at: int | None = None
+    diverges_at: int | None = None
     payload_bytes: int | None = 0
     segment: int = 4096
 
@@ -168,12 +168,12 @@ class _Synthesis:
 
 
 def _values(shape: Shape) -> Iterator[np.ndarray]:
-    """Yield what the events publish, a segment at a time: the same up to where they part."""
+    """Yield what the events publish, a segment at a time: the same up to where they diverge."""
     one, other = np.random.default_rng(1), np.random.default_rng(2)
-    parts_at = shape.events if shape.parts_at is None else shape.parts_at
+    diverges_at = shape.events if shape.diverges_at is None else shape.diverges_at
     for first in range(0, shape.events, shape.segment):
         size = min(shape.segment, shape.events - first)
         values = one.integers(0, 2**63, size, dtype=np.uint64)
         others = other.integers(0, 2**63, size, dtype=np.uint64)
-        values[max(parts_at - first, 0) :] = others[max(parts_at - first, 0) :]
+        values[max(diverges_at - first, 0) :] = others[max(diverges_at - first, 0) :]
         yield values

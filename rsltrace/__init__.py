@@ -19,9 +19,10 @@ from rsltrace._version import __version__
 if TYPE_CHECKING:
     from rsltrace.diff import diff_files as diff
     from rsltrace.diff.bags.comparison import diff_bags
-    from rsltrace.diff.bags.model import BagDiff
     from rsltrace.diff.options import DiffOptions
-    from rsltrace.diff.traces.model import Diff, Verdict
+    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result.divergence import Verdict
+    from rsltrace.diff.result.traces import Diff
     from rsltrace.errors import RsltraceError
     from rsltrace.job import (
         BagSpec,
@@ -38,9 +39,9 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _HOMES = {
-    "BagDiff": "rsltrace.diff.bags.model",
+    "BagDiff": "rsltrace.diff.result.bags",
     "BagSpec": "rsltrace.job",
-    "Diff": "rsltrace.diff.traces.model",
+    "Diff": "rsltrace.diff.result.traces",
     "DiffOptions": "rsltrace.diff.options",
     "HooksSpec": "rsltrace.job",
     "Job": "rsltrace.job",
@@ -53,7 +54,7 @@ _HOMES = {
     "StopSpec": "rsltrace.job",
     "TopicStop": "rsltrace.job",
     "Trace": "rsltrace.trace.reader",
-    "Verdict": "rsltrace.diff.traces.model",
+    "Verdict": "rsltrace.diff.result.traces",
     "diff_bags": "rsltrace.diff.bags.comparison",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",

@@ -72,7 +72,7 @@ def record(folder: Path, run: Run, output: Path) -> None:
 
 
 def report(folder: Path) -> str:
-    """Return what ``rsltrace diff`` prints of a sample. Its exit status must be 1: they part."""
+    """Return what ``rsltrace diff`` prints of a sample. Its exit status must be 1: they diverge."""
     done = subprocess.run(
         [sys.executable, "-m", "rsltrace", "diff", "a.mcap", "b.mcap"],
         cwd=folder,

@@ -15,11 +15,13 @@ import click
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.cli.event_text import EventJson, EventText
+from rsltrace.cli.event_json import EventJson
+from rsltrace.cli.event_line import EventLines
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
+from rsltrace.words.times import parse_stamp
 
 _TOPIC_KINDS = frozenset(
     (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
@@ -41,13 +43,8 @@ class _Time(_IntParam):
         """Return nanoseconds, or end with a usage error."""
         if isinstance(value, int):
             return value
-        from rsltrace.job.values.times import (
-            parse_time,  # the job package needs pydantic, we do not
-        )
-
-        text = str(value).strip()
         try:
-            return parse_time(text if text[-1:].isalpha() else f"{text}s")
+            return parse_stamp(str(value))
         except ValueError as error:
             self.fail(str(error), param, ctx)
 
@@ -116,7 +113,7 @@ def cat(
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
         write = sys.stdout.write
-        form = _json_form(opened, payloads) if as_json else EventText(opened).line
+        form = _json_form(opened, payloads) if as_json else EventLines(opened).line
         for event, outputs in islice(_events(opened, choice), limit):
             write(form(event, outputs) + "\n")
 

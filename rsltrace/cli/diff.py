@@ -1,4 +1,4 @@
-"""``rsltrace diff``: where two runs part, and why."""
+"""``rsltrace diff``: where two runs diverge, and why."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 
 if TYPE_CHECKING:
-    from rsltrace.diff.bags.model import BagDiff
     from rsltrace.diff.report.line import Line
-    from rsltrace.diff.traces.model import Diff
+    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result.traces import Diff
     from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
@@ -134,7 +134,7 @@ def diff(
     check: bool,
     output: Path | None,
 ) -> int:
-    """Find where A and B first part, and why.
+    """Find where A and B first diverge, and why.
 
     A and B are traces (files or addresses: https://, s3://, ...), rosbag2 recordings (folders,
     .mcap or .db3 files), or one of each. With more than two, A is the golden one that all others
@@ -143,8 +143,8 @@ def diff(
     FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
     topics and a colon. A tolerance never makes two traces identical.
 
-    The exit status is 0 if nothing differs, 1 if the runs part, 2 for trouble, 3 if they are equal
-    within tolerance and not identical.
+    The exit status is 0 if nothing differs, 1 if the runs diverge, 2 for trouble, 3 if they are
+    equal within tolerance and not identical.
     """
     options = DiffOptions(
         context=context,
@@ -161,7 +161,7 @@ def diff(
     except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
         raise
     except Exception:
-        # Python's own exit status for a bug would be 1, which here says that the runs part.
+        # Python's own exit status for a bug would be 1, which here says that the runs diverge.
         traceback.print_exc()
         return EXIT_USAGE
 
@@ -189,7 +189,7 @@ def _diff(
             trouble = True
     if done:
         _print(done, form, options, output)
-    from rsltrace.diff.traces.model import exit_code_of_several
+    from rsltrace.diff.result.exit_codes import exit_code_of_several
 
     return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
 
@@ -207,7 +207,7 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
-    from rsltrace.diff.traces.engine import diff_traces
+    from rsltrace.diff.traces.diff import diff_traces
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
         if check_a:

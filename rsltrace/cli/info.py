@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import click
 
@@ -18,6 +18,10 @@ from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
+from rsltrace.words.kinds import kind_label
+
+_Kinds: TypeAlias = type[EventKind] | type[OutputKind]
+_VALUE_MAX = 100
 
 
 @click.command()
@@ -52,8 +56,8 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
             *(() if trace.complete else (("next", _CUT_OFF),)),
             ("digest", trace.digest),
             ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})"),
-            ("events", _by_kind(trace.event_count, counts.event_kinds, _event_kind)),
-            ("outputs", _by_kind(trace.output_count, counts.output_kinds, _output_kind)),
+            ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
+            ("outputs", _by_kind(trace.output_count, counts.output_kinds, OutputKind)),
         )
     )
     for title, mapping in (("job", trace.job), ("environment", trace.environment)):
@@ -151,8 +155,8 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
         "duration_ns": _duration_ns(trace),
         "events": trace.event_count,
         "outputs": trace.output_count,
-        "event_kinds": {_event_kind(k): n for k, n in sorted(counts.event_kinds.items())},
-        "output_kinds": {_output_kind(k): n for k, n in sorted(counts.output_kinds.items())},
+        "event_kinds": _counts_by_kind(counts.event_kinds, EventKind),
+        "output_kinds": _counts_by_kind(counts.output_kinds, OutputKind),
         "result": trace.result,
         "job": trace.job,
         "environment": trace.environment,
@@ -226,19 +230,10 @@ def _count(series: Mapping[int, Any], entity: int) -> int:
     return series[entity].count if entity in series else 0
 
 
-def _by_kind(total: int, kinds: Mapping[int, int], label: Any) -> str:
-    parts = ", ".join(f"{label(kind)} {number}" for kind, number in sorted(kinds.items()))
+def _by_kind(total: int, counts: Mapping[int, int], kinds: _Kinds) -> str:
+    parts = ", ".join(f"{name} {n}" for name, n in _counts_by_kind(counts, kinds).items())
     return f"{total}  ({parts})" if parts else str(total)
 
 
-def _event_kind(number: int) -> str:
-    return EventKind(number).label if number in _EVENT_KINDS else f"kind {number}"
-
-
-def _output_kind(number: int) -> str:
-    return OutputKind(number).label if number in _OUTPUT_KINDS else f"kind {number}"
-
-
-_VALUE_MAX = 100
-_EVENT_KINDS = frozenset(map(int, EventKind))
-_OUTPUT_KINDS = frozenset(map(int, OutputKind))
+def _counts_by_kind(counts: Mapping[int, int], kinds: _Kinds) -> dict[str, int]:
+    return {kind_label(kinds, number): n for number, n in sorted(counts.items())}

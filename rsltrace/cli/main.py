@@ -34,7 +34,7 @@ _COMMANDS = {
     "view": "Look at a trace in the terminal, or at two side by side.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
     "export": "Write the messages of a trace as a plain rosbag2 bag.",
-    "diff": "Find where two runs (or recordings) first part, and why.",
+    "diff": "Find where two runs (or recordings) first diverge, and why.",
 }
 """Each is the function of its name in the module of its name, beside this one."""
 
@@ -108,7 +108,7 @@ def cli() -> None:
       rsltrace info run.mcap                  see what is in it
       rsltrace cat run.mcap | less            read every callback
       rsltrace view run.mcap                  step through it
-      rsltrace diff run1.mcap run2.mcap       see where two runs part, and why
+      rsltrace diff run1.mcap run2.mcap       see where two runs diverge, and why
 
     "rsltrace COMMAND --help" explains a command.
     """

@@ -30,7 +30,7 @@ def rerun(
     force: bool,
     quiet: bool,
 ) -> None:
-    """Show TRACE on Rerun's timelines, or TRACE and OTHER and where they part.
+    """Show TRACE on Rerun's timelines, or TRACE and OTHER and where they diverge.
 
     The timelines are simulated time and the number of the event: stepping along the events steps
     through the callbacks. Messages are drawn and plotted, logs and events are listed, and of two

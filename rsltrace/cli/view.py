@@ -15,7 +15,7 @@ import click
 from rsltrace.errors import OutputError, SetupError, TraceError
 
 if TYPE_CHECKING:
-    from rsltrace_viewer.app import ViewerApp
+    from rsltrace_viewer.terminal.app import ViewerApp
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
@@ -60,7 +60,7 @@ def view(
     if serve:
         _serve(port)
         return
-    from rsltrace_viewer.app import ViewerApp, open_session
+    from rsltrace_viewer.terminal.app import ViewerApp, open_session
 
     chosen = traces or _choose(exporting=export is not None)
     if not chosen:
@@ -92,7 +92,7 @@ def _check_installed(package: str) -> None:
 
 def _choose(*, exporting: bool) -> tuple[Path, ...]:
     """Offer the traces of the current folder."""
-    from rsltrace_viewer.choose import ChooseApp, traces_in
+    from rsltrace_viewer.terminal.choose import ChooseApp, traces_in
 
     found = traces_in(Path())
     if not found:
@@ -107,20 +107,20 @@ def _choose(*, exporting: bool) -> tuple[Path, ...]:
 
 
 def _place(session: Any, at: str) -> int:
-    from rsltrace_viewer.model.times import parse_time
+    from rsltrace.words.times import parse_stamp
 
     if at.isdecimal():
         return int(session.view.place_of(min(int(at), max(session.a.count - 1, 0))))
     try:
-        stamp_ns = parse_time(at)
+        stamp_ns = parse_stamp(at)
     except ValueError as error:
         raise click.BadParameter(f"{error}; or the number of an event", param_hint="--at") from None
     return int(session.place_at_time(stamp_ns)) if not session.empty else 0
 
 
 def _checked_filter(session: Any, text: str) -> str:
-    from rsltrace_viewer.model.query import parse
-    from rsltrace_viewer.model.query_text import QueryError
+    from rsltrace_viewer.model.query.parser import parse
+    from rsltrace_viewer.model.query.tokens import QueryError
 
     try:
         parse(text, session.a)
@@ -142,7 +142,7 @@ def _parse_size(text: str) -> tuple[int, int]:
 def _export(app: ViewerApp, path: Path, size: tuple[int, int], keys: list[str]) -> None:
     if path.suffix not in (".svg", ".txt"):
         raise click.BadParameter(f"{path} should end in .svg or .txt", param_hint="--export")
-    from rsltrace_viewer.export import screen_of
+    from rsltrace_viewer.terminal.screenshot import screen_of
 
     picture = screen_of(app, size, keys, svg=path.suffix == ".svg")
     try:
@@ -172,7 +172,7 @@ def _run(app: ViewerApp) -> None:
 def _serve(port: int) -> None:
     """Serve this very command, without --serve, in a browser. Only this machine can reach it."""
     _check_installed("textual_serve")
-    from rsltrace_viewer.serve import LocalServer
+    from rsltrace_viewer.terminal.serve import LocalServer
 
     arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
     command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])

@@ -1,4 +1,4 @@
-"""Where two runs first part, and why. Reads traces and bags; needs no ROS.
+"""Where two runs first diverge, and why. Reads traces and bags; needs no ROS.
 
 >>> import rsltrace
 >>> result = rsltrace.diff("a.mcap", "b.mcap")            # doctest: +SKIP
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rsltrace.diff.traces.model import Diff
+    from rsltrace.diff.result.traces import Diff
 
     Tolerances = Mapping[str, float] | Sequence[tuple[str, float]]
 
@@ -53,7 +53,7 @@ def diff_files(
     and SetupError for an address when fsspec is not installed.
     """
     from rsltrace.diff.options import DiffOptions
-    from rsltrace.diff.traces.engine import diff_traces
+    from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.trace.reader import Trace
 
     chosen = DiffOptions(

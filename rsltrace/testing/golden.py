@@ -59,7 +59,7 @@ def assert_matches_golden(
     one. ``options`` shape the report; no tolerance makes a run match.
     Returns whether the golden trace was written.
 
-    :raises GoldenMismatch: they part; the message is the report.
+    :raises GoldenMismatch: they diverge; the message is the report.
     :raises RsltraceError: there is nothing to compare: the run failed or a file is unreadable.
     """
     __tracebackhide__ = True
@@ -99,7 +99,7 @@ def _report(golden: Path, run: Path, options: DiffOptions | None) -> str | None:
     """Return what differs, or None if nothing does."""
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.report import render
-    from rsltrace.diff.traces.engine import diff_traces
+    from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.trace.reader import Trace
 
     options = options or DiffOptions()

@@ -9,7 +9,8 @@ from pathlib import Path
 
 from diff_simulator import MS, Fault, Logged, NodePlan, Plan, Simulation, Storage, random_plan
 
-from rsltrace.diff.traces.model import Diff, Divergence, Root, Verdict
+from rsltrace.diff.result.divergence import Divergence, Root, Verdict
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.event import EventKind
 
 EVENTS_MAX = 1500
@@ -19,7 +20,7 @@ EVENTS_MAX = 1500
 class Planted:
     """Two runs that differ by one fault, and what is true of the difference.
 
-    ``nodes`` are those of which one has to be named; ``index`` is where the runs part.
+    ``nodes`` are those of which one has to be named; ``index`` is where the runs diverge.
     """
 
     a: Path
@@ -38,7 +39,7 @@ class Planted:
         if diff.verdict is not self.verdict:
             wrong.append(f"verdict {diff.verdict} instead of {self.verdict}")
         if diff.agreeing != self.index:
-            wrong.append(f"parts at {diff.agreeing} instead of {self.index}")
+            wrong.append(f"diverges at {diff.agreeing} instead of {self.index}")
         if not diff.divergences:
             return [*wrong, "no divergence"]
         first = diff.divergences[0]

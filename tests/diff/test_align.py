@@ -7,20 +7,20 @@ import random
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.traces.align import Past
-from rsltrace.diff.traces.match import NO_CAUSE, UNKNOWN, Strand, match
+from rsltrace.diff.alignment.align import EarlierPairs
+from rsltrace.diff.alignment.match import NO_CAUSE, UNKNOWN, EventSequence, match
 
 # (stamp, input, cause, nth)
 Row = tuple[int, int, int, int]
 
 
-def strand(rows: list[Row]) -> Strand:
+def sequence(rows: list[Row]) -> EventSequence:
     columns = list(zip(*rows, strict=True)) if rows else [(), (), (), ()]
-    return Strand(*columns)
+    return EventSequence(*columns)
 
 
 def pairs(a: list[Row], b: list[Row], *, surest_only: bool = False) -> set[tuple[int, int]]:
-    found = match(strand(a), strand(b), surest_only=surest_only)
+    found = match(sequence(a), sequence(b), surest_only=surest_only)
     assert len({i for i, _ in found}) == len({j for _, j in found}) == len(found)
     assert all(0 <= i < len(a) and 0 <= j < len(b) for i, j in found)
     return set(found)
@@ -141,6 +141,6 @@ def test_long_sequences_of_others_take_no_square_of_time() -> None:
 def test_an_earlier_event_has_a_partner_exactly_if_it_is_somebodys(
     same_before: int, recent: dict[int, int], equal_run: tuple[int, int, int]
 ) -> None:
-    past = Past(same_before, recent, equal_run)
+    past = EarlierPairs(same_before, recent, equal_run)
     partners = {past.in_a(index_b) for index_b in range(20)} - {UNKNOWN}
     assert {index_a for index_a in range(20) if past.has_partner(index_a)} == partners

@@ -14,10 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.diff.bags.comparison import diff_bags
-from rsltrace.diff.bags.model import BagDiff, BagVerdict, Presence
 from rsltrace.diff.bags.sequences import Gap, gaps_by_order, gaps_by_stamp
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.bags import BagDiff, BagVerdict, Presence
 from rsltrace.errors import BagError, TraceError
 
 POINT = "geometry_msgs/msg/PointStamped"

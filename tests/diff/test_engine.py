@@ -12,8 +12,9 @@ import pytest
 from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
 
 import rsltrace
+from rsltrace.diff.result.divergence import Root, Verdict
+from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
-from rsltrace.diff.traces.model import Diff, Root, Verdict
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventKind, OutputKind
 
@@ -127,11 +128,11 @@ def test_the_window_limits_what_is_aligned(tmp_path: Path, window: int) -> None:
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     if window == 5000:
         assert reached == diff.a.events - diff.agreeing
-    else:  # a stretch ends between two instants
+    else:  # a block ends between two instants
         assert 0 < reached <= max(window, 2 * PER_STEP) + PER_STEP
 
 
-def test_all_looks_at_everything_in_stretches(tmp_path: Path) -> None:
+def test_all_looks_at_everything_in_blocks(tmp_path: Path) -> None:
     """A second divergence far behind the first, with equal events in between."""
     long = replace(PLAN, end_ns=40_000 * MS)
     far = Fault("bit", step(3000, 5))
@@ -163,7 +164,7 @@ def test_independent_divergences_are_limited_unless_all_are_asked_for(tmp_path: 
 
 def test_a_consequence_that_was_asked_for_leads_back_to_its_root(tmp_path: Path) -> None:
     diff = compare(tmp_path, Fault("bit", step(20, 1)), nodes=("/sum",))
-    assert diff.agreeing == step(20, 1), "the runs part where they part"
+    assert diff.agreeing == step(20, 1), "the runs diverge where they diverge"
     (first,) = diff.divergences
     assert diff.verdict is first.verdict is Verdict.DIFFERENT_INPUT
     assert first.a is not None
@@ -404,13 +405,13 @@ def test_the_same_swap_again_and_again_is_one_divergence(tmp_path: Path) -> None
 
 def test_the_function_is_also_the_package(tmp_path: Path) -> None:
     import rsltrace.diff
-    import rsltrace.diff.traces.engine
+    import rsltrace.diff.traces.diff
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)), context=2)
     assert isinstance(diff, rsltrace.Diff)
     assert len(diff.divergences[0].before_a) == 2
     assert diff.verdict is rsltrace.Verdict.SAME_INPUT_DIFFERENT_OUTPUT
-    assert rsltrace.diff.traces.engine.diff_traces is not None
+    assert rsltrace.diff.traces.diff.diff_traces is not None
     assert list(inspect.signature(rsltrace.diff).parameters)[:3] == ["a", "b", "context"]
     with pytest.raises(AttributeError, match=r"rsltrace\.diff.*nothing_of_that_name"):
         _ = rsltrace.diff.nothing_of_that_name
@@ -434,7 +435,7 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:
-    from rsltrace.diff.traces.views import at, phrase
+    from rsltrace.diff.causes.event_views import at, phrase
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)))
     view = diff.divergences[0].a

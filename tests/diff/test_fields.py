@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.bags.content import ContentKeys
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import ulp_distance

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.diff.why.job_settings import job_settings
+from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.job import Job, load_job
 
 JOB = """\

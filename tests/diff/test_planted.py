@@ -19,10 +19,11 @@ from diff_simulator import MS, Fault, Simulation
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rsltrace.diff.causes.propagation import Propagation
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.engine import diff_traces
-from rsltrace.diff.traces.model import Diff, Verdict
-from rsltrace.diff.why.cause import Cone
+from rsltrace.diff.result.divergence import Verdict
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
@@ -127,7 +128,7 @@ def _differs(a: dict[int, object], b: dict[int, object], index: int) -> bool:
 
 def test_the_check_bites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Sabotage: an engine that knows no consequences is caught by the cases above."""
-    monkeypatch.setattr(Cone, "_explanation", lambda *_: (None, None))
+    monkeypatch.setattr(Propagation, "_explanation", lambda *_: (None, None))
     wrong = 0
     for seed in range(12):
         planted = plant("bit", random.Random(seed), tmp_path)

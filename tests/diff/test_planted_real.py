@@ -12,7 +12,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 import rsltrace
-from rsltrace.diff.traces.model import Diff, Root, Verdict
+from rsltrace.diff.result.divergence import Root, Verdict
+from rsltrace.diff.result.traces import Diff
 
 pytestmark = pytest.mark.ros
 

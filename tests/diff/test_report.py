@@ -18,7 +18,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.bags.model import (
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import FORMATS, render
+from rsltrace.diff.result.bags import (
     BagDiff,
     BagMessage,
     BagVerdict,
@@ -28,26 +30,21 @@ from rsltrace.diff.bags.model import (
     Recording,
     TopicDiff,
 )
-from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report import FORMATS, render
-from rsltrace.diff.report.words import sentence_text
-from rsltrace.diff.traces.model import (
+from rsltrace.diff.result.divergence import (
     CauseStep,
-    Diff,
     Divergence,
-    EntityCount,
-    EntityKey,
-    EventView,
-    FieldDifference,
     MessageDifference,
     Reach,
     Root,
-    Setting,
-    Side,
     Verdict,
 )
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.traces import Diff, EntityCount, Setting, Side
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.words.entities import EntityKey
+from rsltrace.words.phrases import as_sentence
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "diff"
 DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "diff.md"
@@ -251,7 +248,7 @@ def recordings() -> BagDiff:
         Recording("bags/monday", "mcap", 4, 1207, 112 * 1000 * MS, 203 * 1000 * MS),
         Recording("bags/tuesday", "sqlite3", 3, 1199, 212 * 1000 * MS, 303 * 1000 * MS, False),
         BagVerdict.DIFFERENT,
-        "The recordings first part on /odom, 16.691000000 s after the start: message 500 has "
+        "The recordings first diverge on /odom, 16.691000000 s after the start: message 500 has "
         "another header.stamp (and 3 other fields).",
         "order",
         (
@@ -330,7 +327,7 @@ def test_golden_reports_of_several_runs(form: str) -> None:
 def test_the_first_line_is_the_verdict_in_one_sentence(case: str) -> None:
     diff = CASES[case]()
     text = render(diff, "text", width=400)
-    assert text.splitlines()[0] == sentence_text(diff.sentence)
+    assert text.splitlines()[0] == as_sentence(diff.sentence)
 
 
 @pytest.mark.parametrize("width", [60, 80, 100])
@@ -494,12 +491,12 @@ def test_tolerance_is_said_and_has_its_own_exit_status() -> None:
     assert "equal within tolerance, not identical" in text
     assert tolerated().exit_code == equal_within_tolerance().exit_code == 3
     assert "equal within tolerance" not in render(nondeterministic(), "text")
-    # what is tolerated where the runs part may have grown later
+    # what is tolerated where the runs diverge may have grown later
     partly = dataclasses.replace(tolerated(), tolerance=recordings())
     assert partly.exit_code == 1
     text = render(partly, "text")
     assert "equal within tolerance" not in text
-    assert "not within tolerance: the messages first part on /odom" in " ".join(text.split())
+    assert "not within tolerance: the messages first diverge on /odom" in " ".join(text.split())
     assert json.loads(render(tolerated(), "json"))["within_tolerance"] is True
     for near in (tolerated(), equal_within_tolerance()):
         assert "::notice" in render(near, "github")

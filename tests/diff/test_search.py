@@ -1,4 +1,4 @@
-"""Where two runs part: whatever their files look like, and with few reads."""
+"""Where two runs diverge: whatever their files look like, and with few reads."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, S
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rsltrace.diff.traces.search import first_difference
+from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.errors import TraceError
 from rsltrace.mcap.source import FileSource
 from rsltrace.trace.reader import Trace
@@ -122,9 +122,9 @@ def test_a_damaged_segment_is_named(tmp_path: Path) -> None:
     Simulation(CHAIN, tmp_path / "a.mcap", storage=Storage(50, "", False)).run()
     Simulation(CHAIN, tmp_path / "b.mcap", (Fault("drop", 121),), Storage(50, "", False)).run()
     with Trace.open(tmp_path / "a.mcap") as a, Trace.open(tmp_path / "b.mcap") as b:
-        parts_at = expected(a, b)
-        assert parts_at is not None
-        row = b.segments[parts_at // 50]
+        diverges_at = expected(a, b)
+        assert diverges_at is not None
+        row = b.segments[diverges_at // 50]
         middle = int(row["events_offset"]) + int(row["events_length"]) // 2
     data = bytearray((tmp_path / "b.mcap").read_bytes())
     data[middle] ^= 1

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
 from typing import Any
 
 import pytest
@@ -310,18 +309,13 @@ def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
     assert ears[0].heard == [(1, 200), (2, 200)]
 
 
-def test_viewer_and_cat_say_what_chance_decided(run: Run) -> None:
-    pytest.importorskip("rsltrace_viewer")
-    from rsltrace_viewer.model.run import Run as Opened
-    from rsltrace_viewer.model.text import output_text
-
-    from rsltrace.cli.event_text import EventText
+def test_what_chance_decided_is_said_in_words(run: Run) -> None:
+    from rsltrace.words.events import EventWords
 
     recorded = run(Talker, Listener, delay={"default": "5ms"}, duration=0.1)
     with recorded.trace() as trace:
         event = next(e for e in recorded.events() if e.kind is EventKind.TIMER)
         outputs = trace.outputs_of(event.index)
         assert [o.kind for o in outputs] == [OutputKind.MESSAGE, OutputKind.DRAW]
-        assert EventText(trace).line(event, outputs).endswith("/numbers, delay 5 ms (/listener)")
-    with closing(Opened.open(recorded.path)) as opened:
-        assert output_text(opened, outputs[1]) == "delay 5 ms (/listener)"
+        told = list(EventWords(trace).outputs(outputs))
+        assert told == ["/numbers", "delay 5 ms (/listener)"]

@@ -15,15 +15,16 @@ import pyarrow as pa
 import rerun as rr
 from rsltrace_viewer.rerun_export.columns import clock_for, lists
 from rsltrace_viewer.rerun_export.divergence import document
-from rsltrace_viewer.rerun_export.fields import curves_of
+from rsltrace_viewer.rerun_export.events.labels import hashes
+from rsltrace_viewer.rerun_export.events.rates import step_for
 from rsltrace_viewer.rerun_export.frames import FrameTree
-from rsltrace_viewer.rerun_export.labels import hashes
-from rsltrace_viewer.rerun_export.markers import MarkerBoard
-from rsltrace_viewer.rerun_export.rates import step_for
-from rsltrace_viewer.rerun_export.shapes import SHAPES, Paint
-from rsltrace_viewer.rerun_export.tracks import Track
+from rsltrace_viewer.rerun_export.messages.fields import curves_of
+from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
+from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
+from rsltrace_viewer.rerun_export.messages.tracks import Track
 
-from rsltrace.diff.traces.model import Diff, Side, Verdict
+from rsltrace.diff.result.divergence import Verdict
+from rsltrace.diff.result.traces import Diff, Side
 
 S = 1_000_000_000
 

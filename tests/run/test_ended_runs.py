@@ -1,4 +1,4 @@
-"""Two runs of one job that are stopped at different times part by ending, whatever the job has."""
+"""Two runs of one job stopped at different times diverge by ending, whatever the job has."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 
 import rsltrace
-from rsltrace.diff.traces.model import Diff, Root, Verdict
+from rsltrace.diff.result.divergence import Root, Verdict
+from rsltrace.diff.result.traces import Diff
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.diff.why.record_again import record_again
+from rsltrace.diff.causes.record_command import record_command
 from rsltrace.trace.reader import Trace
 
 JOB = """\
@@ -35,7 +35,7 @@ def test_a_run_is_recorded_again(
     done = rsltrace("record", "job.yaml", "-o", "run.mcap", *given)
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
-        words = shlex.split(record_again(trace))
+        words = shlex.split(record_command(trace))
     assert words[:3] == ["rsltrace", "record", str(tmp_path / "job.yaml")], "beside the trace"
     until = ("--until", "2") if "--until" in given else ()
     again = rsltrace(*words[1:], *until, "-o", "again.mcap")
@@ -91,7 +91,7 @@ class _Job:
 )
 def test_launch_files_and_names(name: str, override: str, command: str) -> None:
     text = f"# The effective job of {name}\n#   with {override}\nnodes: []\n#   with --set x=1\n"
-    assert record_again(_Job(name, text)) == command  # type: ignore[arg-type]
+    assert record_command(_Job(name, text)) == command  # type: ignore[arg-type]
 
 
 def test_a_job_made_in_python_has_no_file_and_no_lines(tmp_path: Path) -> None:
@@ -125,7 +125,7 @@ def _drawing_node() -> Any:
 
 
 def test_which_run_an_exception_ended_is_told(rsltrace: Any, job_file: Any) -> None:
-    """Where runs part by something else, that is what one wants to know of a run that failed."""
+    """Where runs diverge by something else, that is what one wants to know of a run that failed."""
     code = """
 class Fragile(Listener):
     def got(self, message):

@@ -14,9 +14,9 @@ import pytest
 
 pytest.importorskip("textual", reason="needs textual: pip install 'rsltrace[view]'")
 
-from rsltrace_viewer.app import ViewerApp, open_session
-from rsltrace_viewer.export import settle, text_of
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.terminal.app import ViewerApp, open_session
+from rsltrace_viewer.terminal.screenshot import settle, text_of
 from textual.pilot import Pilot
 
 if "trace_maker" not in sys.modules:
@@ -71,7 +71,7 @@ def long_run(long: Path) -> Iterator[Run]:
 
 @pytest.fixture
 def pair() -> tuple[Path, Path]:
-    """Two runs of one job that part, from the samples."""
+    """Two runs of one job that diverge, from the samples."""
     folder = SAMPLES / "nondeterministic_callback"
     return folder / "a.mcap", folder / "b.mcap"
 

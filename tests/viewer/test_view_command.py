@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from rsltrace_viewer.choose import ChooseApp, traces_in
+from rsltrace_viewer.terminal.choose import ChooseApp, traces_in
 
 from rsltrace.cli.main import cli
 
@@ -63,7 +63,7 @@ def test_starting_somewhere(made: Path, tmp_path: Path) -> None:
     [
         (["--export", "x.png"], "should end in .svg or .txt"),
         (["--export", "x.txt", "--size", "big"], "no size"),
-        (["--export", "x.txt", "--at", "soon"], "no time"),
+        (["--export", "x.txt", "--at", "soon"], "expected a time"),
         (["--export", "x.txt", "--filter", "kin:3"], "^^^"),
         (["--export", "no/such/folder/x.txt"], "cannot be written"),
         ([], "needs a terminal"),

@@ -7,16 +7,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rsltrace_viewer.keys import KEYS
-from rsltrace_viewer.model.match import ANY_LOG, find
+from rsltrace_viewer.model.query.conditions import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.screens.help import HelpScreen
-from rsltrace_viewer.screens.plot import PlotScreen, PlotView
-from rsltrace_viewer.screens.report import ReportScreen
-from rsltrace_viewer.widgets.bars import FooterBar
-from rsltrace_viewer.widgets.inspector import Inspector
-from rsltrace_viewer.widgets.lanes import LanesView
-from rsltrace_viewer.widgets.timeline import Timeline
+from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.screens.help import HelpScreen
+from rsltrace_viewer.terminal.screens.plot import PlotScreen, PlotView
+from rsltrace_viewer.terminal.screens.report import ReportScreen
+from rsltrace_viewer.terminal.widgets.bars import FooterBar
+from rsltrace_viewer.terminal.widgets.inspector import Inspector
+from rsltrace_viewer.terminal.widgets.lanes import LanesView
+from rsltrace_viewer.terminal.widgets.timeline import Timeline
 from textual import events
 
 Drive = Callable[..., None]
@@ -150,7 +150,7 @@ def test_going_to_a_time_and_an_index(made: Path, run: Run, drive: Drive) -> Non
         await viewer.press("t")
         await viewer.type("nonsense")
         assert viewer.app.prompt.asking
-        assert "no time" in viewer.text
+        assert "expected a time" in viewer.text
         await viewer.press("escape")
         assert not viewer.app.prompt.asking
         await viewer.press("i")

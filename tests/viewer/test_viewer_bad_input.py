@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from rsltrace_viewer import follow
-from rsltrace_viewer.screens.pick import PickScreen
+from rsltrace_viewer.terminal import follow
+from rsltrace_viewer.terminal.screens.pick import PickScreen
 from trace_maker import Opened, boundaries, write_run
 
 from rsltrace.model.event import EventKind

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rsltrace_viewer.model.match import mask_of
-from rsltrace_viewer.model.query import parse
-from rsltrace_viewer.model.query_completion import completions
-from rsltrace_viewer.model.query_fields import FIELDS
-from rsltrace_viewer.model.query_text import QueryError
+from rsltrace_viewer.model.query.completion import completions
+from rsltrace_viewer.model.query.conditions import mask_of
+from rsltrace_viewer.model.query.fields import FIELDS
+from rsltrace_viewer.model.query.parser import parse
+from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.text import outputs_text
+from rsltrace_viewer.model.timeline.events import outputs_text
 
 
 def found(run: Run, text: str) -> list[int]:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from rsltrace_viewer.model.inspector import inspect
-from rsltrace_viewer.model.lines import Openness
+from rsltrace_viewer.model.inspector.event import inspect
+from rsltrace_viewer.model.inspector.lines import Openness
 from rsltrace_viewer.model.run import Run
 
 import rsltrace
@@ -103,7 +103,7 @@ def test_rerun_tells_them_too(tmp_path: Path) -> None:
 
 
 def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
-    """Also where the runs part by something else, and where run a went on."""
+    """Also where the runs diverge by something else, and where run a went on."""
     a = record(tmp_path, "false", "1", "a.mcap")
     code = NODE + "        if self.total > 12:\n            raise ValueError('too much')\n"
     (tmp_path / "filtering.py").write_text(code)

@@ -13,28 +13,30 @@ from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
-from rsltrace_viewer.model import match
 from rsltrace_viewer.model.history import History, Marks
-from rsltrace_viewer.model.inspector import Effects, inspect
+from rsltrace_viewer.model.inspector.effects import Effects
+from rsltrace_viewer.model.inspector.event import inspect
+from rsltrace_viewer.model.inspector.lines import Line, Openness
 from rsltrace_viewer.model.lanes import LaneMaker, Lanes, Window
-from rsltrace_viewer.model.lines import Line, Openness
-from rsltrace_viewer.model.match import Condition
-from rsltrace_viewer.model.names import ShortNames
-from rsltrace_viewer.model.query import parse
+from rsltrace_viewer.model.query import conditions
+from rsltrace_viewer.model.query.conditions import Condition
+from rsltrace_viewer.model.query.parser import parse
+from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import WITH_TOPIC, Run
-from rsltrace_viewer.model.shown import AllRows, FilteredRows, Rows
-from rsltrace_viewer.model.timeline import Columns, EventText, EventTexts, Sign, layout, node_of
-from rsltrace_viewer.model.view import SingleView, View
+from rsltrace_viewer.model.timeline.columns import Columns, layout
+from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
+from rsltrace_viewer.model.timeline.short_names import ShortNames
+from rsltrace_viewer.model.view import Sign, SingleView, View
 
 if TYPE_CHECKING:
-    from rsltrace.diff.traces.stretches import Stretch
-    from rsltrace_viewer.model.compare import Comparison  # the diff is loaded for two traces only
+    from rsltrace.diff.alignment.blocks import AlignedBlock
+    from rsltrace_viewer.model.comparison import Comparison
 
 SEEK: dict[str, tuple[Condition, str]] = {
-    "raised": (match.RAISED, "exception"),
-    "log": (match.ANY_LOG, "log record"),
-    "warning": (match.log_at_least(30), "warning"),
-    "finding": (match.GUARD_FINDING, "finding of the guard"),
+    "raised": (conditions.RAISED, "exception"),
+    "log": (conditions.ANY_LOG, "log record"),
+    "warning": (conditions.log_at_least(30), "warning"),
+    "finding": (conditions.GUARD_FINDING, "finding of the guard"),
 }
 """What one can jump to by a key: the condition, and what it is called."""
 
@@ -49,7 +51,7 @@ class Session:
         self.side = "diff" if b is not None else "a"
         self.view: View = SingleView(a.count)
         if b is not None:
-            from rsltrace_viewer.model.compare import Comparison
+            from rsltrace_viewer.model.comparison import Comparison
 
             self.view = self.comparison = Comparison(a, b)
         self.rows: Rows = AllRows(self.view.count)
@@ -77,13 +79,13 @@ class Session:
         if self.b is not None:
             self.b.close()
 
-    def take_stretch(self, stretch: Stretch | None) -> None:
-        """Show another stretch of two runs; the selected event stays selected."""
+    def take_block(self, block: AlignedBlock | None) -> None:
+        """Show another block of two runs; the selected event stays selected."""
         comparison = self.comparison
         if comparison is None:
             return
         a, b = comparison.a(self.place), comparison.b(self.place)
-        comparison.take(stretch)
+        comparison.take(block)
         if a is not None:
             self.place = comparison.place_of(a)
         elif b is not None:
@@ -201,7 +203,7 @@ class Session:
         if here is None:
             return []
         if self.comparison is not None and self.side == "diff":
-            from rsltrace_viewer.model.differences import pair_lines
+            from rsltrace_viewer.model.inspector.differences import pair_lines
 
             return pair_lines(self.comparison, self.place, self.openness, self.effects)
         return inspect(here[0], here[1], self.openness, self.effects)
@@ -262,16 +264,16 @@ class Session:
         if entity is None:
             return None
         if what == "node":
-            return match.of_nodes(run, frozenset((entity.node,))), run.node_name(entity.id)
+            return conditions.of_nodes(run, frozenset((entity.node,))), run.node_name(entity.id)
         if what == "entity":
-            return match.OfEntities(match.ids([entity.id])), run.entity_name(entity.id)
+            return conditions.OfEntities(conditions.ids([entity.id])), run.entity_name(entity.id)
         topic = entity.name if entity.kind in WITH_TOPIC else ""
         if not topic:
             sent = next((o for o in outputs if o.kind is OutputKind.MESSAGE), None)
             topic = run.entity_name(sent.entity) if sent is not None else ""
         if not topic:
             return None
-        return match.OfEntities(match.ids(run.ids_on(topic)), outputs=True), topic
+        return conditions.OfEntities(conditions.ids(run.ids_on(topic)), outputs=True), topic
 
     def seek(self, condition: Condition, step: int, *, wrap: bool = False) -> Iterator[int | None]:
         """Yield None while looking and the places of matches from the selected one on."""
@@ -280,11 +282,11 @@ class Session:
             return
         run, index = here
         other = run is self.b
-        for found in match.find(run, condition, index, step):
+        for found in conditions.find(run, condition, index, step):
             yield None if found is None else self.view.place_of(found, other=other)
         if wrap:
             start = -1 if step > 0 else run.count
-            for found in match.find(run, condition, start, step):
+            for found in conditions.find(run, condition, start, step):
                 yield None if found is None else self.view.place_of(found, other=other)
 
     def set_filter(self, text: str) -> FilteredRows | None:

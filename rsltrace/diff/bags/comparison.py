@@ -18,7 +18,10 @@ import xxhash
 
 from rsltrace.diff.bags.content import ContentKeys
 from rsltrace.diff.bags.messages import Fetched, TopicPair, compare_topic
-from rsltrace.diff.bags.model import (
+from rsltrace.diff.bags.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.bags.source import Source, SourceTopic, open_source, source_of
+from rsltrace.diff.options import BY_STAMP, DiffOptions
+from rsltrace.diff.result.bags import (
     BagDiff,
     BagVerdict,
     LoneTopic,
@@ -27,9 +30,6 @@ from rsltrace.diff.bags.model import (
     Recording,
     TopicDiff,
 )
-from rsltrace.diff.bags.sequences import Gap, Keys, gaps_by_order, gaps_by_stamp
-from rsltrace.diff.bags.source import Source, SourceTopic, open_source, source_of
-from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.errors import TraceError
 from rsltrace.model.stamp import format_seconds
@@ -269,13 +269,14 @@ def _sentence(
         same = f"{counted} in both agree, but " if messages else ""
         text = f"{same}{', '.join(lone[:3])}{more}."
         return text[0].upper() + text[1:]
-    at = f"on {first.topic}, {format_seconds(first.after_ns)} s after the start"
+    when = f"{format_seconds(first.after_ns)} s after the start"
+    diverge = f"The recordings first diverge on {first.topic}, {when}"
     if first.presence is Presence.ONLY_A:
         assert first.a is not None
-        return f"The recordings first part {at}: message {first.a.index} of a is missing in b."
+        return f"{diverge}: message {first.a.index} of a is missing in b."
     if first.presence is Presence.ONLY_B:
         assert first.b is not None
-        return f"The recordings first part {at}: message {first.b.index} of b is extra, not in a."
+        return f"{diverge}: message {first.b.index} of b is extra, not in a."
     assert first.a is not None
     differing = len(first.fields) + first.more_fields
     if not first.fields:
@@ -285,7 +286,7 @@ def _sentence(
     else:
         others = _number(differing - 1, "other field")
         what = f"has another {first.fields[0].path} (and {others})"
-    return f"The recordings first part {at}: message {first.a.index} {what}."
+    return f"{diverge}: message {first.a.index} {what}."
 
 
 def _number(count: int, noun: str) -> str:

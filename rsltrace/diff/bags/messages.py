@@ -11,11 +11,16 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from rsltrace.diff.bags.model import BagMessage, MessageDivergence, Presence, TopicDiff
 from rsltrace.diff.bags.sequences import Gap, Keys
 from rsltrace.diff.bags.source import Source, SourceTopic
 from rsltrace.diff.options import BY_STAMP, DiffOptions
-from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.result.bags import (
+    BagMessage,
+    MessageDivergence,
+    Presence,
+    TopicDiff,
+)
+from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import diff_messages, field_differences, preview
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.errors import TraceError
@@ -27,7 +32,7 @@ _PREVIEW = 160
 
 @dataclass(frozen=True, slots=True)
 class TopicPair:
-    """A topic in both recordings: its numbers there, keys and log times, and where they part."""
+    """A topic in both recordings: its numbers there, keys and log times, and where they diverge."""
 
     number_a: int
     number_b: int

@@ -10,12 +10,13 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.line import HEIGHT, Line, plain_text
-from rsltrace.diff.traces.model import Diff
+from rsltrace.diff.report.line import plain_text
+from rsltrace.diff.report.text import report_lines
+from rsltrace.diff.result.traces import Diff
 from rsltrace.errors import TraceError
 
 if TYPE_CHECKING:
-    from rsltrace.diff.bags.model import BagDiff
+    from rsltrace.diff.result.bags import BagDiff
 
 FORMATS = ("text", "json", "markdown", "junit", "github")
 
@@ -55,29 +56,3 @@ def render(
 
         return (junit if format == "junit" else github)(several, options)
     raise TraceError(f"there is no report format {format!r}; there are {', '.join(FORMATS)}")
-
-
-def report_lines(
-    diff: Diff | BagDiff | Sequence[Diff | BagDiff],
-    options: DiffOptions,
-    *,
-    width: int = 100,
-    height: int = HEIGHT,
-) -> list[Line]:
-    """Return the report for people as lines of styled pieces (see ``report.line``).
-
-    ``width`` and ``height`` are those of the screen it is to fit.
-    """
-    if isinstance(diff, Diff):
-        from rsltrace.diff.report.text import trace_report
-
-        return trace_report(diff, options, width, height)
-    if not isinstance(diff, Sequence):
-        from rsltrace.diff.report.bag_text import bag_report
-
-        return bag_report(diff, options, width, height)
-    if len(diff) == 1:
-        return report_lines(diff[0], options, width=width, height=height)
-    from rsltrace.diff.report.several import several_report
-
-    return several_report(diff)

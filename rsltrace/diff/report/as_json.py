@@ -12,10 +12,14 @@ from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
-from rsltrace.diff.bags.model import BagDiff
-from rsltrace.diff.traces.model import Diff, EntityKey, EventView, exit_code_of_several
+from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.exit_codes import exit_code_of_several
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
+from rsltrace.words.entities import EntityKey
+from rsltrace.words.kinds import flag_names
 
 FORMAT = "rsltrace-diff"
 VERSION = 1
@@ -61,7 +65,7 @@ def _plain(name: str, value: Any) -> Any:
     if isinstance(value, (EventKind, OutputKind)):
         return value.label
     if isinstance(value, EventFlag):
-        return [flag.name.lower() for flag in EventFlag if flag and flag in value and flag.name]
+        return flag_names(value)
     if isinstance(value, Enum):
         return value.value
     if dataclasses.is_dataclass(value):

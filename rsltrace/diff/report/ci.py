@@ -6,29 +6,28 @@ import re
 from collections.abc import Sequence
 from xml.sax.saxutils import escape, quoteattr
 
-from rsltrace.diff.bags.model import BagDiff
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.bag_text import bag_report
 from rsltrace.diff.report.line import plain_text
-from rsltrace.diff.report.text import trace_report
-from rsltrace.diff.report.words import sentence_text
-from rsltrace.diff.traces.model import Diff
+from rsltrace.diff.report.text import report_lines
+from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable
+from rsltrace.words.phrases import as_sentence
 
 _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a JUnit test suite with one test case per comparison."""
-    failures = sum(diff.parted for diff in diffs)
+    failures = sum(diff.diverged for diff in diffs)
     counts = f'tests="{len(diffs)}" failures="{failures}" errors="0" skipped="0"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites {counts}>"]
     lines.append(f'  <testsuite name="rsltrace diff" {counts}>')
     for diff in diffs:
         name = _attribute(f"{diff.b.path} agrees with {diff.a.path}")
         lines.append(f'    <testcase classname="rsltrace.diff" name={name}>')
-        report = _xml(plain_text(_report(diff, options)))
-        if diff.parted:
+        report = _xml(plain_text(report_lines(diff, options)))
+        if diff.diverged:
             lines.append(
                 f"      <failure type={_attribute(diff.verdict.value)} "
                 f"message={_attribute(_message(diff))}>{report}</failure>"
@@ -44,9 +43,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return workflow commands: an error per comparison that failed, a notice per other one."""
     lines = []
     for diff in diffs:
-        level = "error" if diff.parted else "notice"
+        level = "error" if diff.diverged else "notice"
         title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
-        text = plain_text(_report(diff, options)) if diff.parted else _message(diff)
+        text = plain_text(report_lines(diff, options)) if diff.diverged else _message(diff)
         file = command_property(printable(diff.a.path))
         place = f"file={file},title={command_property(printable(title))}"
         lines.append(f"::{level} {place}::{command_data(text)}")
@@ -62,13 +61,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     return "".join(f"{row}\n" for row in lines)
 
 
-def _report(diff: Diff | BagDiff, options: DiffOptions) -> list[tuple[tuple[str, str], ...]]:
-    return trace_report(diff, options) if isinstance(diff, Diff) else bag_report(diff, options)
-
-
 def _message(diff: Diff | BagDiff) -> str:
     tolerated = isinstance(diff, Diff) and diff.within_tolerance
-    return sentence_text(diff.sentence) + (
+    return as_sentence(diff.sentence) + (
         " Equal within tolerance, not identical." if tolerated else ""
     )
 

@@ -6,6 +6,8 @@ from difflib import SequenceMatcher
 from itertools import zip_longest
 
 from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
+from rsltrace.diff.report.events import event_cells, event_key, event_text
 from rsltrace.diff.report.line import (
     BAD,
     FAINT,
@@ -21,17 +23,15 @@ from rsltrace.diff.report.line import (
     line,
     wrapped,
 )
-from rsltrace.diff.report.words import (
-    event_cells,
-    event_key,
-    event_text,
-    field_lines,
-    hashes_text,
-    message_title,
+from rsltrace.diff.result.divergence import (
+    CauseStep,
+    Divergence,
+    MessageDifference,
 )
-from rsltrace.diff.traces.model import CauseStep, Divergence, EventView, MessageDifference
+from rsltrace.diff.result.events import EventView
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.words.phrases import seconds_text
 
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
@@ -66,7 +66,7 @@ def _event(found: Divergence, width: int) -> Section:
         if not title.startswith("event ") or a.flags != b.flags or not found.messages:
             rows += _did([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
     elif some is not None:
-        title = "where they part" if a and b else "the event"
+        title = "where they diverge" if a and b else "the event"
         rows += _events_of([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
     else:
         title = ""
@@ -94,16 +94,11 @@ def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> li
 
 def _message(message: MessageDifference, width: int) -> list[Line]:
     rows = [line(f"  {message_title(message)}")]
-    if message.fields:
-        rows += field_lines(message.fields, width)
-        if message.more_fields:
-            rows.append(line((f"    … {message.more_fields} more fields", FAINT)))
-        return rows
-    if message.preview:
-        rows.append(line(f"    {shortened(printable(message.preview), width - 4)}"))
-    if message.reason:
-        rows += wrapped(f"    {printable(message.reason)}", width, style=FAINT, indent="    ")
-    if not message.preview and (message.presence == "both" or message.reason):
+    rows += payload_lines(
+        message.fields, message.more_fields, message.preview, message.reason, width
+    )
+    told = message.fields or message.preview
+    if not told and (message.presence == "both" or message.reason):
         rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
     return rows
 
@@ -247,9 +242,9 @@ def _brief(event: EventView | None, width: int) -> str:
     if event is None:
         return ""
     done = f" -> {printable(event.summary)}" if event.summary else ""
-    seconds = format_seconds(event.stamp_ns).rstrip("0")
-    time = f"{seconds}0" if seconds.endswith(".") else seconds
-    return shortened(f"{event.index} {time} {event_text(event)}{done}", width)
+    return shortened(
+        f"{event.index} {seconds_text(event.stamp_ns)} {event_text(event)}{done}", width
+    )
 
 
 def _reaches(found: Divergence, width: int) -> Section:

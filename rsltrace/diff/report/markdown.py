@@ -5,15 +5,16 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
-from rsltrace.diff.bags.model import BagDiff
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.bag_text import bag_report
+from rsltrace.diff.report.differences import distance_text, message_title
 from rsltrace.diff.report.line import plain_text
 from rsltrace.diff.report.several import COLUMNS, several_cells
-from rsltrace.diff.report.text import trace_report
-from rsltrace.diff.report.words import distance_text, message_title, sentence_text
-from rsltrace.diff.traces.model import Diff, FieldDifference
+from rsltrace.diff.report.text import report_lines
+from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable, shortened
+from rsltrace.words.phrases import as_sentence
 
 _SPECIAL = re.compile(r"([\\`*_\[\]<>|#~@])")
 _FENCE = re.compile(r"`{3,}")
@@ -24,27 +25,25 @@ _CELL = 60
 def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
     """Return a heading with the verdict, a table of the fields that differ, and the full report
     folded away."""
-    lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(sentence_text(diff.sentence)), ""]
+    lines = [f"### rsltrace: {_heading(diff)}", "", _escaped(as_sentence(diff.sentence)), ""]
     lines += _sides(diff)
     lines += _fields(diff)
     if not diff.identical:
-        report = (
-            trace_report(diff, options) if isinstance(diff, Diff) else bag_report(diff, options)
-        )
+        report = report_lines(diff, options)
         lines += ["<details><summary>Full report</summary>", "", *_code(plain_text(report))]
         lines += ["", "</details>", ""]
     return "\n".join(lines).rstrip() + "\n"
 
 
 def several_markdown(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
-    """Return a table of all runs, and below it those that part."""
-    parted = [diff for diff in diffs if diff.parted]
-    verdict = f"{len(parted)} of {len(diffs)} runs part" if parted else "all runs agree"
+    """Return a table of all runs, and below it those that diverge."""
+    diverged = [diff for diff in diffs if diff.diverged]
+    verdict = f"{len(diverged)} of {len(diffs)} runs diverge" if diverged else "all runs agree"
     lines = [f"### rsltrace: {verdict}", "", f"Golden: {_code_span(diffs[0].a.path)}", ""]
     lines += _table(COLUMNS, [several_cells(diff) for diff in diffs])
     text = "\n".join(lines) + "\n"
     return text + "".join(
-        "\n" + markdown(diff, options).replace("###", "####", 1) for diff in parted
+        "\n" + markdown(diff, options).replace("###", "####", 1) for diff in diverged
     )
 
 
@@ -54,7 +53,7 @@ def _heading(diff: Diff | BagDiff) -> str:
     if isinstance(diff, BagDiff):
         return diff.verdict.value
     tolerated = " (equal within tolerance, not identical)" if diff.within_tolerance else ""
-    return f"the runs part: {diff.verdict.value}{tolerated}"
+    return f"the runs diverge: {diff.verdict.value}{tolerated}"
 
 
 def _sides(diff: Diff | BagDiff) -> list[str]:

@@ -1,14 +1,15 @@
-"""Several runs against one golden run: who parts where, as a table."""
+"""Several runs against one golden run: which diverge where, as a table."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
 
-from rsltrace.diff.bags.model import BagDiff
+from rsltrace.diff.report.events import event_text
 from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
-from rsltrace.diff.report.words import event_text
-from rsltrace.diff.traces.model import ENDED_BY_EXCEPTION, Diff
+from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.divergence import ENDED_BY_EXCEPTION
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -42,10 +43,10 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
 
     Nothing in it is cut: it is made to be read by ``grep`` and ``awk``, too.
     """
-    parted = sum(diff.parted for diff in diffs)
+    diverged = sum(diff.diverged for diff in diffs)
     golden = printable(diffs[0].a.path)
-    if parted:
-        sentence = f"{parted} of {len(diffs)} runs part from {golden}."
+    if diverged:
+        sentence = f"{diverged} of {len(diffs)} runs diverge from {golden}."
     else:
         near = sum(diff.within_tolerance for diff in diffs)
         within = f", {near} of them within tolerance" if near else ""
@@ -53,13 +54,13 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     rows: list[list[Piece]] = [[(name, FAINT) for name in COLUMNS]]
     for diff in diffs:
         path, *rest = several_cells(diff)
-        style = BAD if diff.parted else GOOD
+        style = BAD if diff.diverged else GOOD
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
-    lines = [line((sentence, BAD if parted else GOOD)), line()]
+    lines = [line((sentence, BAD if diverged else GOOD)), line()]
     lines += in_columns(rows, indent="", widest=60)
     if failed := [text for diff in diffs if (text := _failure(diff))]:
         lines += [line(), *(line((text, BAD)) for text in failed)]
-    first = next((diff for diff in diffs if diff.parted), None)
+    first = next((diff for diff in diffs if diff.diverged), None)
     if first is not None:
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
         lines += [line(), line(("next: ", TITLE), printable(command))]

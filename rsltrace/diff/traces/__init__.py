@@ -1,1 +1,1 @@
-"""Two traces: where they diverge, and which event of one is which of the other."""
+"""The comparison of two traces: alignment and causes put together into one ``Diff``."""

@@ -1,22 +1,32 @@
-"""Two runs that are not the same, from the event on where they part."""
+"""Two runs that are not the same, from the event on where they diverge."""
 
 from __future__ import annotations
 
 from itertools import islice
 
+from rsltrace.diff.alignment.blocks import (
+    AlignedBlock,
+    AlignedBlocks,
+    EqualBlock,
+    EventPair,
+)
+from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entities
+from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.explain import Explainer
+from rsltrace.diff.causes.job_settings import job_settings
+from rsltrace.diff.causes.propagation import (
+    FoundDivergence,
+    Propagation,
+    different_outputs,
+)
+from rsltrace.diff.causes.settings import entity_settings, environment_settings
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.engine import interruptions, side
-from rsltrace.diff.traces.identity import Identity, identify
-from rsltrace.diff.traces.model import Diff, Divergence, Setting, Verdict
-from rsltrace.diff.traces.one_ended import failures, judge_ended, who_ended
-from rsltrace.diff.traces.rows import Run
-from rsltrace.diff.traces.stretches import EqualRun, Item, Stretch, Stretches
-from rsltrace.diff.traces.tally import Tally
+from rsltrace.diff.result.divergence import Divergence, Verdict
+from rsltrace.diff.result.traces import Diff, Setting
+from rsltrace.diff.traces.counts import EventCounts
+from rsltrace.diff.traces.ended_runs import failures, judge_end, who_ended
+from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
-from rsltrace.diff.why.cause import Cone, Found, different_outputs
-from rsltrace.diff.why.explain import Explainer
-from rsltrace.diff.why.job_settings import job_settings
-from rsltrace.diff.why.settings import entity_settings, environment_settings
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10
@@ -25,7 +35,7 @@ DIVERGENCES_MAX = 10
 EVERY_DIVERGENCE_MAX = 1000
 """Told even then; each takes some milliseconds and some lines."""
 
-_EVENTS_PER_STRETCH = 4096
+_EVENTS_PER_BLOCK = 4096
 _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 
 
@@ -42,13 +52,13 @@ class _Comparison:
         self._b = b
         self._start = start
         self._options = options
-        self._identity: Identity = identify(a, b)
-        self._run_a = Run(a, self._identity, of_b=False)
-        self._run_b = Run(b, self._identity, of_b=True)
+        self._matching: EntityMatching = match_entities(a, b)
+        self._run_a = Run(a, self._matching, of_b=False)
+        self._run_b = Run(b, self._matching, of_b=True)
         self._job = job_settings(a, b)
         self._environment = environment_settings(a, b)
         self._notes = list(interruptions(a, b))
-        self._tally = Tally()
+        self._counts = EventCounts()
         self._aligned_to = (start, start)
 
     def run(self) -> Diff:
@@ -65,9 +75,9 @@ class _Comparison:
             sentence=self._sentence(first),
             agreeing=self._start,
             divergences=tuple(divergences),
-            settings=(*self._job, *self._environment, *entity_settings(self._identity)),
-            counts=self._tally.counts(self._identity),
-            resync_index=self._tally.resync,
+            settings=(*self._job, *self._environment, *entity_settings(self._matching)),
+            counts=self._counts.counts(self._matching),
+            resync_index=self._counts.resync,
             aligned_to=self._aligned_to,
             bytes_read=self._a.bytes_read + self._b.bytes_read,
             notes=tuple(self._notes),
@@ -75,75 +85,77 @@ class _Comparison:
         )
 
     def _sentence(self, first: Divergence) -> str:
-        if not self._identity.different_jobs:
+        if not self._matching.different_jobs:
             return first.sentence
         jobs = [f'"{trace.job["name"]}"' for trace in (self._a, self._b) if trace.job.get("name")]
         which = f" ({jobs[0]}, {jobs[1]})" if len(set(jobs)) == 2 else ""
         return f"these are runs of different jobs{which} without a common node: {first.sentence}"
 
-    def _explainer(self, found: list[Found]) -> Explainer:
+    def _explainer(self, found: list[FoundDivergence]) -> Explainer:
         settings: tuple[Setting, ...] = (*self._job, *self._environment)
         return Explainer(self._run_a, self._run_b, self._options, settings, found)
 
     def _ended(self, over: Trace) -> Divergence:
         explainer = self._explainer([])
         view = explainer.view(self._start, of_b=over is self._a)
-        judgement = judge_ended(self._a, self._b, over, view, self._job)
+        judgement = judge_end(self._a, self._b, over, view, self._job)
         return explainer.ended(self._start, judgement)
 
     def _aligned(self) -> list[Divergence]:
         options = self._options
         watch = self._wanted if options.nodes or options.topics else None
-        cone = Cone(watch)
-        per_stretch = options.window
+        propagation = Propagation(watch)
+        per_block = options.window
         if options.everything:
-            per_stretch = max(options.window, _EVENTS_PER_STRETCH)
-        stretches = Stretches(
-            self._run_a, self._run_b, self._start, per_stretch, skip_equal=options.everything
+            per_block = max(options.window, _EVENTS_PER_BLOCK)
+        blocks = AlignedBlocks(
+            self._run_a, self._run_b, self._start, per_block, skip_equal=options.everything
         )
-        wanted: list[Found] = []
-        for stretch in islice(stretches, None if options.everything else 1):
-            self._aligned_to = (stretch.end_a, stretch.end_b)
-            if isinstance(stretch, EqualRun):
-                self._tally.take_equal(stretch)
+        wanted: list[FoundDivergence] = []
+        for block in islice(blocks, None if options.everything else 1):
+            self._aligned_to = (block.end_a, block.end_b)
+            if isinstance(block, EqualBlock):
+                self._counts.take_equal(block)
                 continue
-            known = len(cone.found)
-            first = first_item(stretch, self._start) if not known else None
-            cone.take(stretch, first)
-            self._tally.take(stretch)
-            new = cone.found[known:]
-            wanted += [f for f in new if watch is None or watch(f.mark.item, stretch)]
-        return self._divergences(cone, wanted)
+            known = len(propagation.found)
+            first = first_item(block, self._start) if not known else None
+            propagation.take(block, first)
+            self._counts.take(block)
+            new = propagation.found[known:]
+            wanted += [f for f in new if watch is None or watch(f.origin.item, block)]
+        return self._divergences(propagation, wanted)
 
-    def _divergences(self, cone: Cone, wanted: list[Found]) -> list[Divergence]:
+    def _divergences(
+        self, propagation: Propagation, wanted: list[FoundDivergence]
+    ) -> list[Divergence]:
         chosen = list(wanted)
-        if cone.watched is not None:
-            chosen.append(cone.watched)
+        if propagation.watched is not None:
+            chosen.append(propagation.watched)
             chosen.sort(key=lambda found: (found.place_a, found.place_b))
         if not chosen:
-            chosen = cone.found[:1]
+            chosen = propagation.found[:1]
             self._notes.append(
                 f"nothing that was asked for ({self._asked()}) differs among the events that were "
-                "aligned; shown is where the runs part"
+                "aligned; shown is where the runs diverge"
             )
-        elif cone.found[0] is not chosen[0]:
+        elif propagation.found[0] is not chosen[0]:
             self._notes.append(
-                f"the runs part at event {self._start}; shown is where {self._asked()} differs"
+                f"the runs diverge at event {self._start}; shown is where {self._asked()} differs"
             )
         most = EVERY_DIVERGENCE_MAX if self._options.everything else DIVERGENCES_MAX
         if len(chosen) > most:
             hint = "" if self._options.everything else "; --all shows them"
             self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
-        explainer = self._explainer(cone.found)
+        explainer = self._explainer(propagation.found)
         return [explainer.explain(found) for found in chosen[:most]]
 
     def _asked(self) -> str:
         return ", ".join((*self._options.nodes, *self._options.topics))
 
-    def _wanted(self, item: Item, stretch: Stretch) -> bool:
+    def _wanted(self, item: EventPair, block: AlignedBlock) -> bool:
         """Whether an item is of a node and touches a topic that was asked for."""
-        options, keys = self._options, self._identity.keys
-        a, b = stretch.rows_a, stretch.rows_b
+        options, keys = self._options, self._matching.keys
+        a, b = block.rows_a, block.rows_b
         rows, index = (a, item.a) if item.a >= 0 else (b, item.b)
         number = rows.number[index - rows.first]
         if not options.wants_node(keys[number].node):
@@ -156,26 +168,26 @@ class _Comparison:
         return any(options.wants_topic(keys[n].name) for n in touched)
 
 
-def first_item(stretch: Stretch, start: int) -> Item:
-    """Return the item that the runs part with: of event ``start`` of a, or of b.
+def first_item(block: AlignedBlock, start: int) -> EventPair:
+    """Return the pair at which the runs diverge: of event ``start`` of a, or of b.
 
     If neither run has the other's event there, it is that of a that is said to be missing; if
     both only changed places, or only times, the one that moved.
     """
-    of_a = next((item for item in stretch.items if item.a == start), None)
-    of_b = next((item for item in stretch.items if item.b == start), None)
+    of_a = next((item for item in block.items if item.a == start), None)
+    of_b = next((item for item in block.items if item.b == start), None)
     if of_a is None or of_b is None:
         only = of_a or of_b
-        assert only is not None, "a stretch holds the event it starts with"
+        assert only is not None, "a block holds the event it starts with"
         return only
     if of_a is of_b or of_a.b < 0:
         return of_a
     if of_b.a < 0:
         return of_b
-    moved_a, moved_b = _moved(stretch, of_a), _moved(stretch, of_b)
+    moved_a, moved_b = _moved(block, of_a), _moved(block, of_b)
     return of_b if moved_b and not moved_a else of_a
 
 
-def _moved(stretch: Stretch, item: Item) -> bool:
-    a, b = stretch.rows_a, stretch.rows_b
+def _moved(block: AlignedBlock, item: EventPair) -> bool:
+    a, b = block.rows_a, block.rows_b
     return a.stamp[item.a - a.first] != b.stamp[item.b - b.first]

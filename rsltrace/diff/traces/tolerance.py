@@ -1,4 +1,4 @@
-"""Whether two runs that part are equal within tolerance after all.
+"""Whether two runs that diverge are equal within tolerance after all.
 
 A tolerance at the first divergence says little: what follows from it may grow. So all messages of
 both runs are compared, which takes reading all of both; that is done only if tolerances are given
@@ -17,7 +17,7 @@ from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.trace.reader import Trace
 
 if TYPE_CHECKING:
-    from rsltrace.diff.bags.model import BagDiff
+    from rsltrace.diff.result.bags import BagDiff
 
 _SAME_EVENTS = "stamp entity kind flags outputs cause_event cause_output".split()
 _SAME_OUTPUTS = "event entity kind".split()
@@ -27,7 +27,7 @@ _AT_ONCE = 4096
 
 
 def messages_within(a: Trace, b: Trace, start: int, options: DiffOptions) -> BagDiff | None:
-    """Compare all messages of two runs that part at event ``start``.
+    """Compare all messages of two runs that diverge at event ``start``.
 
     Return None if no tolerance is asked for, or if more than the contents of messages differs:
     events, their order and times, outputs that are no messages or were not recorded.

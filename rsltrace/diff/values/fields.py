@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import (
     array_text,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.traces.model import FieldDifference
+from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.globs import FieldRules
 
 BINARY_ITEMS_MIN = 65

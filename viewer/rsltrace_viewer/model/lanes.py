@@ -15,7 +15,8 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
-from rsltrace_viewer.model.run import RUN_LABEL, Run, Segment
+from rsltrace.words.entities import RUN_NAME
+from rsltrace_viewer.model.run import Run, Segment
 
 _EXACT_SEGMENTS = 6
 _PIECES_MAX = 32
@@ -94,7 +95,7 @@ class LaneMaker:
 
     def __init__(self, run: Run) -> None:
         self._run = run
-        self.labels = [*(node.name for node in run.nodes), RUN_LABEL]
+        self.labels = [*(node.name for node in run.nodes), RUN_NAME]
         rows = len(self.labels)
         self._pieces = max(4, min(_PIECES_MAX, 2048 // rows))
         count = len(run.segments)
@@ -275,7 +276,7 @@ class LaneMaker:
         most = max(int(np.max(counts, initial=0)), 1)
         for row, label in enumerate(self.labels):
             own = counts[row]
-            if label == RUN_LABEL and not own.any():
+            if label == RUN_NAME and not own.any():
                 continue
             # Roots, rounded up: a busy node must not flatten the others, a single event is seen.
             levels = np.ceil(np.sqrt(own / most) * LEVELS).astype(np.int64)
@@ -313,6 +314,6 @@ class LaneMaker:
         lanes = [
             Lane(label, (), frozenset(columns_raised), "".join(line))
             for label, line, columns_raised in zip(self.labels, letters, raised, strict=True)
-            if label != RUN_LABEL or "".join(line).strip()
+            if label != RUN_NAME or "".join(line).strip()
         ]
         return Lanes(window, columns, tuple(lanes), 1.0, cause)

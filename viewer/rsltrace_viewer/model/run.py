@@ -17,35 +17,16 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, Event, EventKind, Output
+from rsltrace.model.event import NO_EVENT, Event, Output
 from rsltrace.model.printable import printable
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
-
-RUN_LABEL = "(run)"
-"""The node column of what belongs to no node."""
+from rsltrace.words.entities import RUN_NAME
+from rsltrace.words.events import EventWords
 
 _SEGMENTS_KEPT = 24
 """About 0.4 MB each with outputs."""
-
-KIND_WORDS = {
-    EventKind.CONSTRUCT: "init",
-    EventKind.TIMER: "timer",
-    EventKind.SUBSCRIPTION: "sub",
-    EventKind.SERVICE: "srv",
-    EventKind.CLIENT: "client",
-    EventKind.GUARD_CONDITION: "guard",
-    EventKind.TASK: "task",
-    EventKind.RESUME: "resume",
-    EventKind.QOS_EVENT: "qos",
-    EventKind.BAG: "bag",
-    EventKind.SHUTDOWN: "end",
-    EventKind.ACTION: "action",
-    EventKind.CLOCK_JUMP: "jump",
-    EventKind.OUTSIDE: "driver",
-}
-"""Kinds in at most six letters, for columns; the inspector writes them out."""
 
 WITH_TOPIC = frozenset(
     (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
@@ -109,24 +90,17 @@ class Run:
         return tuple(e for e in self.entities.values() if e.kind is EntityKind.NODE)
 
     @cached_property
-    def _labels(self) -> dict[int, tuple[str, str]]:
-        """By entity id: (node, name), printable."""
-        result = {}
-        for entity in self.entities.values():
-            owner = self.entities.get(entity.node)
-            node = printable(owner.name) if owner is not None and owner.name else RUN_LABEL
-            result[entity.id] = node, printable(entity.name) or entity.kind.label
-        return result
+    def words(self) -> EventWords:
+        """The events in words."""
+        return EventWords(self.trace)
 
     def node_name(self, entity_id: int) -> str:
         """Return the name of the node that an entity belongs to."""
-        return self._labels.get(entity_id, (RUN_LABEL, ""))[0]
+        return self.words.names.node(entity_id) or RUN_NAME
 
     def entity_name(self, entity_id: int) -> str:
         """Return the name of an entity; ``#7`` if the trace does not describe it."""
-        if entity_id == 0:
-            return ""
-        return self._labels.get(entity_id, ("", f"#{entity_id}"))[1]
+        return self.words.names.name(entity_id)
 
     @cached_property
     def topics(self) -> tuple[str, ...]:

@@ -5,9 +5,21 @@ A *place* is a row of the unfiltered timeline. With one trace it is the index of
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Protocol
 
-from rsltrace_viewer.model.timeline import Sign
+
+class Sign(Enum):
+    """How a row of two traces compares. The value is what is printed, so no colour is needed."""
+
+    MATCH = "="
+    DIFFERS = "≠"
+    ONLY_A = "-"
+    ONLY_B = "+"
+    MOVED = "~"
+    """Both runs did the same, at another place in the order or at another time."""
+    UNKNOWN = "?"
+    """Beyond the part of the runs that was aligned."""
 
 
 class View(Protocol):

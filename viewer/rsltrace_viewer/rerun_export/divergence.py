@@ -17,15 +17,15 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace.diff.traces.model import (
+from rsltrace.diff.result.divergence import (
     CallDifference,
     CauseStep,
-    Diff,
     Divergence,
-    EventView,
     MessageDifference,
     StateDifference,
 )
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists, make_chunk
@@ -51,7 +51,7 @@ class Marks:
     topics: tuple[str, ...]
     """Topics that the divergence reaches."""
     stamp_ns: int | None
-    """When the runs part."""
+    """When the runs diverge."""
 
 
 def marks_of(diff: Diff) -> Marks:
@@ -165,7 +165,7 @@ def document(diff: Diff) -> str:
 
 
 def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str]:
-    yield f"## Divergence {number} of {count}" if count > 1 else "## Where they part"
+    yield f"## Divergence {number} of {count}" if count > 1 else "## Where they diverge"
     yield ""
     for name, view in (("a", divergence.a), ("b", divergence.b)):
         yield f"- **{name}**: {_text(_event(view)) if view else 'nothing there'}"

@@ -1,4 +1,4 @@
-"""The whole export: one run or two, and where they part, into one Rerun recording (.rrd)."""
+"""The whole export: one run or two, and where they diverge, into one Rerun recording (.rrd)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 
 import rerun as rr
 
-from rsltrace.diff.traces.engine import diff_traces
-from rsltrace.diff.traces.model import Diff
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import clock_for
@@ -34,7 +34,7 @@ class Exported:
 def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Exported:
     """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
 
-    Two traces are compared, and where they part is explained and marked. What was written so far
+    Two traces are compared, and where they diverge is explained and marked. What was written so far
     is removed when something goes wrong. Raises TraceError for damaged traces and OutputError if
     ``output`` exists (without ``force``) or cannot be written.
     """

@@ -11,9 +11,9 @@ from rerun.chunk import Chunk
 
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import Clock
-from rsltrace_viewer.rerun_export.events import EventRows
-from rsltrace_viewer.rerun_export.logs import LogRows
-from rsltrace_viewer.rerun_export.messages import MessageRows, Seen
+from rsltrace_viewer.rerun_export.events.chunks import EventRows
+from rsltrace_viewer.rerun_export.events.logs import LogRows
+from rsltrace_viewer.rerun_export.messages.chunks import MessageRows, Seen
 from rsltrace_viewer.rerun_export.paths import Paths
 
 _CHUNKS_AHEAD = 32

@@ -1,0 +1,60 @@
+"""One event as a line of aligned columns, for ``rsltrace cat``."""
+
+from __future__ import annotations
+
+from rsltrace.model.event import Event, Output
+from rsltrace.model.finding import Finding
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.reader import Trace
+from rsltrace.words.events import EventWords
+from rsltrace.words.kinds import flag_names
+
+_VALUE_MAX = 200
+_COLUMN_MAX = 40
+"""A column is as wide as its longest name, up to here; longer names push the rest to the right."""
+
+
+class EventLines:
+    """Writes the events of a trace as lines.
+
+    Index, simulated seconds, node, kind, entity, input hash, output hash, outputs, flags. Columns
+    without a value hold ``-``; outputs and flags come last because they have any length.
+    """
+
+    def __init__(self, trace: Trace) -> None:
+        self._findings = trace.findings
+        self._words = EventWords(trace)
+        names = self._words.names
+        self._index_width = max(len(str(trace.event_count)), 5)
+        self._time_width = len(format_seconds(trace.end_ns))
+        self._node_width = min(max(names.longest_node, 1), _COLUMN_MAX)
+        self._name_width = min(max(names.longest_name, 1), _COLUMN_MAX)
+
+    def line(self, event: Event, outputs: list[Output]) -> str:
+        """Return the line of an event, without a line end; findings of the guard on their own."""
+        node = self._words.node(event, outputs) or "-"
+        name = self._words.names.name(event.entity) or "-"
+        columns = (
+            f"{event.index:>{self._index_width}}  "
+            f"{format_seconds(event.stamp_ns):>{self._time_width}}  "
+            f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}  "
+            f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
+        )
+        what = ", ".join(self._words.outputs(outputs))
+        flags = "".join(f"  [{flag}]" for flag in flag_names(event.flags))
+        found = self._findings.get(event.index, ())
+        lines = [f"{columns}  {what}{flags}".rstrip(), *map(self._finding, found)]
+        return "\n".join(lines)
+
+    def _finding(self, finding: Finding) -> str:
+        where = printable(finding.stack.partition("\n")[0])
+        return (
+            f"{'':>{self._index_width}}  ! {finding.source.value} {finding.mode.value}: "
+            f"{printable(finding.call)} -> "
+            f"{shortened(printable(finding.value), _VALUE_MAX)}  at {where}"
+        )
+
+
+def _hex(value: int) -> str:
+    return f"{value:016x}" if value else "-"

@@ -1,0 +1,1 @@
+"""Two traces: their first difference, and which event of one is which of the other after it."""

@@ -1,0 +1,127 @@
+"""Which entity of one run is which of the other.
+
+Ids count up in creation order, so one entity more shifts all ids after it. Entities are therefore
+matched by what they are: node, kind, name and type, and their number among those that are alike.
+Everything behind this module speaks of *numbers*, which mean the same entity in both runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.trace.reader import Trace
+from rsltrace.words.entities import EntityKey
+
+_NODE = EntityKind.NODE.label
+
+
+@dataclass(frozen=True)
+class EntityMatching:
+    """The entities of two runs. Numbers count from 0, which is the run itself.
+
+    ``keys`` and ``nodes`` (the number of the owning node) go by number; ``numbers_a`` and
+    ``numbers_b`` give the number of an id, shape (largest id + 1,), -1 where there is no entity.
+    ``same_ids`` says that no id means something else in the other run.
+    """
+
+    keys: tuple[EntityKey, ...]
+    nodes: tuple[int, ...]
+    numbers_a: npt.NDArray[np.int64]
+    numbers_b: npt.NDArray[np.int64]
+    only_a: tuple[int, ...]
+    only_b: tuple[int, ...]
+    same_ids: bool
+    by_key: Mapping[EntityKey, int] = field(repr=False)
+
+    def numbers(self, trace: Trace, ids: npt.NDArray[Any], *, of_b: bool) -> npt.NDArray[np.int64]:
+        """Return the numbers of entity ids. Raises TraceError if the trace has no such entity."""
+        table = self.numbers_b if of_b else self.numbers_a
+        places = ids.astype(np.int64)
+        unknown = places >= len(table)
+        numbers: npt.NDArray[np.int64] = table[np.where(unknown, 0, places)]
+        unknown |= numbers < 0
+        if unknown.any():
+            raise TraceError(f"{trace.name} has no entity {int(places[int(np.argmax(unknown))])}")
+        return numbers
+
+    def node_number(self, key: EntityKey) -> int:
+        """Return the number of the node that an entity belongs to (0: the run)."""
+        return self.nodes[self.by_key[key]]
+
+    @property
+    def different_jobs(self) -> bool:
+        """Whether both runs have nodes and no node is in both: they are runs of different jobs."""
+        only_a, only_b = set(self.only_a), set(self.only_b)
+        nodes = {number for number, key in enumerate(self.keys) if key.kind == _NODE}
+        return bool(nodes & only_a and nodes & only_b) and nodes <= only_a | only_b
+
+
+def match_entities(a: Trace, b: Trace) -> EntityMatching:
+    """Match the entities of two runs. Reads all entities of both."""
+    classes_a, classes_b = _classes(a), _classes(b)
+    keys_a, keys_b = _keys(a, classes_b), _keys(b, classes_a)
+    by_key: dict[EntityKey, int] = {}
+    for key in (*keys_a.values(), *keys_b.values()):
+        by_key.setdefault(key, len(by_key))
+    numbers_a, numbers_b = _table(keys_a, by_key), _table(keys_b, by_key)
+    shared = min(len(numbers_a), len(numbers_b))
+    both = (numbers_a[:shared] >= 0) & (numbers_b[:shared] >= 0)
+    in_a, in_b = set(keys_a.values()), set(keys_b.values())
+    nodes = [0] * len(by_key)
+    for trace, keys in ((a, keys_a), (b, keys_b)):
+        for entity_id, key in keys.items():
+            owner = trace.entities[entity_id].node
+            nodes[by_key[key]] = by_key[keys[owner]] if owner in keys else 0
+    return EntityMatching(
+        keys=tuple(by_key),
+        nodes=tuple(nodes),
+        numbers_a=numbers_a,
+        numbers_b=numbers_b,
+        only_a=tuple(number for key, number in by_key.items() if key not in in_b),
+        only_b=tuple(number for key, number in by_key.items() if key not in in_a),
+        same_ids=bool((numbers_a[:shared] == numbers_b[:shared])[both].all()),
+        by_key=by_key,
+    )
+
+
+def _classes(trace: Trace) -> dict[str, str]:
+    """Return the class of every node, by name."""
+    nodes = (entity for entity in trace.entities.values() if entity.kind is EntityKind.NODE)
+    return {node.name: node.type for node in nodes}
+
+
+def _keys(trace: Trace, other_classes: Mapping[str, str]) -> dict[int, EntityKey]:
+    """Return the key of every entity, by id, in creation order.
+
+    A node whose constructor raised has no class in its trace: it is the node of its name.
+    """
+    seen: dict[tuple[str, str, str, str], int] = {}
+    keys: dict[int, EntityKey] = {}
+    for entity in trace.entities.values():
+        kind = entity.type
+        if entity.kind is EntityKind.NODE and not kind:
+            kind = other_classes.get(entity.name, kind)
+        what = (_node_name(trace, entity), entity.kind.label, entity.name, kind)
+        ordinal = seen.get(what, 0)
+        seen[what] = ordinal + 1
+        keys[entity.id] = EntityKey(*what, ordinal)
+    return keys
+
+
+def _node_name(trace: Trace, entity: Entity) -> str:
+    owner = trace.entities.get(entity.node)
+    return owner.name if owner is not None else ""
+
+
+def _table(keys: Mapping[int, EntityKey], by_key: Mapping[EntityKey, int]) -> npt.NDArray[np.int64]:
+    table = np.full(max(keys) + 1, -1, dtype=np.int64)
+    for entity_id, key in keys.items():
+        table[entity_id] = by_key[key]
+    return table

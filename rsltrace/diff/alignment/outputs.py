@@ -1,0 +1,68 @@
+"""Which output of one event is which of the other's, by what sent them and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from difflib import SequenceMatcher
+
+from rsltrace.diff.alignment.rows import OutputRow
+
+_ALIGNED_MAX = 1000
+
+
+def matched_outputs(
+    a: list[OutputRow], b: list[OutputRow]
+) -> Iterator[tuple[int, OutputRow | None, OutputRow | None, bool]]:
+    """Yield (position, output of a, of b, whether it only moved) for the outputs that differ.
+
+    Outputs are matched by what sent them, in order. One that is there in both but at another place
+    has moved.
+    """
+    if [x[:3] for x in a] == [y[:3] for y in b]:
+        return
+    pairs = list(_paired(a, b))
+    missing = {y[:3]: y for _, x, y in pairs if x is None and y is not None}
+    moved: set[tuple[int, int, int]] = set()
+    for position, x, y in pairs:
+        if x is not None and y is not None:
+            if x[:3] != y[:3]:
+                yield position, x, y, False
+        elif x is not None and x[:3] in missing:
+            moved.add(x[:3])
+            yield position, x, missing[x[:3]], True
+        elif y is None or y[:3] not in moved:
+            yield position, x, y, False
+
+
+def _paired(
+    a: list[OutputRow], b: list[OutputRow]
+) -> Iterator[tuple[int, OutputRow | None, OutputRow | None]]:
+    senders_a, senders_b = [x[:2] for x in a], [y[:2] for y in b]
+    if senders_a == senders_b or max(len(a), len(b)) > _ALIGNED_MAX:
+        for position in range(max(len(a), len(b))):
+            x = a[position] if position < len(a) else None
+            y = b[position] if position < len(b) else None
+            if x and y and x[:2] != y[:2]:
+                yield position, x, None
+                yield position, None, y
+            else:
+                yield position, x, y
+        return
+    # With the content first: of many messages of one publisher, the one that is new is new.
+    matcher = SequenceMatcher(None, [x[:3] for x in a], [y[:3] for y in b], autojunk=False)
+    for tag, begin_a, end_a, begin_b, end_b in matcher.get_opcodes():
+        if tag == "equal":
+            continue
+        inner = SequenceMatcher(
+            None, senders_a[begin_a:end_a], senders_b[begin_b:end_b], autojunk=False
+        )
+        for inner_tag, i, i_end, j, j_end in inner.get_opcodes():
+            if inner_tag == "equal":
+                for nth in range(i_end - i):
+                    x, y = a[begin_a + i + nth], b[begin_b + j + nth]
+                    yield begin_a + i + nth, x, y
+            else:
+                for nth in range(i, i_end):
+                    yield begin_a + nth, a[begin_a + nth], None
+                for nth in range(j, j_end):
+                    yield begin_b + nth, None, b[begin_b + nth]

@@ -1,0 +1,154 @@
+"""A block of one run as plain columns, in terms that mean the same in both runs.
+
+Entities are numbers (see ``entity_matching``), and an event's *content* stands for its outputs: the
+trace's own output hash, or one made anew where the ids in it differ between the runs.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from rsltrace.diff.alignment.entity_matching import EntityMatching
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.reader import Trace
+
+CONSTRUCT = int(EventKind.CONSTRUCT)
+BAG = int(EventKind.BAG)
+TIMER = int(EventKind.TIMER)
+SHUTDOWN = int(EventKind.SHUTDOWN)
+_ENTITY = int(OutputKind.ENTITY)
+
+OutputRow = tuple[int, int, int, int]
+"""(kind, number of the entity, content hash, payload sequence) of an output. The content hash of a
+new entity is 0: its number says what it is, in both runs."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One of the two runs. ``of_b`` says which."""
+
+    trace: Trace
+    matching: EntityMatching
+    of_b: bool
+
+
+@dataclass
+class Rows:
+    """The events ``first <= index < first + len(stamp)`` of a run, as columns.
+
+    ``number`` is the entity, ``owner`` what a difference in this event may change for later ones:
+    the node, for bag messages the topic. ``at_end`` says that nothing follows. Constructing a
+    node counts as an event of that node.
+    """
+
+    run: Run
+    first: int
+    at_end: bool
+    number: list[int]
+    owner: list[int]
+    kind: list[int]
+    stamp: list[int]
+    input: list[int]
+    content: list[int]
+    flags: list[int]
+    state: list[int]
+    cause: list[int]
+    cause_output: list[int]
+    output_counts: list[int] = field(repr=False)
+
+    def __len__(self) -> int:
+        return len(self.stamp)
+
+    @property
+    def end(self) -> int:
+        """The index behind the last event."""
+        return self.first + len(self.stamp)
+
+    def outputs(self, index: int) -> list[OutputRow]:
+        """Return the outputs of the event with this index, in order."""
+        place = index - self.first
+        begin = self._output_starts[place]
+        return self._output_rows[begin : begin + self.output_counts[place]]
+
+    @cached_property
+    def _output_starts(self) -> list[int]:
+        starts = np.cumsum([0, *self.output_counts], dtype=np.int64)
+        return [int(start) for start in starts]
+
+    @cached_property
+    def _output_rows(self) -> list[OutputRow]:
+        return output_rows(self.run, self.first, self.end)
+
+
+def output_rows(run: Run, first: int, last: int) -> list[OutputRow]:
+    """Return the outputs of the events ``first <= index < last``, in order."""
+    rows: list[OutputRow] = []
+    for part in run.trace.outputs(first, last):
+        numbers = run.matching.numbers(run.trace, part["entity"], of_b=run.of_b).tolist()
+        kinds = part["kind"]
+        # The recorder hashes an entity's description with the id of its node; the number says it.
+        hashes = np.where(kinds == _ENTITY, np.uint64(0), part["hash"])
+        columns = (kinds.tolist(), numbers, hashes.tolist(), part["sequence"].tolist())
+        rows.extend(zip(*columns, strict=True))
+    return rows
+
+
+def load_rows(run: Run, first: int, last: int) -> Rows:
+    """Read the events ``first <= index < last`` (as far as there are such) of a run."""
+    columns: dict[str, list[int]] = {name: [] for name in _COLUMNS}
+    numbers: list[int] = []
+    for part in run.trace.events(first, last):
+        numbers += run.matching.numbers(run.trace, part["entity"], of_b=run.of_b).tolist()
+        for name, values in columns.items():
+            values += part[name].tolist()
+    nodes = run.matching.nodes
+    rows = Rows(
+        run=run,
+        first=first,
+        at_end=first + len(numbers) >= run.trace.event_count,
+        number=numbers,
+        owner=[nodes[number] for number in numbers],
+        kind=columns["kind"],
+        stamp=columns["stamp"],
+        input=columns["input_hash"],
+        content=columns["output_hash"],
+        flags=columns["flags"],
+        state=columns["state_hash"],
+        cause=columns["cause_event"],
+        cause_output=columns["cause_output"],
+        output_counts=columns["outputs"],
+    )
+    for place, kind in enumerate(rows.kind):
+        if kind == CONSTRUCT:
+            rows.number[place] = rows.owner[place] = _constructed(rows, place)
+        elif kind == BAG:
+            rows.owner[place] = rows.number[place]
+    if not run.matching.same_ids:
+        rows.content = [
+            hash(tuple(output[:3] for output in rows.outputs(first + place))) if count else 0
+            for place, count in enumerate(rows.output_counts)
+        ]
+    return rows
+
+
+_COLUMNS = (
+    "kind stamp input_hash output_hash flags state_hash cause_event cause_output outputs"
+).split()
+
+
+def _constructed(rows: Rows, place: int) -> int:
+    """Return the number of the first node that a constructor made (0: none)."""
+    keys = rows.run.matching.keys
+    for kind, number, _, _ in rows.outputs(rows.first + place):
+        if kind == _ENTITY and keys[number].kind == EntityKind.NODE.label:
+            return number
+    return 0
+
+
+def outputs_of(run: Run, index: int) -> list[OutputRow]:
+    """Return the outputs of any event, in order."""
+    return output_rows(run, index, index + 1)

@@ -1,0 +1,1 @@
+"""Why two traces diverge: roots and consequences, verdicts, and the evidence for them."""

@@ -1,0 +1,68 @@
+"""The calls the guard found that can explain a divergence: in the event itself, or before it."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+
+from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.result.divergence import CallDifference
+from rsltrace.diff.result.events import EventView
+from rsltrace.model.finding import Finding
+
+CALLS_MAX = 20
+EARLIER_MAX = 3
+
+
+def call_differences(
+    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
+) -> tuple[CallDifference, ...]:
+    """Return the calls made inside two events, those with different answers first.
+
+    If all answers agree, the first calls before them in the same node that gave different ones
+    come first: what a node read earlier may show only now.
+    """
+    inside = _paired(_inside(run_a, a), _inside(run_b, b))
+    differing = [call for call in inside if call.a != call.b]
+    if differing:
+        return (*differing, *(call for call in inside if call.a == call.b))[:CALLS_MAX]
+    some = a or b
+    node = some.entity.node if some is not None else ""
+    # Where one run has no such event: up to there the two agree, indexes and all.
+    before = _paired(_before(run_a, a or b, node), _before(run_b, b or a, node)) if node else []
+    earlier = [call for call in before if call.a != call.b][:EARLIER_MAX]
+    return (*earlier, *inside)[:CALLS_MAX]
+
+
+def _inside(run: Run, view: EventView | None) -> list[Finding]:
+    return run.trace.findings.get(view.index, []) if view is not None else []
+
+
+def _before(run: Run, view: EventView | None, node: str) -> list[Finding]:
+    if view is None:
+        return []
+    events = run.trace.findings.items()
+    return [f for index, found in events if index < view.index for f in found if f.node == node]
+
+
+def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
+    """Pair the n-th findings of each call at each place."""
+    places: dict[tuple[str, str], tuple[list[Finding], list[Finding]]] = {}
+    for side, findings in enumerate((a, b)):
+        for finding in findings:
+            places.setdefault((finding.call, finding.stack), ([], []))[side].append(finding)
+    calls = []
+    for (call, stack), (of_a, of_b) in places.items():
+        for x, y in zip_longest(of_a, of_b):
+            one = x or y
+            calls.append(
+                CallDifference(
+                    source=one.source.value,
+                    call=call,
+                    where=stack.partition("\n")[0],
+                    event_a=None if x is None else x.event,
+                    event_b=None if y is None else y.event,
+                    a=None if x is None else x.value,
+                    b=None if y is None else y.value,
+                )
+            )
+    return calls

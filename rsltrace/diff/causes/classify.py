@@ -1,0 +1,324 @@
+"""From two differing events to a verdict, and to the sentences that say it.
+
+The rules stand in the order in which they are asked: what is seen first in ``judge`` wins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from rsltrace.diff.causes.event_views import CLOCK_OF, phrase, raised
+from rsltrace.diff.causes.propagation import NODE
+from rsltrace.diff.result.divergence import MessageDifference, Root, Verdict
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.traces import Setting
+from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.stamp import format_duration
+from rsltrace.words.phrases import at_time
+
+_NAMED_MAX = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """What is known of a place where the runs differ.
+
+    ``a`` and ``b`` are counterparts, or one of them is None. ``other_a`` and ``other_b`` are what
+    the runs did at that place, which is something else if the event is not there, or came later.
+    ``cause_a`` and ``cause_b`` are the events that caused them. ``why`` is None for a root.
+    """
+
+    a: EventView | None
+    b: EventView | None
+    other_a: EventView | None
+    other_b: EventView | None
+    cause_a: EventView | None
+    cause_b: EventView | None
+    inverted: bool
+    cause_only: bool
+    why: str | None
+    messages: Sequence[MessageDifference]
+    settings: Sequence[Setting]
+
+    @property
+    def one(self) -> EventView:
+        """The event, of whichever run has it."""
+        view = self.a or self.b
+        assert view is not None
+        return view
+
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """A verdict in words. ``a`` and ``b`` are the events to show."""
+
+    verdict: Verdict
+    root: Root
+    sentence: str
+    root_sentence: str
+    a: EventView | None
+    b: EventView | None
+
+
+ROOT_OF = {
+    Verdict.SAME_INPUT_DIFFERENT_OUTPUT: Root.CALLBACK,
+    Verdict.SCHEDULE: Root.SCHEDULE,
+    Verdict.TIMING: Root.TIMING,
+    Verdict.MISSING: Root.MISSING,
+    Verdict.EXTRA: Root.EXTRA,
+    Verdict.EXCEPTION: Root.EXCEPTION,
+    Verdict.DRAW: Root.DRAW,
+    Verdict.GRAPH: Root.JOB,
+    Verdict.ENVIRONMENT: Root.JOB,
+}
+
+_DRIVEN_DIFFERENTLY = "whoever drove the simulations did not do the same"
+
+
+def judge(case: Case) -> Judgement:
+    """Return the verdict on a place where the runs differ."""
+    a, b, one = case.a, case.b, case.one
+    if one.kind is EventKind.CONSTRUCT and not (a and b and raised(a) != raised(b)):
+        return _construction(case)
+    if case.inverted:
+        return _schedule(case)
+    if a is None or b is None:
+        return _one_sided(case)
+    if raised(a) != raised(b) and a.input_hash == b.input_hash:
+        return _exception(case, a, b)
+    if a.stamp_ns != b.stamp_ns or (a.kind is EventKind.TIMER and a.input_hash != b.input_hash):
+        return _timing(case, a, b)
+    if a.input_hash != b.input_hash:
+        return _different_input(case, a, b)
+    if case.cause_only:
+        return _another_cause(case, a, b)
+    draws = [m for m in case.messages if m.kind is OutputKind.DRAW]
+    if draws and all(m.kind is OutputKind.DRAW for m in case.messages):
+        return _draw(case, a, b, draws)
+    if draws and draws[0] is case.messages[0] and draws[0].topic.startswith(CLOCK_OF):
+        return _draw(case, a, b, draws)  # what was done with the time that was read is different
+    return _same_input(case, a, b)
+
+
+# -- the verdicts ----------------------------------------------------------------------------------
+
+
+def _construction(case: Case) -> Judgement:
+    a, b, one = case.a, case.b, case.one
+    verdict, root = Verdict.GRAPH, Root.JOB if case.settings else Root.CALLBACK
+    because = _because_of_settings(case.settings)
+    if a is None or b is None:
+        has, has_not = ("a", "b") if b is None else ("b", "a")
+        name = one.entity.name or "a part of the run"
+        sentence = f"the graphs differ: {name} is constructed in {has} and not in {has_not}"
+        root = Root.JOB
+    elif case.inverted:
+        sentence = "the nodes are constructed in another order"
+    else:
+        changed = [m for m in case.messages if m.kind is OutputKind.ENTITY]
+        if changed:
+            where = {"only a": "only in a", "only b": "only in b"}
+            things = [f"{m.topic} {where.get(m.presence, 'differs')}" for m in changed]
+            sentence = f"the graphs differ: {phrase(one)} made other entities ({_listed(things)})"
+        elif case.settings:
+            verdict = Verdict.ENVIRONMENT
+            sentence = f"{phrase(one)} did something else{_what_differs(case)}"
+        else:
+            verdict, root = Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK
+            sentence = (
+                f"{phrase(one)} did something else{_what_differs(case)}, in the same job and "
+                "environment"
+            )
+    why = because or (
+        "job and environment are the same as far as the traces tell: the constructor itself is "
+        "not deterministic, or its code changed"
+    )
+    return Judgement(verdict, root, sentence, why, a, b)
+
+
+def _schedule(case: Case) -> Judgement:
+    one = case.one
+    first, second = case.other_a, case.other_b
+    if first is None or second is None or first.entity == second.entity:
+        sentence = f"{at_time(one.stamp_ns)} the same events ran in another order"
+        if first is not None and second is not None:
+            sentence += f": {phrase(one)} took two inputs the other way round"
+    else:
+        sentence = (
+            f"{at_time(one.stamp_ns)} the same events ran in another order: "
+            f"first {phrase(first)} in a, first {phrase(second)} in b"
+        )
+    root_sentence = (
+        "both were ready at the same simulated time; whatever decides between them (order of "
+        "creation, of subscription, of delivery) is not the same in the two runs"
+    )
+    if because := _because_of_settings(case.settings):
+        root_sentence = f"both were ready at the same simulated time, and {because}"
+    return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, root_sentence, first, second)
+
+
+def _one_sided(case: Case) -> Judgement:
+    one, a = case.one, case.a
+    verdict, root = (Verdict.MISSING, Root.MISSING) if a else (Verdict.EXTRA, Root.EXTRA)
+    has, has_not = ("a", "b") if a else ("b", "a")
+    instead = case.other_b if a else case.other_a
+    sentence = f"{phrase(one)} {at_time(one.stamp_ns)} happened only in {has}"
+    if instead is not None:
+        sentence += f"; {has_not} went on with {phrase(instead)} {at_time(instead.stamp_ns)}"
+    cause = case.cause_a if a else case.cause_b
+    if case.why is not None:
+        root_sentence = ""
+    elif cause is not None:
+        root_sentence = (
+            f"what it should have received was sent in both runs (event {cause.index}, "
+            f"{phrase(cause)}), but arrived only in {has}"
+        )
+    elif one.kind is EventKind.BAG:
+        root_sentence = f"only the bag of {has} has this message"
+    elif one.kind is EventKind.OUTSIDE:
+        root_sentence = f"whoever drove the simulation did this only in {has}"
+    else:
+        root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
+        if because := _because_of_settings(case.settings):
+            root_sentence = f"nothing before it differs, but {because}"
+    return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
+
+
+def _exception(case: Case, a: EventView, b: EventView) -> Judgement:
+    where, not_where = ("a", "b") if raised(a) else ("b", "a")
+    text = next((m.preview for m in case.messages if m.kind is OutputKind.EXCEPTION), "")
+    what = f" {text}" if text else " an exception"
+    sentence = (
+        f"{phrase(a)} {at_time(a.stamp_ns)} raised{what} in {where} and not in {not_where}, "
+        "from the same input"
+    )
+    return Judgement(
+        Verdict.EXCEPTION, Root.EXCEPTION, sentence, _hidden(case, "what decides over it"), a, b
+    )
+
+
+def _timing(case: Case, a: EventView, b: EventView) -> Judgement:
+    delta_ns = b.stamp_ns - a.stamp_ns
+    if delta_ns:
+        late = "later" if delta_ns > 0 else "earlier"
+        sentence = (
+            f"{phrase(a)} ran {at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b, "
+            f"{format_duration(abs(delta_ns))} {late}"
+        )
+    else:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} was due at another time in a than in b"
+    return Judgement(
+        Verdict.TIMING, Root.TIMING, sentence, _hidden(case, "what sets its time"), a, b
+    )
+
+
+def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
+    inputs = [m.topic for m in case.messages if m.position < 0 and m.topic]
+    what = f"another {inputs[0]}" if inputs else "another input"
+    if a.kind is EventKind.BAG:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one"
+        root, why = Root.EXTERNAL_INPUT, "the bags that were played differ in this message"
+    elif a.kind is EventKind.OUTSIDE:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one"
+        root, why = Root.EXTERNAL_INPUT, _DRIVEN_DIFFERENTLY
+    else:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} received {what}"
+        root = Root.UNKNOWN
+        if case.cause_a is not None and case.cause_b is not None:
+            if (a.cause_event, a.cause_output) == (b.cause_event, b.cause_output):
+                why = "the same message was sent to it, but something else arrived"
+            else:
+                why = (
+                    f"in a it came from {phrase(case.cause_a)} (event {a.cause_event}), in b from "
+                    f"{phrase(case.cause_b)} (event {b.cause_event})"
+                )
+        else:
+            why = "the trace does not say where it came from"
+    return Judgement(Verdict.DIFFERENT_INPUT, root, sentence, why, a, b)
+
+
+def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
+    sentence = (
+        f"{phrase(a)} {at_time(a.stamp_ns)} received equal inputs, but of other events: "
+        f"{_event(a.cause_event)} in a, {_event(b.cause_event)} in b"
+    )
+    why = "two equal messages were delivered in another order"
+    return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, why, a, b)
+
+
+def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDifference]) -> Judgement:
+    first = draws[0]
+    was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("?", "?")
+    is_clock = first.topic.startswith(CLOCK_OF)
+    same = "read a clock" if is_clock else "did the same in both runs"
+    sentence = (
+        f"{phrase(a)} {at_time(a.stamp_ns)} {same}, but chance decided otherwise: "
+        f"{first.topic}: {was_a} in a, {was_b} in b"
+    )
+    if len(draws) > 1:
+        sentence += f" (and {len(draws) - 1} more)"
+    why = _because_of_settings(case.settings) or (
+        "job and seed are the same as far as the traces tell, so the stream of this link had been "
+        "drawn from a different number of times before"
+    )
+    return Judgement(Verdict.DRAW, Root.DRAW, sentence, why, a, b)
+
+
+def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
+    if a.kind is EventKind.OUTSIDE:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is something else{_what_differs(case)}"
+        root = Root.EXTERNAL_INPUT
+        return Judgement(Verdict.DIFFERENT_INPUT, root, sentence, _DRIVEN_DIFFERENTLY, a, b)
+    same = "the same input" if a.input_hash else "no input"
+    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} got {same} in both runs"
+    if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
+        sentence += " and sent the same, but left its node in another state"
+    else:
+        sentence += f" and did something else{_what_differs(case)}"
+    return Judgement(
+        Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
+        Root.CALLBACK,
+        sentence,
+        _hidden(case, "the callback itself"),
+        a,
+        b,
+    )
+
+
+# -- words ---------------------------------------------------------------------------------------
+
+
+def _hidden(case: Case, what: str) -> str:
+    """Say what a root means: nothing that the trace shows differs before it."""
+    if case.why == NODE:
+        return ""
+    text = f"nothing before it differs: {what} is not deterministic"
+    because = _because_of_settings(case.settings)
+    return f"nothing before it differs, but {because}" if because else text
+
+
+def _because_of_settings(settings: Sequence[Setting]) -> str:
+    if not settings:
+        return ""
+    return f"the runs were made differently: {_listed([str(setting) for setting in settings])}"
+
+
+def _what_differs(case: Case) -> str:
+    where = {"only a": " only in a", "only b": " only in b"}
+    things = [
+        f"{message.topic}{where.get(message.presence, '')}"
+        for message in case.messages
+        if message.position >= 0
+    ]
+    return f" ({_listed(things)})" if things else ""
+
+
+def _listed(things: Sequence[str]) -> str:
+    unique = list(dict.fromkeys(things))
+    more = len(unique) - _NAMED_MAX
+    return ", ".join(unique[:_NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
+
+
+def _event(index: int) -> str:
+    return "no event" if index == NO_EVENT else f"event {index}"

@@ -1,0 +1,137 @@
+"""Events of one run, resolved for people: entities by name, outputs in a few words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cached_property
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
+from rsltrace.diff.result.events import EventView
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.words.entities import EntityKey
+from rsltrace.words.outputs import output_text
+from rsltrace.words.phrases import event_phrase
+
+COUNTED_MAX = 8192
+"""Events up to here are told which of their entity's events they are. Counting takes reading."""
+
+_SUMMARY_OUTPUTS_MAX = 4
+_DRAW = int(OutputKind.DRAW)
+_SEGMENTS_BACK = 2
+
+CLOCK_OF = "the clock of "
+"""How the text of a draw begins that has set a clock."""
+
+
+class EventViews:
+    """Makes the views of one run's events."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+
+    def view(self, index: int) -> EventView:
+        """Return event ``index``, which must exist."""
+        run = self._run
+        event = run.trace.event(index)
+        outputs = outputs_of(run, index)
+        number = self._number(event.entity, event.kind, outputs)
+        return EventView(
+            index=index,
+            stamp_ns=event.stamp_ns,
+            entity=run.matching.keys[number],
+            kind=event.kind,
+            flags=event.flags,
+            cause_event=event.cause_event,
+            cause_output=event.cause_output,
+            input_hash=event.input_hash,
+            output_hash=event.output_hash,
+            state_hash=event.state_hash,
+            outputs=event.outputs,
+            position=self._position(index, event.entity) if event.entity else 0,
+            summary=self.summary(outputs),
+        )
+
+    def before(self, index: int, count: int) -> tuple[EventView, ...]:
+        """Return the last ``count`` events before ``index``, in order."""
+        end = min(index, self._run.trace.event_count)
+        return tuple(self.view(i) for i in range(max(end - count, 0), end))
+
+    def before_in_node(self, index: int, count: int, node: int) -> tuple[EventView, ...]:
+        """Return the last ``count`` events of a node before ``index``, in order.
+
+        Two segments are looked at: what lies further back is no context any more.
+        """
+        found: list[int] = []
+        if node and count:
+            for part in self._segments_before(index):
+                numbers = self._run.matching.numbers(
+                    self._run.trace, part["entity"], of_b=self._run.of_b
+                )
+                own = np.array(self._run.matching.nodes)[numbers] == node
+                own &= part["kind"] != CONSTRUCT
+                found[:0] = part["index"][own].tolist()
+                if len(found) >= count:
+                    break
+        return tuple(self.view(i) for i in found[-count:] if count)
+
+    def summary(self, outputs: list[OutputRow]) -> str:
+        """Return outputs as a short text: ``/t1, call /s1``."""
+        keys = self._run.matching.keys
+        texts = [
+            output_text(kind, keys[n].name, keys[n].kind)
+            for kind, n, _, _ in outputs
+            if kind != _DRAW
+        ]
+        if len(texts) > _SUMMARY_OUTPUTS_MAX:
+            texts[_SUMMARY_OUTPUTS_MAX:] = [f"{len(texts) - _SUMMARY_OUTPUTS_MAX} more"]
+        return ", ".join(texts)
+
+    def _number(self, entity: int, kind: EventKind, outputs: list[OutputRow]) -> int:
+        keys = self._run.matching.keys
+        if kind is EventKind.CONSTRUCT:
+            for output_kind, number, _, _ in outputs:
+                if output_kind == OutputKind.ENTITY and keys[number].kind == "node":
+                    return number
+        ids = np.array([entity], dtype=np.uint32)
+        return int(self._run.matching.numbers(self._run.trace, ids, of_b=self._run.of_b)[0])
+
+    def _segments_before(self, index: int) -> Iterator[npt.NDArray[np.void]]:
+        """Yield the last segments before ``index``, backwards, cut off there."""
+        starts = self._run.trace.segments["first_event"]
+        segment = int(np.searchsorted(starts, np.uint64(index), side="left")) - 1
+        end = index
+        for number in range(segment, max(segment - _SEGMENTS_BACK, -1), -1):
+            start = int(starts[number])
+            yield from self._run.trace.events(start, end)
+            end = start
+
+    def _position(self, index: int, entity: int) -> int:
+        if index > COUNTED_MAX:
+            return -1
+        return int(np.count_nonzero(self._first_entities[:index] == entity))
+
+    @cached_property
+    def _first_entities(self) -> npt.NDArray[np.uint32]:
+        parts = [part["entity"] for part in self._run.trace.events(0, COUNTED_MAX)]
+        return np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint32)
+
+
+def drawn_for(key: EntityKey) -> str:
+    """Return what chance decided about: a link, or a clock that was set."""
+    if key.kind == EntityKind.NODE.label:
+        return f"{CLOCK_OF}{key.name}"
+    return f"{key.kind} {key.name} of {key.node}"
+
+
+def phrase(view: EventView) -> str:
+    """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
+    return event_phrase(view.kind, view.entity)
+
+
+def raised(view: EventView) -> bool:
+    """Whether an event ended with an exception."""
+    return bool(view.flags & EventFlag.RAISED)

@@ -1,0 +1,298 @@
+"""One divergence with everything there is to say about it: verdict, way from the root, evidence."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+from rsltrace.diff.alignment.rows import Run, outputs_of
+from rsltrace.diff.causes.call_differences import call_differences
+from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
+from rsltrace.diff.causes.event_views import EventViews
+from rsltrace.diff.causes.message_differences import message_differences
+from rsltrace.diff.causes.propagation import NODE, FoundDivergence, Origin
+from rsltrace.diff.causes.record_command import record_command
+from rsltrace.diff.causes.state_differences import state_differences
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.divergence import (
+    CallDifference,
+    CauseStep,
+    Divergence,
+    MessageDifference,
+    Reach,
+    Root,
+    Verdict,
+)
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.traces import Setting
+from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.stamp import format_seconds
+
+ANCESTORS_MAX = 5
+"""Events told that led to a root: both runs have them, they only say how it came to run."""
+
+STEPS_MAX = 16
+"""Steps told between a root and its consequence; of a longer way, the last ones."""
+
+
+@dataclass
+class Explainer:
+    """Puts divergences in words. ``found`` are all roots so far, by number."""
+
+    run_a: Run
+    run_b: Run
+    options: DiffOptions
+    settings: Sequence[Setting]
+    found: Sequence[FoundDivergence]
+    _judged: dict[int, Judgement] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._viewer_a = EventViews(self.run_a)
+        self._viewer_b = EventViews(self.run_b)
+
+    def explain(self, found: FoundDivergence) -> Divergence:
+        """Return everything about a root, or about a consequence that was asked for."""
+        a, b, messages = self._differing(found)
+        judgement = self._judge(found, a, b, messages)
+        if found.origin.previous is not None:
+            judgement = self._following(judgement, found.origin)
+        return self._divergence(found, judgement, messages)
+
+    def ended(self, index: int, judgement: Judgement) -> Divergence:
+        """Return a divergence at ``index`` where one run has nothing more to compare."""
+        bare = Divergence(
+            verdict=judgement.verdict,
+            sentence=judgement.sentence,
+            a=judgement.a,
+            b=judgement.b,
+            root=judgement.root,
+            root_sentence=judgement.root_sentence,
+            chain=(CauseStep(judgement.a, judgement.b),),
+            next_step=self._next_step(judgement),
+        )
+        return self._with_context(bare, index, index)
+
+    def view(self, index: int, *, of_b: bool) -> EventView | None:
+        """Return an event of one of the runs, or None if it has none of that index."""
+        run, viewer = (self.run_b, self._viewer_b) if of_b else (self.run_a, self._viewer_a)
+        return viewer.view(index) if 0 <= index < run.trace.event_count else None
+
+    # -- the verdict ---------------------------------------------------------------------------
+
+    def _differing(
+        self, found: FoundDivergence
+    ) -> tuple[EventView | None, EventView | None, tuple[MessageDifference, ...]]:
+        item = found.origin.item
+        a, b = self.view(item.a, of_b=False), self.view(item.b, of_b=True)
+        return a, b, message_differences(self.run_a, self.run_b, a, b, self.options)
+
+    def _judge(
+        self,
+        found: FoundDivergence,
+        a: EventView | None,
+        b: EventView | None,
+        messages: tuple[MessageDifference, ...],
+    ) -> Judgement:
+        return judge(
+            Case(
+                a=a,
+                b=b,
+                other_a=self.view(found.place_a, of_b=False),
+                other_b=self.view(found.place_b, of_b=True),
+                cause_a=self.view(_cause(a), of_b=False),
+                cause_b=self.view(_cause(b), of_b=True),
+                inverted=found.origin.item.inverted,
+                cause_only=found.cause_only,
+                why=found.origin.why,
+                messages=messages,
+                settings=self.settings,
+            )
+        )
+
+    def _root_judgement(self, number: int) -> Judgement:
+        if number not in self._judged:
+            found = self.found[number]
+            self._judged[number] = self._judge(found, *self._differing(found))
+        return self._judged[number]
+
+    def _following(self, judgement: Judgement, origin: Origin) -> Judgement:
+        """Return the verdict on a consequence: its own, with the root of its divergence."""
+        root = self._root_judgement(origin.root)
+        verdict, sentence = judgement.verdict, judgement.sentence
+        if origin.why == NODE and verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT:
+            sentence += ", because its node had done something else before"
+        return replace(
+            judgement,
+            verdict=verdict,
+            sentence=sentence,
+            root=ROOT_OF.get(root.verdict, root.root),
+            root_sentence=f"it follows from an earlier difference: {root.sentence}",
+        )
+
+    # -- the way from the root -------------------------------------------------------------------
+
+    def _chain(self, found: FoundDivergence) -> tuple[CauseStep, ...]:
+        origins = [found.origin]
+        while (previous := origins[-1].previous) is not None:
+            origins.append(previous)
+        origins.reverse()
+        steps = []
+        for origin, following in zip(origins, [*origins[1:], None], strict=True):
+            relation = ""
+            if following is not None and following.why == NODE:
+                item = following.item
+                view = self.view(item.a, of_b=False) or self.view(item.b, of_b=True)
+                relation = f"may have changed the state of {view.entity.node}" if view else ""
+            elif following is not None:
+                relation = self._sent(following)
+            a = self.view(origin.item.a, of_b=False)
+            b = self.view(origin.item.b, of_b=True)
+            steps.append(CauseStep(a, b, relation))
+        if len(steps) > STEPS_MAX:
+            left_out = len(steps) - STEPS_MAX
+            steps[1 : 1 + left_out] = []
+            steps[0] = replace(steps[0], relation=f"led, in {left_out} more steps, to")
+        return (*self._ancestors(origins[0]), *steps)
+
+    def _ancestors(self, root: Origin) -> list[CauseStep]:
+        """Return what led to a root, as far as both runs have it."""
+        steps: list[CauseStep] = []
+        item = root.item
+        of_b = item.a < 0
+        view = self.view(item.b if of_b else item.a, of_b=of_b)
+        start = min(found.origin.item.a for found in self.found[:1])
+        while view is not None and len(steps) < ANCESTORS_MAX:
+            cause = _cause(view)
+            if not 0 <= cause < min(view.index, start if start >= 0 else view.index):
+                break
+            relation = self._relation(self.run_b if of_b else self.run_a, cause, view.cause_output)
+            a, b = self.view(cause, of_b=False), self.view(cause, of_b=True)
+            steps.append(CauseStep(a, b, relation))
+            view = a
+        return steps[::-1]
+
+    def _sent(self, origin: Origin) -> str:
+        """Say how the cause of an event led to it."""
+        item = origin.item
+        for run, index in ((self.run_a, item.a), (self.run_b, item.b)):
+            if index >= 0:
+                event = run.trace.event(index)
+                if event.cause_event != NO_EVENT:
+                    return self._relation(run, event.cause_event, event.cause_output)
+        return ""
+
+    def _relation(self, run: Run, cause: int, nth: int) -> str:
+        outputs = outputs_of(run, cause)
+        if nth >= len(outputs):
+            return "caused"
+        kind, number, _, _ = outputs[nth]
+        verb = _VERBS.get(kind, "caused")
+        return f"{verb} {run.matching.keys[number].name}".rstrip()
+
+    # -- the rest --------------------------------------------------------------------------------
+
+    def _divergence(
+        self, found: FoundDivergence, judgement: Judgement, messages: tuple[MessageDifference, ...]
+    ) -> Divergence:
+        place_a = judgement.a.index if judgement.a is not None else found.place_a
+        place_b = judgement.b.index if judgement.b is not None else found.place_b
+        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b)
+        bare = Divergence(
+            verdict=judgement.verdict,
+            sentence=judgement.sentence,
+            a=judgement.a,
+            b=judgement.b,
+            root=judgement.root,
+            root_sentence=_with_call(judgement, calls),
+            chain=self._chain(found),
+            messages=messages,
+            calls=calls,
+            state=state_differences(self.run_a, self.run_b, judgement.a, judgement.b),
+            reaches=self._reaches(found),
+            next_step=self._next_step(judgement),
+        )
+        return self._with_context(bare, place_a, place_b)
+
+    def _with_context(self, bare: Divergence, place_a: int, place_b: int) -> Divergence:
+        count = self.options.context
+        view = bare.a or bare.b
+        node = self.run_a.matching.node_number(view.entity) if view is not None else 0
+        return replace(
+            bare,
+            before_a=self._viewer_a.before(place_a, count),
+            before_b=self._viewer_b.before(place_b, count),
+            same_node_a=self._viewer_a.before_in_node(place_a, count, node),
+            same_node_b=self._viewer_b.before_in_node(place_b, count, node),
+        )
+
+    def _reaches(self, found: FoundDivergence) -> tuple[Reach, ...]:
+        keys = self.run_a.matching.keys
+        topics: dict[str, tuple[int, int]] = {}
+        for number, (first, count) in found.reached.items():
+            topic = keys[number].name
+            earlier, so_far = topics.get(topic, (first, 0))
+            topics[topic] = (min(first, earlier), so_far + count)
+        reaches = [
+            Reach(topic, max(first - found.stamp, 0), count)
+            for topic, (first, count) in topics.items()
+            if self.options.wants_topic(topic)
+        ]
+        return tuple(sorted(reaches, key=lambda reach: (reach.after_ns, reach.topic)))
+
+    def _next_step(self, judgement: Judgement) -> str:
+        view = judgement.a or judgement.b
+        assert view is not None
+        path_a, path_b = (shlex.quote(run.trace.name) for run in (self.run_a, self.run_b))
+        verdict = judgement.verdict
+        if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
+            return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
+        if self.settings and (verdict is Verdict.ENVIRONMENT or _told_to_differ(self.settings)):
+            if "://" in f"{path_a} {path_b}":  # which the viewer does not open
+                return f"rsltrace diff {path_a} {path_b} --all"
+            return f"rsltrace view {path_a} {path_b}"
+        until = format_seconds(view.stamp_ns)
+        record = record_command(self.run_a.trace)
+        if judgement.root in _AGAIN and record and view.kind is not EventKind.CONSTRUCT:
+            again = f"{record} --until {until} -o again.mcap --force"
+            return f"{again}; rsltrace diff {path_a} again.mcap"
+        path = path_a if judgement.a is not None else path_b
+        node = view.entity.node
+        choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""
+        if view.kind is EventKind.BAG:
+            choice = f" --topic {shlex.quote(view.entity.name)}"
+        if view.kind is EventKind.CONSTRUCT:
+            choice = " --kind construct"
+        return f"rsltrace cat {path}{choice} --from {until} --to {until} --json --payloads"
+
+
+def _told_to_differ(settings: Sequence[Setting]) -> bool:
+    """Whether job or code are others in the two runs: that needs no third run to be believed."""
+    return any(not setting.place.startswith("environment:") for setting in settings)
+
+
+def _with_call(judgement: Judgement, calls: Sequence[CallDifference]) -> str:
+    """Add to the root the first call that can explain it."""
+    if judgement.root is not Root.CALLBACK or not calls:
+        return judgement.root_sentence
+    call = calls[0]
+    differs = "gave different answers" if call.a != call.b else "was called in it"
+    return f"{judgement.root_sentence}; {call.call} at {call.where} {differs}"
+
+
+_AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
+"""What recording the job once more tells more about: which of the two runs is the usual one."""
+
+_VERBS: dict[int, str] = {
+    OutputKind.MESSAGE: "published",
+    OutputKind.REQUEST: "called",
+    OutputKind.RESPONSE: "answered",
+    OutputKind.LOG: "logged to",
+    OutputKind.GUARD: "triggered",
+    OutputKind.TASK: "made or resumed a task of",
+}
+
+
+def _cause(view: EventView | None) -> int:
+    """Return the index of an event's cause, -1 if it has none."""
+    return -1 if view is None or view.cause_event == NO_EVENT else view.cause_event

@@ -1,0 +1,263 @@
+"""What differs in the jobs of two runs, key by key, and in which line of the job file.
+
+Compared is what was meant: the resolved jobs, in which every key has a value, so that another
+layout of the file, a unit written otherwise or an override on the command line show as what they
+are. Keys are written as ``--set`` takes them. Traces without a resolved job (it is damaged, or
+somebody else wrote the trace) are compared by the lines of the job files.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from rsltrace.diff.causes.record_command import is_effective, is_of_file
+from rsltrace.diff.result.traces import Setting
+from rsltrace.model.stamp import format_duration
+from rsltrace.trace.reader import Trace
+
+_LINES_MAX = 20_000
+"""Longer job files are compared as a whole: difflib takes time with the square of the lines."""
+
+_NANOSECONDS = "_ns"
+_NOTHING: tuple[object, ...] = (None, [], {})
+_NO_VALUES = tuple((nothing,) for nothing in _NOTHING)
+
+Path = tuple["str | int", ...]
+
+
+def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
+    """Return what differs in the jobs, in the order of the job file; keys without a line last."""
+    resolved_a, resolved_b = _resolved(a), _resolved(b)
+    if not resolved_a or not resolved_b:
+        return tuple(_differing_lines(a, b))
+    text_a, text_b = _JobText(a), _JobText(b)
+    found = []
+    for change in _changes((), (), resolved_a, resolved_b):
+        if change.is_of_another_version(text_a.text, text_b.text):
+            continue
+        places = text_a.place(change.path_a, change.a), text_b.place(change.path_b, change.b)
+        depth, line = max(places, key=lambda place: place[0])
+        name = f"{_name(a, b)}:{line}" if depth else "job"
+        in_a = change.a is not None
+        key = _key(change.path_a, resolved_a) if in_a else _key(change.path_b, resolved_b)
+        found.append((line or _LINES_MAX, Setting(name, *change.shown(), key)))
+    return tuple(setting for _, setting in sorted(found, key=lambda item: item[0]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Change:
+    """A leaf that differs: where each side has it (or would), and the values, each in a tuple."""
+
+    path_a: Path
+    path_b: Path
+    a: tuple[Any] | None
+    b: tuple[Any] | None
+
+    def is_of_another_version(self, text_a: str, text_b: str) -> bool:
+        """Whether only one version of rsltrace knows the key, and it was not given."""
+        if None not in (self.a, self.b) or _is_named_by_users(self.path_a):
+            return False
+        text = text_b if self.a is None else text_a
+        unset = (self.a or self.b) in _NO_VALUES
+        return unset or (bool(text) and _written(self.path_a[-1]) not in text)
+
+    def shown(self) -> tuple[str | None, str | None]:
+        """Return both values on a line each: times with a unit; parts without unset keys."""
+        if (self.a and self.a[0]) is None and (self.b and self.b[0]) is None:
+            return (None if self.a is None else "null"), (None if self.b is None else "null")
+        key = self.path_a[-1]
+        a, b = (None if leaf is None else _text(leaf[0], key) for leaf in (self.a, self.b))
+        if a == b and a is not None:  # rounded for people
+            a, b = (json.dumps(leaf[0]) for leaf in (self.a, self.b) if leaf is not None)
+        return a, b
+
+
+class _JobText:
+    """The job file of a trace, to find the lines of its keys in."""
+
+    def __init__(self, trace: Trace) -> None:
+        self.text: str = trace.job_text
+        self.is_file: bool = bool(self.text) and is_of_file(trace) and not is_effective(trace)
+        """An effective job was put together from files and options: its lines are of none."""
+
+    @cached_property
+    def _root(self) -> Any:
+        return _composed(self.text)
+
+    def place(self, path: Path, leaf: tuple[Any] | None) -> tuple[int, int]:
+        """Return how much of a path the file has, and the line (from 1) where that is, or 0, 0.
+
+        Where the leaf is not there, neither is the last step: what the file has at an entry's
+        number is another entry.
+        """
+        node: Any = self._root if self.is_file else None
+        path = path if leaf is not None else path[:-1]
+        line = 0
+        for depth, step in enumerate(path):
+            found = _child(node, step)
+            if found is None:
+                return depth, line
+            place, node = found
+            line = place.start_mark.line + 1
+        return len(path), line
+
+
+def _composed(text: str) -> Any:
+    """Return the YAML nodes of a job file, or None if it cannot be read."""
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    try:
+        return YAML().compose(text)
+    except (YAMLError, ValueError, RecursionError):
+        return None
+
+
+def _child(node: Any, step: str | int) -> tuple[Any, Any] | None:
+    """Return the node that is the place of a key or an entry, and the node of its value."""
+    from ruamel.yaml.nodes import MappingNode, SequenceNode
+
+    if isinstance(step, int):
+        if not isinstance(node, SequenceNode) or step >= len(node.value):
+            return None
+        return node.value[step], node.value[step]
+    if not isinstance(node, MappingNode):
+        return None
+    return next(((k, v) for k, v in node.value if k.value == _written(step)), None)
+
+
+def _written(step: str | int) -> str:
+    return str(step).removesuffix(_NANOSECONDS)
+
+
+def _key(path: Path, value: Any) -> str:
+    """Return a path as ``--set`` takes it: nodes by their names where they have one."""
+    steps: list[str] = []
+    for step in path:
+        value = _inner(value, step)
+        name = value.get("name") if isinstance(value, dict) and steps == ["nodes"] else None
+        steps.append(name if isinstance(name, str) and name else _written(step))
+    return ".".join(steps)
+
+
+def _inner(value: Any, step: str | int) -> Any:
+    return value.get(step) if isinstance(value, dict) else value[step]
+
+
+def _is_named_by_users(path: Path) -> bool:
+    """Whether a key of the job is a name that its author chose, not one that rsltrace knows."""
+    parents = ("arguments", "parameters", "remappings", "topics", "services")
+    return isinstance(path[-1], int) or any(parent in parents for parent in path[:-1])
+
+
+def _resolved(trace: Trace) -> dict[str, Any]:
+    try:
+        value = json.loads(trace.job.get("resolved") or "{}")
+    except ValueError:  # of a later version, or damaged: the job files themselves are compared
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _changes(path_a: Path, path_b: Path, a: Any, b: Any) -> Iterator[_Change]:
+    """Yield the leaves that differ."""
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in sorted({*a, *b}):
+            inner_a, inner_b = (*path_a, key), (*path_b, key)
+            if key in a and key in b:
+                yield from _changes(inner_a, inner_b, a[key], b[key])
+            else:
+                of_a, of_b = ((side[key],) if key in side else None for side in (a, b))
+                yield _Change(inner_a, inner_b, of_a, of_b)
+    elif isinstance(a, list) and isinstance(b, list) and _holds_parts(a, b):
+        yield from _changed_entries(path_a, path_b, a, b)
+    elif a != b or type(a) is not type(b):
+        yield _Change(path_a, path_b, (a,), (b,))
+
+
+def _holds_parts(a: list[Any], b: list[Any]) -> bool:
+    """Whether lists are of parts with keys (or as long as each other), not just of values."""
+    return len(a) == len(b) or all(isinstance(item, dict) for item in (*a, *b))
+
+
+def _changed_entries(path_a: Path, path_b: Path, a: list[Any], b: list[Any]) -> Iterator[_Change]:
+    if len(a) == len(b):
+        changes = [(0, len(a), 0, len(b))]
+    else:
+        text_a, text_b = ([json.dumps(item, sort_keys=True) for item in side] for side in (a, b))
+        matcher = difflib.SequenceMatcher(None, text_a, text_b, autojunk=False)
+        changes = [code[1:] for code in matcher.get_opcodes() if code[0] != "equal"]
+    for begin_a, end_a, begin_b, end_b in changes:
+        alike = min(end_a - begin_a, end_b - begin_b)
+        for at_a, at_b in zip(range(begin_a, end_a), range(begin_b, end_b), strict=False):
+            yield from _changes((*path_a, at_a), (*path_b, at_b), a[at_a], b[at_b])
+        for at_a in range(begin_a + alike, end_a):
+            yield _Change((*path_a, at_a), (*path_b, at_a), (a[at_a],), None)
+        for at_b in range(begin_b + alike, end_b):
+            yield _Change((*path_a, at_b), (*path_b, at_b), None, (b[at_b],))
+
+
+def _text(value: Any, key: str | int) -> str | None:
+    if value is None:
+        return None
+    plain = _plain(value, key)
+    text = json.dumps(plain, ensure_ascii=False)
+    return plain if isinstance(plain, str) and not _has_two_meanings(plain) else text
+
+
+def _has_two_meanings(text: str) -> bool:
+    """Whether a text without its quotes looks like a number, a list or nothing."""
+    try:
+        json.loads(text or "null")
+    except ValueError:
+        return text != text.strip() or not text.isprintable()
+    return True
+
+
+def _plain(value: Any, key: str | int) -> Any:
+    if isinstance(value, dict):
+        kept = {name: item for name, item in value.items() if item not in _NOTHING}
+        return {_written(name): _plain(item, name) for name, item in kept.items()}
+    if isinstance(value, list):
+        return [_plain(item, key) for item in value]
+    return format_duration(value) if _is_time(value, key) else value
+
+
+def _is_time(value: Any, key: str | int) -> bool:
+    return type(value) is int and str(key).endswith(_NANOSECONDS)
+
+
+def _name(a: Trace, b: Trace) -> str:
+    return a.job.get("name") or b.job.get("name") or "job.yaml"
+
+
+def _differing_lines(a: Trace, b: Trace) -> Iterator[Setting]:
+    if a.job_text == b.job_text:
+        return
+    name = _name(a, b)
+    if is_effective(a) or is_effective(b):
+        name = f"effective {name}"  # put together from several files: no line of one of them
+    (numbers_a, lines_a), (numbers_b, lines_b) = _lines(a), _lines(b)
+    if max(len(lines_a), len(lines_b)) > _LINES_MAX:
+        yield Setting(name, f"{len(lines_a)} lines", f"{len(lines_b)} lines")
+        return
+    matcher = difflib.SequenceMatcher(None, lines_a, lines_b, autojunk=False)
+    for tag, begin_a, end_a, begin_b, end_b in matcher.get_opcodes():
+        if tag == "equal":
+            continue
+        for nth in range(max(end_a - begin_a, end_b - begin_b)):
+            line_a = lines_a[begin_a + nth] if begin_a + nth < end_a else None
+            line_b = lines_b[begin_b + nth] if begin_b + nth < end_b else None
+            number = numbers_b[begin_b + nth] if line_a is None else numbers_a[begin_a + nth]
+            yield Setting(f"{name}:{number}", line_a, line_b)
+
+
+def _lines(trace: Trace) -> tuple[list[int], list[str]]:
+    """Return numbers and text of the lines of a job that are more than space and a comment."""
+    numbered = enumerate(trace.job_text.splitlines(), 1)
+    lines = [(n, line) for n, line in numbered if line.strip() and line.lstrip()[0] != "#"]
+    return [n for n, _ in lines], [line for _, line in lines]

@@ -1,0 +1,189 @@
+"""The messages in which two events differ, decoded where their payloads were recorded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from rsltrace.diff.alignment.outputs import matched_outputs
+from rsltrace.diff.alignment.rows import OutputRow, Run, outputs_of
+from rsltrace.diff.causes.event_views import drawn_for
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.divergence import MessageDifference
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.values.fields import diff_messages, preview
+from rsltrace.errors import TraceError
+from rsltrace.model.draw import draw_text
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
+from rsltrace.words.entities import EntityKey
+from rsltrace.words.outputs import output_text
+
+MESSAGES_MAX = 50
+"""Differing messages of one event that are decoded; one callback can publish thousands."""
+
+_EXCEPTION_MAX = 200
+_INPUT = -1
+_IN_BOTH, _ONLY_A, _ONLY_B = "both", "only a", "only b"
+_WITH_PAYLOAD = frozenset(
+    (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
+)
+_WITHOUT_INPUT = frozenset((EventKind.TIMER, EventKind.CONSTRUCT, EventKind.SHUTDOWN))
+
+
+def message_differences(
+    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None, options: DiffOptions
+) -> tuple[MessageDifference, ...]:
+    """Return the input and the outputs in which two events differ, the input first.
+
+    Where one run has no such event, all of the other's. At most ``MESSAGES_MAX``.
+    """
+    evidence = _Evidence(run_a, run_b, options)
+    found: list[MessageDifference] = []
+    for difference in evidence.differences(a, b):
+        if options.wants_topic(difference.topic):
+            found.append(difference)
+            if len(found) == MESSAGES_MAX:
+                break
+    return tuple(found)
+
+
+class _Evidence:
+    def __init__(self, run_a: Run, run_b: Run, options: DiffOptions) -> None:
+        self._run_a = run_a
+        self._run_b = run_b
+        self._options = options
+
+    def differences(self, a: EventView | None, b: EventView | None) -> Iterator[MessageDifference]:
+        """Yield what differs between two events, of which one may be missing."""
+        input_a, input_b = self._input(self._run_a, a), self._input(self._run_b, b)
+        hash_a = a.input_hash if a is not None else None
+        hash_b = b.input_hash if b is not None else None
+        if (input_a or input_b) and hash_a != hash_b:
+            yield self._difference(_INPUT, input_a, input_b, hash_a, hash_b)
+        outputs_a = outputs_of(self._run_a, a.index) if a is not None else []
+        outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
+        bag = any(view is not None and _is_published_input(view) for view in (a, b))
+        for position, x, y, moved in matched_outputs(outputs_a, outputs_b):
+            if bag and (x or y or (0,))[0] == OutputKind.MESSAGE:
+                continue  # what is published is the input, shown already
+            reason = "sent in another order" if moved else ""
+            yield self._difference(position, x, y, x and x[2], y and y[2], reason)
+
+    def _input(self, run: Run, view: EventView | None) -> OutputRow | None:
+        """Return the output that was an event's input; for a bag message, its own publication."""
+        if view is None or view.kind in _WITHOUT_INPUT:
+            return None
+        if _is_published_input(view):
+            outputs = outputs_of(run, view.index)
+            return outputs[0] if outputs else None
+        if view.cause_event == NO_EVENT or view.cause_event >= view.index:
+            return None
+        outputs = outputs_of(run, view.cause_event)
+        if view.cause_output >= len(outputs):
+            return None
+        output = outputs[view.cause_output]
+        return output if output[0] in _WITH_PAYLOAD else None
+
+    def _difference(
+        self,
+        position: int,
+        a: OutputRow | None,
+        b: OutputRow | None,
+        hash_a: int | None,
+        hash_b: int | None,
+        reason: str = "",
+    ) -> MessageDifference:
+        one = a or b
+        assert one is not None
+        kind, number, _, _ = one
+        keys = self._run_a.matching.keys
+        key = keys[number]
+        presence = _IN_BOTH if a and b else _ONLY_A if a else _ONLY_B
+        topic = _topic(kind, key)
+        base = MessageDifference(
+            kind=None if position == _INPUT else OutputKind(kind),
+            topic=topic,
+            type=key.type,
+            position=position,
+            presence=presence,
+            hash_a=hash_a,
+            hash_b=hash_b,
+            reason=reason,
+        )
+        if reason or kind == OutputKind.ENTITY:
+            return base
+        if kind == OutputKind.DRAW:
+            text_a, text_b = (draw_text(output[2]) if output else "none" for output in (a, b))
+            return replace(base, fields=(FieldDifference("draw", text_a, text_b),))
+        values: list[object] = []
+        for run, output in ((self._run_a, a), (self._run_b, b)):
+            if output is None:
+                continue
+            try:
+                value = self._decoded(run, output)
+            except TraceError as error:
+                return replace(base, reason=str(error))
+            if value is None:
+                return replace(base, reason=self._not_recorded(run, output, topic))
+            values.append(value)
+        if len(values) == 1 and kind == OutputKind.EXCEPTION:
+            lines = str(values[0]).strip().splitlines() or [""]
+            return replace(base, preview=shortened(printable(lines[-1]), _EXCEPTION_MAX))
+        if len(values) == 1:
+            return replace(base, preview=preview(values[0]))
+        fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
+        if not fields and self._options.ignore:
+            reason = "all fields that differ are ignored"
+        elif not fields:
+            reason = "its fields are equal, but what the recorder hashed of it is not"
+        return replace(base, fields=fields, more_fields=more, reason=reason)
+
+    def _decoded(self, run: Run, row: OutputRow) -> object | None:
+        """Return the decoded payload of an output (a text for a detail), None if not recorded."""
+        kind, number, content, sequence = row
+        if sequence == NO_SEQUENCE:
+            return None
+        trace = run.trace
+        entity = _entity_id(run, number)
+        output = Output(0, entity, OutputKind(kind), content, sequence)
+        if kind not in _WITH_PAYLOAD:
+            return trace.detail(output)
+        channel = trace.channel_of(output)
+        found = trace.payload(output)
+        if channel is None or found is None or channel.topic == TOPIC_DETAILS:
+            return None
+        return trace.decode(channel, found[2])
+
+    def _not_recorded(self, run: Run, row: OutputRow, topic: str) -> str:
+        if row[0] not in _WITH_PAYLOAD:
+            return "nothing more than its hash is recorded"
+        where = "b" if run.of_b else "a"
+        return (
+            f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
+            f"and a topic glob that matches {topic} (record: in the job)"
+        )
+
+
+def _topic(kind: int, key: EntityKey) -> str:
+    """Return the topic of an output with a payload; of others what they are."""
+    if kind == OutputKind.LOG:
+        return TOPIC_ROSOUT
+    if kind in _WITH_PAYLOAD:
+        return key.name
+    return drawn_for(key) if kind == OutputKind.DRAW else output_text(kind, key.name, key.kind)
+
+
+def _is_published_input(view: EventView) -> bool:
+    """Return whether an event publishes what it got from outside: a bag's message, a driver's."""
+    if view.kind is EventKind.OUTSIDE:
+        return view.entity.kind == EntityKind.PUBLISHER.label
+    return view.kind is EventKind.BAG
+
+
+def _entity_id(run: Run, number: int) -> int:
+    table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
+    return int((table == number).nonzero()[0][0])

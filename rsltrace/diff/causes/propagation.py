@@ -1,0 +1,339 @@
+"""What follows from what: which of the differing events are consequences of an earlier one.
+
+An event that differs is a consequence if what caused it differs (the message it received, the
+event that made it) or if its node did something different before, since nobody sees into the state
+of a node. What is neither is a divergence of its own. Every consequence remembers what it follows
+from, so that the way back to the root can be told.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+
+from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
+from rsltrace.diff.alignment.rows import CONSTRUCT, SHUTDOWN, OutputRow, Rows
+from rsltrace.model.event import NO_EVENT, OutputKind
+
+CAUSE = "cause"
+NODE = "node"
+REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
+
+UNDECIDED = -1
+_DRAW = int(OutputKind.DRAW)
+
+_REMEMBERED_MAX = 50_000
+_DEPTH_MAX = 100
+"""Steps of a way back that are kept."""
+
+
+@dataclass(slots=True)
+class Origin:
+    """Why an event differs. ``root`` is the number of the divergence it follows from (or is), or
+    UNDECIDED until the end of the instant.
+
+    ``why`` is ``cause`` or ``node``, and ``previous`` the origin of the event it follows from that
+    way; None for a root. ``depth`` counts the steps back to it.
+    """
+
+    item: EventPair
+    root: int
+    why: str | None
+    previous: Origin | None
+    depth: int = 0
+
+
+@dataclass(slots=True)
+class FoundDivergence:
+    """A divergence before it is put in words.
+
+    ``place_a`` and ``place_b`` say where it stands in runs that have no such event. ``reached``
+    holds for each publisher, client or service: first stamp, number of messages. ``cause_only`` is
+    set where nothing but the cause differs. ``swapped`` are the entities that changed places.
+    """
+
+    origin: Origin
+    stamp: int
+    place_a: int
+    place_b: int
+    reached: dict[int, tuple[int, int]] = field(default_factory=dict)
+    cause_only: bool = False
+    swapped: frozenset[int] = frozenset()
+
+
+class Propagation:
+    """Takes blocks in order and sorts differing events into roots and consequences.
+
+    ``found`` are the roots, in order. ``watched`` is the first consequence for which ``watch``
+    (a function of item and block) is true.
+    """
+
+    def __init__(self, watch: Callable[[EventPair, AlignedBlock], bool] | None = None) -> None:
+        self.found: list[FoundDivergence] = []
+        self.watched: FoundDivergence | None = None
+        self._watch = watch
+        self._owners: dict[int, Origin] = {}
+        self._origins_a: dict[int, Origin] = {}
+        self._origins_b: dict[int, Origin] = {}
+        self._block: AlignedBlock
+        self._moment: list[Origin] = []
+        self._moment_stamp = -1
+        self._inverted_in: dict[int, int] = {}
+
+    def origin_of(self, item: EventPair) -> Origin | None:
+        """Return why an item differs, if it does."""
+        return self._origins_a.get(item.a) or self._origins_b.get(item.b)
+
+    def take(self, block: AlignedBlock, first: EventPair | None = None) -> None:
+        """Go through a block. ``first``, if given, is the divergence the search has found: it
+        is a root whatever else there is, and comes before everything."""
+        self._block = block
+        if first is not None:
+            self._seed(first)
+        for item in block.items:
+            if not item.plain and not item.beyond and self.origin_of(item) is None:
+                self._take_item(item)
+        self._end_moment()
+        self._forget(block)
+
+    def _seed(self, first: EventPair) -> None:
+        found = self._root(first)
+        found.cause_only = first.plain
+        if first.plain:
+            return
+        self._moment_stamp = found.stamp
+        self._spread(first, found.origin)
+        if first.inverted:
+            # All that changed places at this instant is one divergence, and so is what follows.
+            found.place_a = found.place_b = min(first.a, first.b)
+            swapped = [
+                item
+                for item in self._block.items
+                if item.inverted and self._block.stamp(item) == found.stamp
+            ]
+            found.swapped = self._entities(swapped)
+            for item in swapped:
+                if item is not first:
+                    why, previous = self._explanation(item)
+                    self._consequence(item, why, previous or found.origin)
+
+    # -- one event -----------------------------------------------------------------------------
+
+    def _take_item(self, item: EventPair) -> None:
+        rows, index = self._rows(item)
+        place = index - rows.first
+        if rows.stamp[place] != self._moment_stamp:
+            self._end_moment()
+            self._moment_stamp = rows.stamp[place]
+        why, previous = self._explanation(item)
+        if previous is not None and previous.root == UNDECIDED and not item.same:
+            self._end_moment()
+            why, previous = self._explanation(item)
+        if previous is not None and previous.root != UNDECIDED:
+            self._consequence(item, why, previous)
+        elif item.same:
+            # It only changed places: with whom, and whether that was due to something, is known
+            # when the instant is over.
+            origin = Origin(item, UNDECIDED, why, previous)
+            self._moment.append(origin)
+            self._remember(item, origin)
+        elif rows.kind[place] != SHUTDOWN:  # when the run ends is said elsewhere
+            self._spread(item, self._root(item).origin)
+
+    def _consequence(self, item: EventPair, why: str | None, previous: Origin) -> None:
+        depth = previous.depth + 1
+        if depth > _DEPTH_MAX:  # lets go of what lies further back
+            why, previous, depth = None, self.found[previous.root].origin, 1
+        origin = Origin(item, previous.root, why, previous, depth)
+        self._remember(item, origin)
+        self._spread(item, origin)
+        if self._watch is not None and self.watched is None and self._watch(item, self._block):
+            self.watched = FoundDivergence(origin, self._block.stamp(item), *self._places(item))
+
+    def _rows(self, item: EventPair) -> tuple[Rows, int]:
+        if item.a >= 0:
+            return self._block.rows_a, item.a
+        return self._block.rows_b, item.b
+
+    def _entities(self, items: list[EventPair]) -> frozenset[int]:
+        rows = self._block.rows_a
+        return frozenset(rows.number[item.a - rows.first] for item in items)
+
+    def _root(self, item: EventPair) -> FoundDivergence:
+        origin = Origin(item, len(self.found), None, None)
+        place_a, place_b = self._places(item)
+        found = FoundDivergence(origin, self._block.stamp(item), place_a, place_b)
+        self.found.append(found)
+        self._remember(item, origin)
+        return found
+
+    def _places(self, item: EventPair) -> tuple[int, int]:
+        """Return the indexes of an item; where it is missing, of what follows it there."""
+        block = self._block
+        if item.a >= 0 and item.b >= 0:
+            return item.a, item.b
+        position = next(i for i, other in enumerate(block.items) if other is item)
+        for other in block.items[position + 1 :]:
+            if item.a < 0 and other.a >= 0:
+                return other.a, item.b
+            if item.b < 0 and other.b >= 0:
+                return item.a, other.b
+        return (block.end_a, item.b) if item.a < 0 else (item.a, block.end_b)
+
+    def _remember(self, item: EventPair, origin: Origin) -> None:
+        if item.a >= 0:
+            self._origins_a[item.a] = origin
+        if item.b >= 0:
+            self._origins_b[item.b] = origin
+
+    def _forget(self, block: AlignedBlock) -> None:
+        """Drop what lies before this block: a run that never agrees again has millions."""
+        if len(self._origins_a) + len(self._origins_b) > _REMEMBERED_MAX:
+            first_a, first_b = block.rows_a.first, block.rows_b.first
+            self._origins_a = {i: origin for i, origin in self._origins_a.items() if i >= first_a}
+            self._origins_b = {i: origin for i, origin in self._origins_b.items() if i >= first_b}
+
+    def _end_moment(self) -> None:
+        """Decide on what only changed places at the last instant, now that all of it is known."""
+        moment, self._moment = self._moment, []
+        self._inverted_in.clear()
+        if not moment:
+            return
+        # Those that only changed places with a consequence were passed by it and did nothing.
+        copies = [EventPair(origin.item.a, origin.item.b, True) for origin in moment]
+        mark_inverted(copies)
+        still = {copy.a: copy.b for copy in copies if copy.inverted}
+        swapped = self._entities([origin.item for origin in moment if origin.item.a in still])
+        # What decides between two that are due at once decides every time: that is one divergence.
+        root = next((found for found in self.found if swapped and swapped <= found.swapped), None)
+        for origin in moment:
+            item = origin.item
+            self._origins_a.pop(item.a, None)
+            self._origins_b.pop(item.b, None)
+            if item.a not in still:
+                continue
+            if root is None:
+                root = self._root(item)
+                root.place_a, root.place_b = min(still), min(still.values())
+                root.swapped = swapped
+                self._spread(item, root.origin)
+            else:
+                known = origin.previous and self.origin_of(origin.previous.item)
+                self._consequence(item, origin.why if known else None, known or root.origin)
+
+    # -- why -------------------------------------------------------------------------------------
+
+    def _explanation(self, item: EventPair) -> tuple[str | None, Origin | None]:
+        """Return what an item follows from: ``cause`` or ``node``, and the origin of that."""
+        a, b = self._block.rows_a, self._block.rows_b
+        rows, index = self._rows(item)
+        place = index - rows.first
+        by_node = None if rows.kind[place] == CONSTRUCT else self._owners.get(rows.owner[place])
+        if item.a >= 0 and item.b >= 0 and not item.inverted:
+            i, j = item.a - a.first, item.b - b.first
+            if a.input[i] == b.input[j] and a.stamp[i] == b.stamp[j]:
+                return (NODE, by_node) if by_node is not None else (None, None)
+        for side, origins, at in ((a, self._origins_a, item.a), (b, self._origins_b, item.b)):
+            if at < 0:
+                continue
+            cause = side.cause[at - side.first]
+            origin = origins.get(cause) if cause != NO_EVENT else None
+            if origin is not None and self._passes_on(origin, side, at, item):
+                return CAUSE, origin
+        return (NODE, by_node) if by_node is not None else (None, None)
+
+    def _passes_on(self, origin: Origin, rows: Rows, at: int, item: EventPair) -> bool:
+        """Whether the difference of a cause is one that the event it caused can have got.
+
+        A message that is the same may still have had another delay.
+        """
+        cause = origin.item
+        if cause.a < 0 or cause.b < 0:
+            return True
+        a, b = self._block.rows_a, self._block.rows_b
+        if not a.first <= cause.a < a.end or not b.first <= cause.b < b.end:
+            return True  # of an earlier block: not looked at again
+        if a.stamp[cause.a - a.first] != b.stamp[cause.b - b.first]:
+            return True
+        if item.inverted and cause.inverted:
+            return True
+        nth = rows.cause_output[at - rows.first]
+        mine, theirs = (cause.a, cause.b) if rows is a else (cause.b, cause.a)
+        other = b if rows is a else a
+        outputs = rows.outputs(mine)
+        if nth >= len(outputs):
+            return True
+        receiver = rows.number[at - rows.first]
+        if any(o[:2] == (_DRAW, receiver) for o in self._different_outputs(cause)):
+            return True
+        # Of equal outputs, the second has a counterpart only if the other run sent two.
+        sent = outputs[nth][:3]
+        before = sum(output[:3] == sent for output in outputs[: nth + 1])
+        return before > sum(output[:3] == sent for output in other.outputs(theirs))
+
+    # -- what follows ----------------------------------------------------------------------------
+
+    def _spread(self, item: EventPair, origin: Origin) -> None:
+        """Note whom a differing event reaches: its node, and the topics of what it sent."""
+        rows, index = self._rows(item)
+        place = index - rows.first
+        owner = rows.owner[place]
+        if item.same:
+            # Changed places: its node notices only if it got two things in another order.
+            self._inverted_in[owner] = self._inverted_in.get(owner, 0) + 1
+            if self._inverted_in[owner] >= 2:
+                self._taint(owner, origin)
+            return
+        outputs = self._different_outputs(item)
+        nodes = rows.run.matching.nodes
+        if not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
+            # What chance decides on the way leaves the sender as it was; its own clock does not.
+            self._taint(owner, origin)
+        found = self.found[origin.root]
+        stamp = self._block.stamp(item)
+        for kind, number, _, _ in outputs:
+            if kind == OutputKind.ENTITY:  # the node may be one that only this run has
+                self._taint(rows.run.matching.nodes[number], origin)
+            elif kind in REACHING:
+                first, count = found.reached.get(number, (stamp, 0))
+                found.reached[number] = (min(first, stamp), count + 1)
+
+    def _taint(self, owner: int, origin: Origin) -> None:
+        if owner:
+            self._owners.setdefault(owner, origin)
+
+    def _different_outputs(self, item: EventPair) -> list[OutputRow]:
+        """Return the outputs that only one run has; for a change, the one of a."""
+        a, b = self._block.rows_a, self._block.rows_b
+        mine = a.outputs(item.a) if item.a >= 0 else []
+        theirs = b.outputs(item.b) if item.b >= 0 else []
+        return different_outputs(mine, theirs)
+
+
+def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:
+    """Return the outputs that only one side has; where one changed into another of the same
+    sender, that of ``a``. The order does not matter."""
+    if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
+        return []
+    if len(a) == 1 == len(b):  # as most events: counting would take ten times as long
+        return [*a] if a[0][:2] == b[0][:2] else [*a, *b]
+    theirs = Counter(output[:3] for output in b)
+    mine = Counter(output[:3] for output in a)
+    result = list(_beyond(a, theirs))
+    changed = Counter(output[:2] for output in result)
+    for output in _beyond(b, mine):
+        if changed[output[:2]] > 0:
+            changed[output[:2]] -= 1
+        else:
+            result.append(output)
+    return result
+
+
+def _beyond(outputs: list[OutputRow], others: Counter[tuple[int, int, int]]) -> Iterator[OutputRow]:
+    """Yield the outputs of which the others have fewer."""
+    left = Counter(others)
+    for output in outputs:
+        left[output[:3]] -= 1
+        if left[output[:3]] < 0:
+            yield output

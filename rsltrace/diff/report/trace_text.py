@@ -1,0 +1,162 @@
+"""The report of two traces as a person reads it: verdict first, on one screen."""
+
+from __future__ import annotations
+
+from itertools import takewhile
+
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
+from rsltrace.diff.report.frame import head_lines, next_section, notes_section
+from rsltrace.diff.report.line import (
+    BAD,
+    BLANK,
+    FAINT,
+    HEIGHT,
+    NOTHING,
+    SIDE_A,
+    SIDE_B,
+    TITLE,
+    Line,
+    Piece,
+    Section,
+    cut,
+    fitted,
+    in_columns,
+    line,
+    wrapped,
+)
+from rsltrace.diff.result.divergence import Divergence
+from rsltrace.diff.result.traces import Diff, Setting, Side
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_seconds
+from rsltrace.words.phrases import as_sentence
+
+_ALIKE_SHOWN = 12
+_ALL_HINT = "--all shows them"
+
+
+def trace_report(
+    diff: Diff, options: DiffOptions, width: int = 100, height: int = HEIGHT
+) -> list[Line]:
+    """Return the report of two traces, at most ``height`` lines unless ``options.everything``."""
+    head = _head(diff, width)
+    hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
+    # First what else to know of the comparison: that the jobs are different ones, or a file cut.
+    before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
+    if not diff.divergences:
+        return fitted(head, [before, _settings(diff, width)], None)
+    first, *others = diff.divergences
+    sections = [
+        before,
+        *divergence_sections(first, width, options),
+        _afterwards(diff, width),
+        _settings(diff, width),
+    ]
+    if not options.everything:
+        # Whoever asks for a longer context wants to see it.
+        height += 2 * max(options.context - CONTEXT, 0)
+        return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
+    lines = fitted(head, [*sections, _next(first, 0)], None)
+    for number, other in enumerate(others, start=2):
+        lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
+        lines += wrapped(as_sentence(other.sentence), width, style=BAD)
+        lines += fitted([], [*divergence_sections(other, width, options), _next(other, 0)], None)
+    return lines
+
+
+def _head(diff: Diff, width: int) -> list[Line]:
+    agree = f"the first {diff.agreeing} events agree"
+    if diff.agreeing < 2:
+        agree = "the first event agrees" if diff.agreeing else "no event before agrees"
+    verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
+    sides = [_facts(side) for side in (diff.a, diff.b)]
+    lines = head_lines(diff.sentence, sides, verdict, width, good=diff.identical)
+    return lines + ([] if diff.identical else _tolerance(diff, width))
+
+
+def _tolerance(diff: Diff, width: int) -> list[Line]:
+    if diff.tolerance is None:
+        return []
+    if diff.within_tolerance:
+        how = "but for what is ignored" if diff.tolerance.identical else "within tolerance"
+        text = f"equal {how}, not identical: the digests differ"
+    else:
+        said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)
+        text = f"not within tolerance: {said}"
+    return wrapped(f"  {text}", width, style=TITLE, indent="    ")
+
+
+def _facts(side: Side) -> list[Piece]:
+    ended = side.stop_reason or ("" if side.complete else "interrupted")
+    return [
+        (printable(side.path), ""),
+        (f"{side.events} events", ""),
+        (f"{format_seconds(side.end_ns)} s", ""),
+        (f"digest {side.digest}", ""),
+        (printable(ended), FAINT),
+    ]
+
+
+def _afterwards(diff: Diff, width: int) -> Section:
+    if not diff.counts:
+        return NOTHING
+    total = [
+        sum(getattr(count, name) for count in diff.counts)
+        for name in ("matching", "differing", "only_a", "only_b")
+    ]
+    text = (
+        f"from there to event {diff.aligned_to[0]} of a and {diff.aligned_to[1]} of b: "
+        f"{total[0]} events match, {total[1]} differ, {total[2]} only in a, {total[3]} only in b"
+    )
+    if diff.resync_index is not None:
+        a, b = diff.resync_index
+        text += f"; they agree again from event {a} of a, {b} of b on"
+    rows = wrapped(text, width, indent="  ")
+    least = len(rows)
+    worst = sorted(diff.counts, key=lambda c: c.differing + c.only_a + c.only_b, reverse=True)
+    for count in worst:
+        diverged = count.differing + count.only_a + count.only_b
+        if diverged:
+            of = diverged + count.matching
+            rows.append(cut(line(f"  {diverged} of {of}  {printable(str(count.entity))}"), width))
+    return Section((), rows, least, "entities", least)
+
+
+def _settings(diff: Diff, width: int) -> Section:
+    if not diff.settings:
+        return NOTHING
+    room = max((width - 40) // 2, 16)
+    rows = in_columns(
+        [
+            [
+                (printable(str(setting)), ""),
+                (a, SIDE_A),
+                ("|", FAINT),
+                (b, SIDE_B),
+            ]
+            for setting in diff.settings
+            for a, b in [_values(setting, room)]
+        ],
+        widest=max(room, 34),
+    )
+    title: Piece = ("job and environment differ", TITLE)
+    if len(rows) == 1:
+        (row,) = rows
+        return Section((), [cut(line(title, ": ", *row[1:]), width)], 1, "settings")
+    return Section(line(title), rows, 2, "settings")
+
+
+def _values(setting: Setting, room: int) -> tuple[str, str]:
+    """Return both values in ``room`` characters each: of long ones, what differs."""
+    a, b = ("-" if v is None else printable(v.strip()) for v in (setting.a, setting.b))
+    alike = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(a, b, strict=False)))
+    if max(len(a), len(b)) > room and alike > _ALIKE_SHOWN:
+        a, b = (f"…{text[alike - _ALIKE_SHOWN :]}" for text in (a, b))
+    return shortened(a, room), shortened(b, room)
+
+
+def _next(found: Divergence, others: int, *, hidden: bool = False) -> Section:
+    count = f"more than {others}" if hidden else str(others)
+    word = "divergence" if count == "1" else "divergences"
+    more = [f"{count} further independent {word}: {_ALL_HINT}"] if others else []
+    return next_section(found.next_step, *more)

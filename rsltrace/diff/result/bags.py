@@ -1,0 +1,153 @@
+"""What a diff of two recordings says: frozen values that the comparison fills and reports print.
+
+``a`` is always the first recording given, ``b`` the second. Log times are integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
+from rsltrace.diff.result.fields import FieldDifference
+
+
+class BagVerdict(Enum):
+    """How two recordings compare. The set is closed; ``BagDiff.sentence`` puts it in words."""
+
+    EQUAL = "equal"
+    WITHIN_TOLERANCE = "equal-within-tolerance"
+    DIFFERENT = "different"
+
+
+class Presence(Enum):
+    """Which of the recordings a message is in."""
+
+    BOTH = "both"
+    ONLY_A = "only a"
+    ONLY_B = "only b"
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """One of the two sides. ``kind`` is ``mcap``, ``sqlite3`` or ``trace``.
+
+    ``complete`` is false for a file that was cut off and read as far as it goes.
+    """
+
+    path: str
+    kind: str
+    topics: int
+    messages: int
+    start_ns: int
+    end_ns: int
+    complete: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class BagMessage:
+    """A message of a topic: its number there, counted from 0, its log time, and what it says."""
+
+    index: int
+    stamp_ns: int
+    preview: str
+
+
+@dataclass(frozen=True, slots=True)
+class MessageDivergence:
+    """The first message of a topic that differs, is missing or is extra.
+
+    ``a`` or ``b`` is None where that side has no counterpart. ``after_ns`` is how long after the
+    start of its recording the message was logged. ``before`` are the last messages of the topic
+    before it (in a, or in b where a has none). ``fields`` and ``more_fields`` say what differs;
+    ``reason`` why nothing can be said.
+    """
+
+    topic: str
+    type: str
+    presence: Presence
+    a: BagMessage | None
+    b: BagMessage | None
+    after_ns: int
+    fields: tuple[FieldDifference, ...] = ()
+    more_fields: int = 0
+    reason: str = ""
+    before: tuple[BagMessage, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class TopicDiff:
+    """How the messages of one topic compare; ``first`` is None if nothing but tolerance is between.
+
+    ``equal`` messages are the same bit for bit in every field that is compared, ``tolerated`` ones
+    within tolerance. The four other counts never include these. ``type_b`` differs from ``type_a``
+    only where the recordings disagree about the topic's type.
+    """
+
+    topic: str
+    type_a: str
+    type_b: str
+    equal: int
+    tolerated: int
+    differing: int
+    only_a: int
+    only_b: int
+    first: MessageDivergence | None = None
+
+    @property
+    def diverged(self) -> bool:
+        """Whether some message differs, is missing or is extra."""
+        return bool(self.differing or self.only_a or self.only_b)
+
+
+@dataclass(frozen=True, slots=True)
+class LoneTopic:
+    """A topic that only one side has."""
+
+    topic: str
+    type: str
+    messages: int
+
+
+@dataclass(frozen=True, slots=True)
+class BagDiff:
+    """The answer for two recordings. ``exit_code``: 0 equal, 1 different, 3 within tolerance.
+
+    ``topics`` are those that both sides have, in the order of a; ``first`` is the earliest
+    divergence of all of them, counted from the start of each recording (with ``--by stamp``: by
+    the log time).
+    """
+
+    a: Recording
+    b: Recording
+    verdict: BagVerdict
+    sentence: str
+    by: str
+    topics: tuple[TopicDiff, ...] = ()
+    topics_only_a: tuple[LoneTopic, ...] = ()
+    topics_only_b: tuple[LoneTopic, ...] = ()
+    first: MessageDivergence | None = None
+    next_step: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def identical(self) -> bool:
+        """Whether every message is the same, no tolerance needed."""
+        return self.verdict is BagVerdict.EQUAL
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether messages differ, but none by more than is tolerated."""
+        return self.verdict is BagVerdict.WITHIN_TOLERANCE
+
+    @property
+    def diverged(self) -> bool:
+        """Whether some message differs by more than is tolerated, is missing or is extra."""
+        return self.verdict is BagVerdict.DIFFERENT
+
+    @property
+    def exit_code(self) -> int:
+        """0 equal, 1 different, 3 equal within tolerance; trouble is raised instead."""
+        if self.diverged:
+            return EXIT_DIVERGED
+        return EXIT_WITHIN_TOLERANCE if self.within_tolerance else 0

@@ -1,0 +1,104 @@
+"""What a diff of two traces says. A report prints it without opening the files again.
+
+``a`` is always the first file given, ``b`` the second. Stamps are simulated nanoseconds, hashes
+unsigned 64-bit.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.divergence import Divergence, Verdict
+from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
+from rsltrace.words.entities import EntityKey
+
+
+@dataclass(frozen=True, slots=True)
+class EntityCount:
+    """How the events of one entity compare, over the part of the runs that was aligned."""
+
+    entity: EntityKey
+    matching: int
+    differing: int
+    only_a: int
+    only_b: int
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A difference outside of the events: keys of the job, versions, entities of the graph.
+
+    ``place`` is ``job.yaml:12``, ``job`` (of no line), ``environment: numpy``, ``entity``; ``key``
+    is that of a job as ``--set`` takes it, or empty. ``a``/``b`` are None where a side has nothing
+    there.
+    """
+
+    place: str
+    a: str | None
+    b: str | None
+    key: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.place}: {self.key}" if self.key else self.place
+
+
+@dataclass(frozen=True, slots=True)
+class Side:
+    """One of the two files."""
+
+    path: str
+    digest: str
+    events: int
+    end_ns: int
+    complete: bool
+    stop_reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Diff:
+    """The answer. ``exit_code``: 0 identical, 1 diverged, 3 equal within tolerance.
+
+    ``verdict`` and ``sentence`` are those of the first divergence. ``agreeing`` is how many events
+    are the same before it. ``settings`` lists what differs in job and environment. ``counts`` and
+    ``resync_index`` (indexes in a and b from which on the runs agree again, if they do) cover the
+    events from the divergence to ``aligned_to`` (indexes in a and b; all of both with ``--all``).
+    ``tolerance`` compares all messages of both runs, if tolerances were given and no event is
+    missing, extra or at another time; else it is None.
+    """
+
+    a: Side
+    b: Side
+    verdict: Verdict
+    sentence: str
+    agreeing: int
+    divergences: tuple[Divergence, ...] = ()
+    settings: tuple[Setting, ...] = ()
+    counts: tuple[EntityCount, ...] = ()
+    resync_index: tuple[int, int] | None = None
+    aligned_to: tuple[int, int] = (0, 0)
+    bytes_read: int = 0
+    notes: tuple[str, ...] = field(default=())
+    tolerance: BagDiff | None = None
+
+    @property
+    def identical(self) -> bool:
+        """Whether the two runs did the same."""
+        return self.verdict is Verdict.IDENTICAL
+
+    @property
+    def within_tolerance(self) -> bool:
+        """Whether the runs are not identical, but every message is within what is tolerated."""
+        return self.tolerance is not None and not self.tolerance.diverged
+
+    @property
+    def diverged(self) -> bool:
+        """Whether the runs did not do the same, and not even within tolerance."""
+        return self.exit_code == EXIT_DIVERGED
+
+    @property
+    def exit_code(self) -> int:
+        """0 identical, 1 diverged, 3 equal within tolerance; trouble is raised instead."""
+        if self.identical:
+            return 0
+        return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED

@@ -1,0 +1,51 @@
+"""The diff of two traces: find where they diverge, align what follows, say why.
+
+    first difference -> entities matched -> blocks aligned -> roots and consequences -> Diff
+
+Nothing is read of two identical runs but the ends of their files, and of others only what lies
+around the divergence, unless everything is asked for.
+"""
+
+from __future__ import annotations
+
+from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.divergence import Verdict
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.trace.reader import Trace
+
+
+def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
+    """Compare two runs. ``a`` and ``b`` stay open; the result needs them no more.
+
+    Raises TraceError where a part that has to be read is damaged.
+    """
+    start = first_difference(a, b)
+    if start is None:
+        return _identical(a, b)
+    # Most runs are compared in the hope that they are identical: those load no more than this.
+    from rsltrace.diff.traces.comparison import compare
+
+    return compare(a, b, start, options or DiffOptions())
+
+
+def _identical(a: Trace, b: Trace) -> Diff:
+    notes = []
+    for what in ("stop_reason", "exit_code"):
+        ended_a, ended_b = a.result.get(what), b.result.get(what)
+        if a.complete and b.complete and ended_a != ended_b:
+            notes.append(f"{what.replace('_', ' ')}: {ended_a} in a, {ended_b} in b")
+    events = a.event_count
+    # Of two files without an end nobody knows what the runs did after it.
+    as_far = "" if a.complete or b.complete else "as far as both recordings go, "
+    return Diff(
+        a=side(a),
+        b=side(b),
+        verdict=Verdict.IDENTICAL,
+        sentence=f"{as_far}the two runs are identical: {events} events, digest {a.digest}",
+        agreeing=events,
+        aligned_to=(events, events),
+        bytes_read=a.bytes_read + b.bytes_read,
+        notes=(*interruptions(a, b), *notes),
+    )

@@ -1,1 +1,0 @@
-"""Why two traces diverge: causes, verdicts, evidence, settings."""

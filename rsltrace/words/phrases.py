@@ -1,0 +1,57 @@
+"""Events as titles and as parts of sentences."""
+
+from __future__ import annotations
+
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_seconds
+from rsltrace.words.entities import EntityKey
+
+
+def event_title(kind: EventKind, entity: EntityKey) -> str:
+    """Return ``/filter: subscription /scan``, with what else ran: ``/filter: … (resume)``."""
+    text = printable(str(entity)).rstrip()
+    word = kind.label.replace("_", " ")
+    return text if word in text else f"{text} ({word})"
+
+
+def event_phrase(kind: EventKind, entity: EntityKey) -> str:
+    """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
+    name = entity.name
+    if kind is EventKind.CONSTRUCT:
+        return f"the constructor of {name}" if name else "the construction"
+    if kind is EventKind.BAG:
+        return f"the bag's message on {name}"
+    if kind is EventKind.OUTSIDE:
+        published = entity.kind == EntityKind.PUBLISHER.label
+        return f"the message from outside on {name}" if published else "what outside did"
+    if kind is EventKind.SHUTDOWN:
+        return f"the end of {name or 'the run'}"
+    if kind is EventKind.CLOCK_JUMP:
+        return "the jump of the clock to the start"
+    number = f" (number {entity.ordinal + 1} of that name)" if entity.ordinal else ""
+    what = kind.label.replace("_", " ")
+    if kind is EventKind.CLIENT:
+        what = "the response of"
+    elif kind in (EventKind.TASK, EventKind.RESUME):
+        what = f"{'a task' if kind is EventKind.TASK else 'a resumed task'} of {entity.kind}"
+    return f"{what} {name}{number} of {entity.node or 'the run'}"
+
+
+def seconds_text(stamp_ns: int) -> str:
+    """Return a time in seconds without the zeros at its end: ``1.5``, ``2.0``."""
+    text = format_seconds(stamp_ns).rstrip("0")
+    return f"{text}0" if text.endswith(".") else text
+
+
+def at_time(stamp_ns: int) -> str:
+    """Return a time as part of a sentence: ``at 1.5 s``."""
+    return f"at {seconds_text(stamp_ns)} s"
+
+
+def as_sentence(text: str) -> str:
+    """Return a text with a capital and a full stop, whoever made it."""
+    text = printable(text).strip()
+    text = text[:1].upper() + text[1:]
+    return text if text.endswith((".", "!", "?")) else f"{text}."

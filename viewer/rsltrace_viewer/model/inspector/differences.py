@@ -1,0 +1,238 @@
+"""A pair of events of two runs as lines: what differs, field by field, and where it came from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rsltrace.diff.causes.event_views import EventViews
+from rsltrace.diff.causes.message_differences import message_differences
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report.differences import distance_text
+from rsltrace.diff.result.divergence import (
+    ENDED_BY_EXCEPTION,
+    Divergence,
+    MessageDifference,
+)
+from rsltrace.diff.result.events import EventView
+from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.errors import TraceError
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.words.entities import RUN_NAME
+from rsltrace.words.kinds import SHORT_KINDS
+from rsltrace_viewer.model.comparison import Comparison
+from rsltrace_viewer.model.inspector.effects import Effects
+from rsltrace_viewer.model.inspector.event import event_link, inspect
+from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
+from rsltrace_viewer.model.inspector.states import (
+    differing_call_lines,
+    differing_state_lines,
+)
+from rsltrace_viewer.model.view import Sign
+
+_SAYS = {
+    Sign.MATCH: "the same in both runs",
+    Sign.DIFFERS: "differs",
+    Sign.ONLY_A: "in run a only",
+    Sign.ONLY_B: "in run b only",
+    Sign.MOVED: "the same, at another time or place in the order",
+    Sign.UNKNOWN: "not compared (beyond what was matched)",
+}
+_FIRST_SHOWN = 3
+
+
+def pair_lines(
+    comparison: Comparison, place: int, openness: Openness, effects: Effects | None = None
+) -> list[Line]:
+    """Return the lines of the inspector for a place of two runs. ``effects`` are those of the
+    event in run a, or in run b if it is there only."""
+    a, b = comparison.a(place), comparison.b(place)
+    sign = comparison.sign(place)
+    lines = list(_title(comparison, place, a, b, sign))
+    try:
+        first = place == comparison.first_place
+        if first:  # the reason comes first: in a small terminal little else fits
+            lines += _why(comparison)
+        if sign not in (Sign.MATCH, Sign.UNKNOWN):
+            lines += _difference_lines(comparison, a, b, openness, first=first)
+        if first and comparison.diff is not None and comparison.diff.divergences:
+            lines += chain_lines(comparison, comparison.diff.divergences[0])
+        if sign not in (Sign.MATCH, Sign.UNKNOWN):
+            lines += _cause_lines(comparison, a, b)
+    except TraceError as error:
+        lines.append(Line(0, "", printable(str(error)), Role.ERROR, "diff.error"))
+    for run, index, name in ((comparison.run_a, a, "a"), (comparison.run_b, b, "b")):
+        if index is None or (name == "b" and a is not None and sign is Sign.MATCH):
+            continue
+        words = f"run {name}" if sign is not Sign.MATCH else "both runs"
+        # Where they agree there is nothing better to show than the event itself.
+        is_open = openness.is_open(f"run{name}", sign is Sign.MATCH)
+        lines.append(Line(0, words, f"event {index}", Role.SECTION, f"run{name}", is_open))
+        if is_open:
+            said = {"event", "event.at"} if sign is Sign.MATCH else {"event"}
+            own = name == "a" or a is None
+            if not own:
+                said.add("effects")  # nobody looks for these; run a's are shown
+            inner = (
+                line
+                for line in inspect(run, index, openness, effects if own else None)
+                if line.path not in said
+            )
+            lines += [_of_run(line, other=name == "b") for line in inner]
+    return lines
+
+
+def _of_run(line: Line, *, other: bool) -> Line:
+    return Line(
+        line.depth, line.label, line.value, line.role, line.path, line.open, line.link, other
+    )
+
+
+def _title(
+    comparison: Comparison, place: int, a: int | None, b: int | None, sign: Sign
+) -> Iterator[Line]:
+    view = _view(comparison, a, b)
+    entity = f"{view.entity.node or RUN_NAME}  {view.kind.label} {view.entity.name}"
+    number = str(a if a is not None else b)
+    if a is not None and b is not None and a != b:
+        number = f"{a} / {b}"
+    yield Line(0, f"event {number}", printable(entity), Role.SECTION, "event")
+    role = Role.SAME if sign in (Sign.MATCH, Sign.UNKNOWN) else Role.DIFFERENCE
+    yield Line(1, sign.value, _SAYS[sign], role, "event.sign")
+    stamps = [
+        run.stamp(index)
+        for run, index in ((comparison.run_a, a), (comparison.run_b, b))
+        if index is not None
+    ]
+    if len(set(stamps)) == 1:
+        yield Line(1, "at", f"{format_seconds(stamps[0])} s", Role.FIELD, "event.at")
+    else:
+        later = format_duration(abs(stamps[1] - stamps[0]))
+        which = "later" if stamps[1] > stamps[0] else "earlier"
+        text = (
+            f"{format_seconds(stamps[0])} s / {format_seconds(stamps[1])} s (b is {later} {which})"
+        )
+        yield Line(1, "at", text, Role.DIFFERENCE, "event.at")
+
+
+def _view(comparison: Comparison, a: int | None, b: int | None) -> EventView:
+    if a is not None:
+        return EventViews(comparison.diff_run_a).view(a)
+    assert b is not None  # a place stands for something
+    return EventViews(comparison.diff_run_b).view(b)
+
+
+def _why(comparison: Comparison) -> Iterator[Line]:
+    """Yield the reason of the first divergence, as the diff has it."""
+    if comparison.diff is None:
+        yield Line(1, "why", "looking for the cause …", Role.NOTE, "why")
+    elif comparison.diff.divergences:
+        divergence = comparison.diff.divergences[0]
+        sentence = divergence.root_sentence or divergence.sentence
+        yield Line(1, "why", printable(sentence), Role.NOTE, "why")
+        failed = [note for note in comparison.diff.notes if ENDED_BY_EXCEPTION in note]
+        for place, note in enumerate(failed):
+            yield Line(1, "!", printable(note), Role.ERROR, f"why.{place}")
+
+
+def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line]:
+    """Yield the way from the root to a divergence as a tree of links, root first."""
+    if not divergence.chain:
+        return
+    yield Line(0, "cause chain", "root first", Role.SECTION, "chain")
+    for depth, step in enumerate(divergence.chain):
+        view = step.a or step.b
+        if view is None:
+            continue
+        other = step.a is None
+        sign = comparison.sign(comparison.place_of(view.index, other=other))
+        words = (
+            f"{view.index} {sign.value} {view.entity.node or RUN_NAME} {SHORT_KINDS[view.kind]} "
+        )
+        text = f"{words}{view.entity.name}"
+        if step.relation:
+            text += f", {step.relation}"
+        yield Line(
+            1 + depth,
+            "└" if depth else "●",
+            printable(text),
+            Role.LINK,
+            f"chain.{depth}",
+            link=view.index,
+            other_run=other,
+        )
+
+
+def _difference_lines(
+    comparison: Comparison, a: int | None, b: int | None, openness: Openness, *, first: bool
+) -> Iterator[Line]:
+    runs = comparison.diff_run_a, comparison.diff_run_b
+    view_a = EventViews(runs[0]).view(a) if a is not None else None
+    view_b = EventViews(runs[1]).view(b) if b is not None else None
+    found = message_differences(*runs, view_a, view_b, DiffOptions())
+    divergences = comparison.diff.divergences if first and comparison.diff is not None else ()
+    known = divergences[0] if divergences else None
+    beside = list(differing_state_lines(runs, (view_a, view_b), known, openness))
+    if known is not None:
+        beside += differing_call_lines(known.calls)
+    if not found and not beside:
+        yield Line(0, "messages", "the same in both", Role.SECTION, "diff")
+    for place, message in enumerate(found):
+        yield from message_difference_lines(message, f"diff.{place}", openness)
+    yield from beside
+
+
+def message_difference_lines(
+    message: MessageDifference, path: str, openness: Openness
+) -> Iterator[Line]:
+    """Yield a message in which two events differ, with its fields."""
+    what = "input" if message.position < 0 else f"output {message.position}"
+    presence = "" if message.presence == "both" else f", {message.presence}"
+    is_open = openness.is_open(path, True)
+    title = printable(f"{message.topic}  {message.type}{presence}").rstrip()
+    yield Line(0, f"≠ {what}", title, Role.SECTION, path, is_open)
+    if not is_open:
+        return
+    if message.reason:
+        yield Line(1, "", printable(message.reason), Role.NOTE, f"{path}.reason")
+    if message.preview:
+        yield Line(1, "", printable(message.preview), Role.FIELD, f"{path}.preview")
+    for number, difference in enumerate(message.fields):
+        yield from _field_lines(difference, f"{path}.{number}")
+    if message.more_fields:
+        text = f"… and {message.more_fields} more fields"
+        yield Line(1, "", text, Role.NOTE, f"{path}.more")
+
+
+def _field_lines(field: FieldDifference, path: str) -> Iterator[Line]:
+    yield Line(1, "", printable(field.path), Role.DIFFERENCE, path)
+    if field.elements is None or not field.first:
+        yield Line(2, "a", printable(field.a), Role.FIELD, f"{path}.a")
+        yield Line(2, "b", printable(field.b), Role.FIELD, f"{path}.b")
+    else:
+        for place, a, b in field.first[:_FIRST_SHOWN]:
+            yield Line(2, f"[{place}]", printable(f"{a} | {b}"), Role.FIELD, f"{path}.{place}")
+    if distance := distance_text(field):
+        yield Line(2, "", distance, Role.NOTE, f"{path}.note")
+
+
+def _cause_lines(comparison: Comparison, a: int | None, b: int | None) -> Iterator[Line]:
+    shown = set()
+    yield Line(0, "cause", "", Role.SECTION, "cause")
+    for run, index, other in ((comparison.run_a, a, False), (comparison.run_b, b, True)):
+        if index is None:
+            continue
+        cause = int(run.row(index)["cause_event"])
+        if not 0 <= cause < run.count:
+            continue
+        place = comparison.place_of(cause, other=other)
+        if place in shown:
+            continue
+        shown.add(place)
+        sign = comparison.sign(place)
+        link = event_link(run, cause, f"cause.{'b' if other else 'a'}")
+        yield Line(
+            1, f"→ {sign.value}", link.value, Role.LINK, link.path, link=cause, other_run=other
+        )
+    if not shown:
+        yield Line(1, "", "no other event", Role.NOTE, "cause.none")

@@ -1,0 +1,122 @@
+"""The filter language: reading it, and saying where it is wrong.
+
+    node:/ekf kind:timer,sub time:1.5..2 -topic:/tf      all must hold; ``-`` turns one around
+    (level:warn or is:raised) text:"too far"             alternatives, brackets, quotes
+    plan                                                 a bare word: in names, logs, exceptions
+
+``docs/view.md`` explains the fields; ``query_fields`` has the list of them.
+"""
+
+from __future__ import annotations
+
+from rsltrace_viewer.model.query import conditions
+from rsltrace_viewer.model.query.conditions import Condition
+from rsltrace_viewer.model.query.fields import FIELDS, bare_word
+from rsltrace_viewer.model.query.tokens import QueryError, Token, tokens
+from rsltrace_viewer.model.run import Run
+
+
+def parse(text: str, run: Run) -> Condition | None:
+    """Return the condition that ``text`` stands for in a trace; None if it is empty.
+
+    Raises QueryError.
+    """
+    try:
+        return _Parser(text, run).whole()
+    except RecursionError:
+        raise QueryError("brackets and negations are nested too deeply", 0, len(text)) from None
+
+
+class _Parser:
+    """Reads ``or`` of ``and`` of terms, by recursive descent."""
+
+    def __init__(self, text: str, run: Run) -> None:
+        self._tokens = tokens(text)
+        self._length = len(text)
+        self._place = 0
+        self._run = run
+
+    def whole(self) -> Condition | None:
+        if not self._tokens:
+            return None
+        condition = self._alternatives()
+        token = self._peek()
+        if token is not None:
+            raise QueryError("there is no opening bracket for this", token.start, token.end)
+        return condition
+
+    def _peek(self) -> Token | None:
+        return self._tokens[self._place] if self._place < len(self._tokens) else None
+
+    def _alternatives(self) -> Condition:
+        parts = [self._conjunction()]
+        while (token := self._peek()) is not None and token.text.lower() == "or":
+            self._place += 1
+            parts.append(self._conjunction())
+        return parts[0] if len(parts) == 1 else conditions.Any(tuple(parts))
+
+    def _conjunction(self) -> Condition:
+        parts: list[Condition] = []
+        while (token := self._peek()) is not None and token.text.lower() not in ("or", ")"):
+            if token.text.lower() == "and":
+                self._place += 1
+                continue
+            parts.append(self._term())
+        if not parts:
+            token = self._peek()
+            start = token.start if token else self._length
+            raise QueryError("something to look for is missing here", start, start + 1)
+        parts.sort(key=_cost)
+        return parts[0] if len(parts) == 1 else conditions.All(tuple(parts))
+
+    def _term(self) -> Condition:
+        token = self._peek()
+        if token is None:
+            raise QueryError(
+                "something to look for is missing here", self._length, self._length + 1
+            )
+        self._place += 1
+        if token.text.lower() == "not" or token.text == "-":
+            return conditions.Not(self._term())
+        if token.text == "(":
+            inner = self._alternatives()
+            closing = self._peek()
+            if closing is None:
+                raise QueryError("this bracket is not closed", token.start, token.end)
+            self._place += 1
+            return inner
+        if token.text == ")":
+            raise QueryError("there is no opening bracket for this", token.start, token.end)
+        if token.text.startswith("-"):
+            return conditions.Not(self._condition(Token(token.text[1:], token.start + 1)))
+        return self._condition(token)
+
+    def _condition(self, token: Token) -> Condition:
+        name, colon, _ = token.text.partition(":")
+        if not colon or '"' in name or "/" in name:
+            return bare_word(self._run, token)
+        field = FIELDS.get(name.lower())
+        if field is None:
+            known = ", ".join(FIELDS)
+            raise QueryError(
+                f"there is no field {name!r}; there are {known}",
+                token.start,
+                token.start + len(name),
+            )
+        rest = Token(token.text[len(name) + 1 :], token.start + len(name) + 1)
+        if not rest.text:
+            raise QueryError(f"a value is missing after {name}:", rest.start, rest.start + 1)
+        return field.read(self._run, rest)
+
+
+def _cost(condition: Condition) -> int:
+    """Numbers first, then logs, then decoded messages."""
+    if isinstance(condition, conditions.EachEvent):
+        return 3
+    if isinstance(condition, conditions.WithOutput) and condition.accept is not None:
+        return 2
+    if isinstance(condition, conditions.Not):
+        return _cost(condition.inner)
+    if isinstance(condition, (conditions.All, conditions.Any)):
+        return max(map(_cost, condition.parts))
+    return 0 if isinstance(condition, conditions.Between) else 1

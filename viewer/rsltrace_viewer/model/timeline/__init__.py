@@ -1,0 +1,1 @@
+"""Rows of the timeline: what each says, and which columns fit."""

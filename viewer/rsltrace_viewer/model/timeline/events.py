@@ -1,0 +1,118 @@
+"""Events as rows of the timeline: each in words, at its full length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+from rsltrace.errors import TraceError
+from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
+from rsltrace.model.printable import printable, shortened
+from rsltrace.model.stamp import format_seconds
+from rsltrace.words.entities import RUN_NAME
+from rsltrace.words.kinds import SHORT_KINDS
+from rsltrace.words.logs import LEVEL_WARN, log_record
+from rsltrace_viewer.model.run import Run
+
+_ROWS_KEPT = 2048
+_SUMMARY_MAX = 400
+_NODE_WIDTH_MAX = 28
+
+
+@dataclass(frozen=True, slots=True)
+class EventText:
+    """One event in words, each at its full length."""
+
+    index: int
+    time: str
+    node: str
+    kind: str
+    entity: str
+    input_hash: str
+    output_hash: str
+    outputs: str
+    raised: bool
+    suspended: bool
+    warns: bool
+    """Whether it logged a warning or worse."""
+
+
+class EventTexts:
+    """Events of a run in words; what was shown last is kept."""
+
+    def __init__(self, run: Run) -> None:
+        self._run = run
+        self.of = lru_cache(maxsize=_ROWS_KEPT)(self._of)
+        self.index_width = max(len(str(max(run.count - 1, 0))), 5)
+        self.time_width = len(format_seconds(run.end_ns))
+        names = [run.node_name(e.id) for e in run.entities.values()]
+        self.node_width = min(max(map(len, names), default=5), _NODE_WIDTH_MAX)
+        entities = (_short(run.entity_name(e.id)) for e in run.entities.values())
+        self.names = {"node": set(names), "entity": set(entities)}
+        """What may stand in these columns."""
+
+    def _of(self, index: int) -> EventText:
+        """Return event ``index`` in words. Raises IndexError; damage is written into the row."""
+        try:
+            return self._readable(index)
+        except TraceError as error:
+            why = printable(f"unreadable: {error}")
+            return EventText(index, "", "", "", "", "", "", why, True, False, False)
+
+    def _readable(self, index: int) -> EventText:
+        run = self._run
+        event = run.event(index)
+        outputs = run.outputs(index) if event.outputs else []
+        logs = [
+            log_record(run.trace, output) for output in outputs if output.kind is OutputKind.LOG
+        ]
+        return EventText(
+            index=index,
+            time=format_seconds(event.stamp_ns),
+            node=node_of(run, event),
+            kind=SHORT_KINDS[event.kind],
+            entity=entity_of(run, event),
+            input_hash=f"{event.input_hash:016x}"[:6] if event.input_hash else "·",
+            output_hash=f"{event.output_hash:016x}"[:6] if event.output_hash else "·",
+            outputs=outputs_text(run, outputs),
+            raised=EventFlag.RAISED in event.flags,
+            suspended=EventFlag.SUSPENDED in event.flags,
+            warns=any(log is not None and log.level >= LEVEL_WARN for log in logs),
+        )
+
+
+def node_of(run: Run, event: Event) -> str:
+    """Return the node of an event; the node that a constructor made."""
+    outputs = run.outputs(event.index) if event.kind is EventKind.CONSTRUCT else ()
+    return run.words.node(event, outputs) or RUN_NAME
+
+
+def entity_of(run: Run, event: Event) -> str:
+    """Return the name of what ran, without what the kind says already."""
+    if event.entity == 0:
+        return "constructor" if event.kind is EventKind.CONSTRUCT else ""
+    return _short(run.entity_name(event.entity))
+
+
+def _short(name: str) -> str:
+    # Timers are named after their callback: `Class._on_timer`. The node says the class.
+    return name.rpartition(".")[2] if "." in name and not name.startswith("/") else name
+
+
+def event_text(run: Run, event: Event) -> str:
+    """Return an event in a few words: ``17  /ekf sub /odom``."""
+    kind = SHORT_KINDS[event.kind]
+    return f"{event.index}  {node_of(run, event)} {kind} {entity_of(run, event)}".rstrip()
+
+
+def outputs_text(run: Run, outputs: Sequence[Output], width: int = _SUMMARY_MAX) -> str:
+    """Return what an event did as one line."""
+    parts: list[str] = []
+    length = 0
+    for text in run.words.outputs(outputs):
+        parts.append(text)
+        length += len(text)
+        if length > width:
+            break
+    return shortened(", ".join(parts), width)

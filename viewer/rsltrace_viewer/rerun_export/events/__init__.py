@@ -1,0 +1,1 @@
+"""The events of a run: table, lanes, rates, log records."""

@@ -1,0 +1,339 @@
+"""The messages of a trace: Rerun's own loader reads them, this puts them in their place.
+
+What the loader draws (point clouds, images, transforms, grids, …) stays as it is, on our timelines
+and below our root. What it leaves as data stays as data, and is drawn and plotted besides.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk, McapReader
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.format import (
+    TOPIC_DETAILS,
+    TOPIC_ENTITIES,
+    TOPIC_EVENTS,
+    TOPIC_OUTPUTS,
+    TOPIC_ROSOUT,
+)
+from rsltrace.trace.reader import Trace
+from rsltrace_viewer.rerun_export.colours import colour
+from rsltrace_viewer.rerun_export.columns import (
+    EVENT,
+    SIM_TIME,
+    Clock,
+    Column,
+    lists,
+    make_chunk,
+)
+from rsltrace_viewer.rerun_export.frames import FrameTree
+from rsltrace_viewer.rerun_export.messages.fields import Curves, curves_of
+from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerRows
+from rsltrace_viewer.rerun_export.messages.rows import (
+    LoadedColumns,
+    Rows,
+    Stream,
+    Waiting,
+    loaded_chunk,
+    loaded_columns,
+)
+from rsltrace_viewer.rerun_export.messages.shapes import (
+    SHAPES,
+    Drawing,
+    Paint,
+    frames_of,
+    pose_drawing,
+)
+from rsltrace_viewer.rerun_export.messages.trails import Trails
+from rsltrace_viewer.rerun_export.messages.values import messages_of, numbers
+from rsltrace_viewer.rerun_export.moments import Moments
+from rsltrace_viewer.rerun_export.paths import Paths, join
+
+_OWN = (TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS, TOPIC_ROSOUT)
+_DECODERS = ("ros2msg", "ros2_reflection", "raw", "schema")
+"""``schema`` puts the type of a topic beside its messages. That also helps the viewer: without a
+static row at its entity, 0.41 does not draw a grid map."""
+_LOG_TIME = "message_log_time"
+_FRAME_TYPE = b"rerun.components.TransformFrameId"
+_MARKERS = ("visualization_msgs.msg.Marker", "visualization_msgs.msg.MarkerArray")
+_IMAGES = {"Image:buffer", "EncodedImage:blob", "DepthImage:buffer", "EncodedDepthImage:blob"}
+_SOLID = {"Points3D:positions", "GridMap:data", "Pinhole:image_from_camera"}
+"""What the loader draws, flat and in space."""
+_RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
+"""The bytes of a cloud, beside its points: the same once more."""
+
+_BYTES_WAITING_MAX = 32 << 20
+
+
+@dataclass(slots=True)
+class Seen:
+    """What there is to show, gathered while the messages pass; the layout is made from it."""
+
+    frames: FrameTree = field(default_factory=FrameTree)
+    images: dict[str, None] = field(default_factory=dict)
+    fixes: dict[str, None] = field(default_factory=dict)
+    curves: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """By path, the names of the curves there."""
+    topic_of: dict[str, str] = field(default_factory=dict)
+    """By path of curves or drawings, the topic."""
+
+
+class MessageRows:
+    """Makes chunks of the messages of one trace; memory is that of a chunk of the file."""
+
+    def __init__(self, trace: Trace, paths: Paths, clock: Clock, recording: rr.RecordingStream):
+        self.seen = Seen()
+        self._trace = trace
+        self._paths = paths
+        self._clock = clock
+        self._moments = Moments(trace)
+        self._topics = {join(c.topic): c.topic for c in trace.channels.values()}
+        self._numbers = {topic: i for i, topic in enumerate(sorted(self._topics.values()))}
+        self._waiting: dict[Stream, Waiting] = {}
+        self._prefix = f"{paths.label}/" if paths.label else ""
+        self._trails = Trails()
+        self._markers = MarkerRows(paths.label, trace.start_ns, clock, recording, self.seen.frames)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
+        own = [f"^{re.escape(topic)}$" for topic in _OWN]
+        try:
+            reader = McapReader(
+                self._trace.name,
+                timeline_type=self._clock.timeline_type,
+                decoders=_DECODERS,
+                exclude_topic_regex=own,
+                recover=not self._trace.complete,
+            )
+            for chunk in reader.stream():
+                yield from self._chunk(chunk)
+            for stream in list(self._waiting):
+                yield from self._flush(stream)
+        except (RuntimeError, ValueError, OSError) as error:
+            raise TraceError(
+                f"{self._trace.name}: Rerun cannot read its messages ({error})"
+            ) from error
+        yield from self._ends()
+
+    def _chunk(self, chunk: Chunk) -> Iterator[Chunk]:
+        topic, below = self._place(str(chunk.entity_path))
+        if not topic:
+            return
+        path = self._paths.topic(topic) + below
+        batch = chunk.to_record_batch()
+        columns = loaded_columns(batch)
+        if chunk.is_static:
+            yield from self._static(path, columns)
+            return
+        stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
+        stream = (path, tuple(f.name for f, _ in columns))
+        events, _ = self._moments.of_messages(topic, stream, stamps)
+        waiting = self._waiting.setdefault(stream, Waiting(topic, path))
+        waiting.add(columns, stamps, events)
+        if waiting.full:
+            yield from self._flush(stream)
+        elif sum(each.bytes for each in self._waiting.values()) >= _BYTES_WAITING_MAX:
+            for each in list(self._waiting):
+                yield from self._flush(each)
+
+    def _flush(self, stream: Stream) -> Iterator[Chunk]:
+        """Yield what waits of a sequence of rows."""
+        rows = self._waiting.pop(stream).joined(self._clock)
+        yield from self._as_it_is(rows)
+        yield from self._derived(rows)
+
+    def _place(self, loaded: str) -> tuple[str, str]:
+        """Return the topic of an entity that the loader made, and the path below the topic's."""
+        path = loaded
+        while path:
+            if path in self._topics:
+                return self._topics[path], loaded[len(path) :]
+            path = path.rpartition("/")[0]
+        return "", ""
+
+    def _static(self, path: str, columns: LoadedColumns) -> list[Chunk]:
+        """Names of curves and the like."""
+        for f, column in columns:
+            if f.name == "SeriesLines:names":
+                names = tuple(f"{self._paths.label} {n}".strip() for n in column[0].as_py())
+                self.seen.curves[path] = names
+                return self._curve_names(path, names)
+        return loaded_chunk(path, (), columns)
+
+    def _as_it_is(self, rows: Rows) -> Iterator[Chunk]:
+        """What the loader made, on our timelines, with the run's own frames."""
+        columns = []
+        for f, column in rows.columns:
+            if f.name.startswith(_RAW_CLOUD):
+                continue
+            if (f.metadata or {}).get(b"rerun:component_type") == _FRAME_TYPE:
+                if f.name == "CoordinateFrame:frame":
+                    yield from self._note_frame(rows.path, column)
+                column = self._own_frames(column)
+            columns.append((f, column))
+        names = {f.name for f, _ in rows.columns}
+        if names & _IMAGES:
+            self.seen.images[rows.path] = None
+        if names & _SOLID:
+            self.seen.frames.drawn.add(rows.path)
+        self.seen.topic_of.setdefault(rows.path, rows.topic)
+        if columns:
+            yield from loaded_chunk(rows.path, rows.times, columns)
+
+    def _derived(self, rows: Rows) -> Iterator[Chunk]:
+        by_name = {f.name: column for f, column in rows.columns}
+        for name, column in by_name.items():
+            type_name, _, kind = name.partition(":")
+            messages = messages_of(column) if kind == "message" else None
+            if messages is None:
+                continue
+            if type_name in _MARKERS:
+                for message, stamp_ns, event in zip(
+                    messages.to_pylist(), rows.stamps_ns.tolist(), rows.events.tolist(), strict=True
+                ):
+                    self._markers.log(rows.path, message, stamp_ns, event)
+                continue
+            yield from self._curves(rows, curves_of(messages))
+            draw = SHAPES.get(type_name)
+            if draw is not None:
+                yield from self._draw(rows, draw(messages, self._paint(rows.topic)), messages)
+        translations = by_name.get("InstancePoses3D:translations")
+        if translations is not None:
+            yield from self._curves(rows, _vector_curves("position", "xyz", translations))
+            yield from self._loaded_pose(rows, by_name)
+        fixes = by_name.get("GeoPoints:positions")
+        if fixes is not None:
+            yield from self._fix(rows, fixes, by_name.get("altitude"))
+        if "Transform3D:child_frame" in by_name and "Transform3D:parent_frame" in by_name:
+            self._note_transforms(by_name)
+        if "Scalars:scalars" in by_name:
+            self.seen.curves.setdefault(rows.path, ())
+
+    # Frames.
+
+    def _own_frames(self, column: pa.Array) -> pa.Array:
+        if not self._prefix:
+            return column
+        names = [
+            None if row is None else [f"{self._prefix}{name}" for name in row]
+            for row in column.to_pylist()
+        ]
+        return pa.array(names, type=column.type)
+
+    def _note_frame(self, path: str, column: pa.Array) -> list[Chunk]:
+        """Return the frame of an entity's first data, as that of the start of the run: a view
+        complains about entities that are in no frame, even when they have no data yet."""
+        names = column.flatten()
+        if path in self.seen.frames.frames or not len(names):
+            return []
+        frame = names[0].as_py()
+        self.seen.frames.frames[path] = frame
+        start_ns = np.array([self._trace.start_ns])
+        return make_chunk(
+            path,
+            ((SIM_TIME, self._clock.array(start_ns)), (EVENT, pa.array([0]))),
+            ((rr.CoordinateFrame.descriptor_frame(), pa.array([f"{self._prefix}{frame}"])),),
+        )
+
+    def _note_transforms(self, by_name: dict[str, pa.Array]) -> None:
+        parents = by_name["Transform3D:parent_frame"].flatten()
+        children = by_name["Transform3D:child_frame"].flatten()
+        for pair in set(zip(parents.to_pylist(), children.to_pylist(), strict=False)):
+            self.seen.frames.add_edge(*pair)
+
+    # What is drawn.
+
+    def _paint(self, topic: str) -> Paint:
+        return Paint(colour(self._paths.label, self._numbers[topic]))
+
+    def _draw(self, rows: Rows, drawing: Drawing, messages: pa.StructArray) -> Iterator[Chunk]:
+        frames = frames_of(messages) or [""] * len(messages)
+        yield from self._drawing(rows, drawing, frames)
+
+    def _drawing(self, rows: Rows, drawing: Drawing, frames: list[Any]) -> Iterator[Chunk]:
+        path = f"{rows.path}/{drawing.part}"
+        names = pa.array([str(name) for name in frames])
+        column = lists(np.ones(len(frames), dtype=np.int64), names)
+        yield from self._note_frame(path, column)
+        self.seen.frames.drawn.add(path)
+        self.seen.topic_of.setdefault(path, rows.topic)
+        frame = self._own_frames(column)
+        columns = (*drawing.columns, (rr.CoordinateFrame.descriptor_frame(), frame))
+        yield from make_chunk(path, rows.times, columns)
+        if drawing.position is not None:
+            first = f"{self._prefix}{frames[0]}"
+            self._trails.add_poses(rows.path, first, self._paint(rows.topic), drawing.position)
+
+    def _loaded_pose(self, rows: Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
+        """The loader knows poses, but draws nothing where they are."""
+        positions = _flat(by_name["InstancePoses3D:translations"], 3)
+        quaternions = _flat(by_name["InstancePoses3D:quaternions"], 4)
+        frames = by_name["CoordinateFrame:frame"].flatten().to_pylist()
+        if len(positions) == len(quaternions) == len(frames) == len(rows.stamps_ns):
+            drawing = pose_drawing(positions, quaternions, self._paint(rows.topic))
+            yield from self._drawing(rows, drawing, frames)
+
+    def _fix(self, rows: Rows, fixes: pa.Array, altitude: pa.Array | None) -> Iterator[Chunk]:
+        self.seen.fixes[rows.path] = None
+        positions = _flat(fixes, 2)
+        self._trails.add_fixes(rows.path, self._paint(rows.topic), positions)
+        yield from self._curves(rows, _vector_curves("position", ("latitude", "longitude"), fixes))
+        if altitude is not None:
+            counts = np.ones(len(altitude), dtype=np.int64)
+            scalars = lists(counts, pa.array(numbers(altitude.flatten())))
+            yield from self._curves(rows, iter((Curves("altitude", ("altitude",), scalars),)))
+
+    # Curves.
+
+    def _curves(self, rows: Rows, curves: Iterator[Curves]) -> Iterator[Chunk]:
+        for curve in curves:
+            path = rows.path + (join(curve.path) if curve.path else "")
+            scalars = rr.Scalars.descriptor_scalars()
+            yield from make_chunk(path, rows.times, ((scalars, curve.scalars),))
+            known = self.seen.curves.get(path, ())
+            if len(curve.names) > len(known):
+                names = tuple(f"{self._paths.label} {name}".strip() for name in curve.names)
+                self.seen.curves[path] = names
+                self.seen.topic_of[path] = rows.topic
+                yield from self._curve_names(path, names)
+
+    def _curve_names(self, path: str, names: tuple[str, ...]) -> list[Chunk]:
+        one = np.array([len(names)])
+        columns: list[Column] = [
+            (rr.SeriesLines.descriptor_names(), lists(one, pa.array(list(names))))
+        ]
+        if self._paths.label:
+            paints = [colour(self._paths.label, i) for i in range(len(names))]
+            paint = pa.array(paints, type=pa.uint32())
+            columns.append((rr.SeriesLines.descriptor_colors(), lists(one, paint)))
+        return make_chunk(path, (), columns)
+
+    def _ends(self) -> Iterator[Chunk]:
+        self._markers.end(self._trace.end_ns)
+        for path, frame, chunks in self._trails.poses():
+            self.seen.frames.frames[path] = frame.removeprefix(self._prefix)
+            self.seen.frames.drawn.add(path)
+            yield from chunks
+        yield from self._trails.fixes()
+
+
+def _flat(column: pa.Array, size: int) -> npt.NDArray[np.float64]:
+    """Return a column of one fixed-size list per row as an array of shape (rows, size)."""
+    values = column.flatten().flatten().to_numpy()
+    return np.asarray(values, dtype=np.float64).reshape(-1, size)
+
+
+def _vector_curves(path: str, names: str | tuple[str, ...], column: pa.Array) -> Iterator[Curves]:
+    values = _flat(column, len(names))
+    if len(values) == len(column):
+        counts = np.full(len(values), len(names), dtype=np.int64)
+        yield Curves(path, tuple(names), lists(counts, pa.array(values.reshape(-1))))

@@ -1,0 +1,66 @@
+"""Chunks of tracks: where poses and satellite fixes went over the whole run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import numpy.typing as npt
+import pyarrow as pa
+import rerun as rr
+from rerun.chunk import Chunk
+
+from rsltrace_viewer.rerun_export.columns import constant, lists, make_chunk, strip_lists, vectors
+from rsltrace_viewer.rerun_export.messages.shapes import Paint
+from rsltrace_viewer.rerun_export.messages.tracks import Track
+
+_WIDTH = -1.0
+"""On the screen."""
+
+
+class Trails:
+    """Gathers the positions of topics; each has a track at ``TOPIC/track``."""
+
+    def __init__(self) -> None:
+        self._poses: dict[str, tuple[Track, str, Paint]] = {}
+        self._fixes: dict[str, tuple[Track, Paint]] = {}
+
+    def add_poses(
+        self, path: str, frame: str, paint: Paint, positions: npt.NDArray[np.float64]
+    ) -> None:
+        """Add positions, shape (n, 3), in the frame of the first ones."""
+        self._poses.setdefault(path, (Track(), frame, paint))[0].add(positions)
+
+    def add_fixes(self, path: str, paint: Paint, positions: npt.NDArray[np.float64]) -> None:
+        """Add latitudes and longitudes, shape (n, 2)."""
+        self._fixes.setdefault(path, (Track(), paint))[0].add(positions)
+
+    def poses(self) -> Iterator[tuple[str, str, list[Chunk]]]:
+        """Yield path, frame (with its prefix) and chunk of every track of poses."""
+        for topic_path, (track, frame, paint) in self._poses.items():
+            points = track.points
+            if len(points):
+                path = f"{topic_path}/track"
+                strip = strip_lists(np.array([len(points)]), vectors(points))
+                columns = (
+                    (rr.LineStrips3D.descriptor_strips(), lists(np.array([1]), strip)),
+                    (rr.LineStrips3D.descriptor_colors(), paint.faint.column(1)),
+                    (rr.LineStrips3D.descriptor_radii(), constant(_WIDTH, 1, pa.float32())),
+                    (rr.CoordinateFrame.descriptor_frame(), pa.array([frame])),
+                )
+                yield path, frame, make_chunk(path, (), columns)
+
+    def fixes(self) -> Iterator[Chunk]:
+        """Yield the tracks on the map."""
+        for topic_path, (track, paint) in self._fixes.items():
+            points = track.points
+            if len(points):
+                flat = pa.array(np.ascontiguousarray(points).reshape(-1))
+                kind = pa.list_(pa.field("item", pa.float64(), nullable=False), 2)
+                places = pa.FixedSizeListArray.from_arrays(flat, type=kind)
+                strip = strip_lists(np.array([len(points)]), places)
+                columns = (
+                    (rr.GeoLineStrings.descriptor_line_strings(), lists(np.array([1]), strip)),
+                    (rr.GeoLineStrings.descriptor_colors(), paint.column(1)),
+                )
+                yield from make_chunk(f"{topic_path}/track", (), columns)

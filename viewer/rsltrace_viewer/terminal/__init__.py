@@ -1,0 +1,1 @@
+"""The terminal application: what is drawn, and what keys do."""

@@ -1,0 +1,298 @@
+"""The viewer: what keys, clicks and answers change, besides moving."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, ClassVar
+
+from textual.app import SystemCommand
+from textual.binding import Binding
+from textual.screen import Screen
+
+from rsltrace.errors import TraceError
+from rsltrace.words.times import parse_stamp
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.follow import Follow
+from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.questions import parse_index, question_of
+from rsltrace_viewer.terminal.screens.help import HelpScreen
+from rsltrace_viewer.terminal.stepping import Stepping
+from rsltrace_viewer.terminal.widgets.inspector import Inspector
+from rsltrace_viewer.terminal.widgets.lanes import LanesView
+from rsltrace_viewer.terminal.widgets.prompt import Prompt
+from rsltrace_viewer.terminal.widgets.timeline import Timeline
+
+_ONLY = ("only-timeline", "only-inspector", "only-lanes")
+
+
+class ViewerApp(Stepping):
+    """One session on the screen."""
+
+    BINDINGS: ClassVar = [
+        Binding(key.keys, key.action, key.help, show=False, priority=key.first) for key in KEYS
+    ]
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        start: int | None = None,
+        light: bool = False,
+        follow: bool = False,
+        filter_text: str = "",
+    ) -> None:
+        """Show ``session``, at place ``start`` (None: where it is)."""
+        super().__init__(session, start=start, light=light)
+        self._first_filter = filter_text
+        self._follow: Follow | None = None
+        self._follow_at_once = follow
+
+    def first_shown(self) -> None:
+        """Filter and follow, if that was asked for at the start."""
+        if self._first_filter:
+            self._filter(self._first_filter)
+        if self._follow_at_once:
+            self.action_follow()
+
+    # Asking.
+
+    def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
+        """Some keys come before the pane that has the focus, but not while one types."""
+        if action == "ask":
+            return not self.prompt.asking and len(self.screen_stack) == 1
+        if action == "pane":
+            return not self.prompt.asking
+        return True
+
+    def action_ask(self, kind: str) -> None:
+        """Ask for a search, a filter, a time or an index."""
+        self.prompt.ask(question_of(kind, self.session))
+
+    def on_prompt_answered(self, event: Prompt.Answered) -> None:
+        """Do what was asked for."""
+        self.timeline.focus()
+        if event.text is None:
+            return
+        if event.kind == "search":
+            self.session.set_search(event.text)
+            if self.session.search is not None:
+                self.action_again(1)
+        elif event.kind == "filter":
+            self._filter(event.text)
+        elif not self.session.empty and event.text.strip():
+            if event.kind == "time":
+                self.go(self.session.place_at_time(parse_stamp(event.text)), centre=True)
+            else:
+                index = min(parse_index(event.text), self.session.a.count - 1)
+                self.go(self.session.view.place_of(index), centre=True)
+
+    def _filter(self, text: str) -> None:
+        rows = self.session.set_filter(text)
+        self.workers.cancel_group(self, "filter")
+        if rows is None:
+            self.timeline.empty = self.session.nothing
+            self._say("")
+            self._show_rows(centre=True)
+            return
+
+        def steps() -> Iterator[float]:
+            while not rows.done:
+                rows.advance()
+                yield rows.progress
+
+        def arrive(progress: float | None, done: bool) -> None:
+            if self.session.rows is not rows:
+                return
+            self.timeline.empty = "no event passes the filter" if done else "looking …"
+            part = "" if done else f" ({progress or 0:.0%} read)"
+            self._status = f"filter: {rows.count:,} events{part}"
+            if rows.count:
+                self.session.place = rows.at(self.session.row_of_place())
+            self._show_rows(centre=True)
+            if done:
+                self._show_lanes()
+                self._show_inspector()
+
+        walk(self, "filter", steps(), arrive)
+
+    def action_escape(self) -> None:
+        """End the nearest thing that can be ended."""
+        session = self.session
+        screen = self.screen_stack[0]
+        if self.prompt.asking:
+            self.prompt.put_aside()
+        elif any(w.group == "seek" and w.is_running for w in self.workers):
+            self.workers.cancel_group(self, "seek")
+            self._say("stopped")
+        elif any(screen.has_class(name) for name in _ONLY):
+            screen.remove_class(*_ONLY)
+        elif self.focused is not self.timeline:
+            self.timeline.focus()
+        elif session.search is not None:
+            session.set_search("")
+            self._say("")
+        elif session.filter_text:
+            self._filter("")
+        elif self._follow is not None:
+            self.action_follow()
+
+    # Looking.
+
+    def action_enter(self) -> None:
+        """Open, close or follow the line of the inspector; go there first."""
+        inspector = self._focused_inspector()
+        if inspector is None:
+            self.inspector.focus()
+        elif inspector.current is not None:
+            self._choose_line(inspector.current.path, inspector)
+
+    def on_inspector_chosen(self, event: Inspector.Chosen) -> None:
+        """A line was clicked."""
+        self._choose_line(event.line.path, self.inspector)
+
+    def _choose_line(self, path: str, inspector: Inspector) -> None:
+        line = next((line for line in inspector.lines if line.path == path), None)
+        if line is None:
+            return
+        if line.link is not None:
+            self._go_to_event(line.link, other=line.other_run)
+        elif line.open is not None:
+            self.session.openness.toggle(line.path)
+            self._show_inspector(top=False)
+
+    def on_timeline_picked(self, event: Timeline.Picked) -> None:
+        """A row was clicked."""
+        self.timeline.focus()
+        self.go(self.session.rows.at(event.row))
+
+    def on_lanes_view_picked(self, event: LanesView.Picked) -> None:
+        """A column of the lanes was clicked."""
+        session = self.session
+        if session.empty:
+            return
+        if event.order:
+            self.go(session.view.place_of(min(event.position, session.a.count - 1)), centre=True)
+        else:
+            self.go(session.place_at_time(event.position), centre=True)
+
+    def action_pane(self, step: int) -> None:
+        """Go to the next part of the screen."""
+        if len(self.screen_stack) > 1:
+            self.screen.focus_next()
+            return
+        panes = [self.timeline, self.inspector, self.lanes]
+        shown = [pane for pane in panes if pane.display and pane.size.height]
+        place = shown.index(self.focused) if self.focused in shown else -step
+        shown[(place + step) % len(shown)].focus()
+
+    def action_zoom(self, step: int) -> None:
+        """Zoom the lanes."""
+        self.session.zoom(step, self.lanes.columns)
+        self._show_lanes()
+
+    def action_maximise(self) -> None:
+        """Give the whole screen to the current pane."""
+        screen = self.screen_stack[0]
+        if any(screen.has_class(name) for name in _ONLY):
+            screen.remove_class(*_ONLY)
+        elif self.focused is not None and f"only-{self.focused.id}" in _ONLY:
+            screen.add_class(f"only-{self.focused.id}")
+
+    def action_theme(self) -> None:
+        """Change between dark and light."""
+        self.theme = "textual-dark" if self.theme == "textual-light" else "textual-light"
+
+    def action_help(self) -> None:
+        """Show all keys."""
+        self.push_screen(HelpScreen(two=self.session.b is not None))
+
+    def action_plot(self) -> None:
+        """Open the plots."""
+        from rsltrace_viewer.terminal.screens.plot import PlotScreen
+
+        self.push_screen(PlotScreen(self.session))
+
+    def action_verdict(self) -> None:
+        """Show the whole report on two traces."""
+        comparison = self.session.comparison
+        if comparison is None:
+            self._say("this is one trace; rsltrace view A B compares two")
+        elif comparison.diff is None:
+            self._say("the runs are identical" if comparison.identical else "still looking …")
+        else:
+            from rsltrace_viewer.terminal.screens.report import ReportScreen
+
+            self.push_screen(ReportScreen(comparison.diff))
+
+    def action_other(self) -> None:
+        """Inspect the differences, run a, run b in turn."""
+        side = self.session.next_side()
+        self._show_rows()
+        self._show_inspector()
+        self._say({"diff": "the differences", "a": "run a only", "b": "run b only"}[side])
+
+    def action_follow(self) -> None:
+        """Follow a file that is still being recorded, or stop that."""
+        if self._follow is not None:
+            self._follow.stop()
+            self._follow, self.following = None, False
+            self._say("no longer following")
+        elif self.session.b is not None:
+            self._say("only one trace can be followed")
+        elif self.session.a.trace.complete:
+            self._say("this trace is finished: there is nothing to follow")
+        else:
+            self.following = True
+            self._follow = Follow(self, Path(self.session.a.trace.name), self._grown)
+            self._say("following; Esc stops")
+
+    def _grown(self, run: Run) -> None:
+        """Show a trace that got longer."""
+        session = self.session
+        at_end = session.empty or session.place >= session.view.count - 1
+        session.replace_run(run)
+        self._fit(self.size.width, self.size.height)
+        self._show_header()
+        if session.filter_text:
+            self._filter(session.filter_text)
+        if at_end and not session.empty:
+            self.go(session.view.count - 1, remember=False)
+        self._show_rows()
+        self._show_lanes()
+        if run.trace.complete:
+            self._follow, self.following = None, False
+            self._say("the recording has ended")
+        walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
+
+    def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
+        """Offer all keys by their help in the command palette."""
+        yield from super().get_system_commands(screen)
+        for key in KEYS:
+            if self.session.b is not None or not key.two:
+                yield SystemCommand(f"{key.help}", f"key {key.shown}", self._runner(key.action))
+
+    def _runner(self, action: str) -> Any:
+        async def run() -> None:
+            await self.run_action(action)
+
+        return run
+
+    async def action_quit(self) -> None:
+        """Leave."""
+        self.workers.cancel_all()
+        self.exit()
+
+
+def open_session(a: Path, b: Path | None = None) -> Session:
+    """Open one or two traces. Raises TraceError, TraceFormatError."""
+    first = Run.open(a)
+    try:
+        return Session(first, Run.open(b) if b is not None else None)
+    except TraceError:
+        with suppress(OSError):
+            first.close()
+        raise

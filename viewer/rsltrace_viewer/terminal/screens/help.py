@@ -1,0 +1,124 @@
+"""All keys and the filter language, on one screen."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import BindingType
+from textual.containers import VerticalScroll
+from textual.content import Content
+from textual.screen import ModalScreen
+from textual.widgets import Static
+
+from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.lanes import KIND_LETTERS
+from rsltrace_viewer.model.query.fields import FIELDS
+from rsltrace_viewer.terminal.keys import KEYS
+
+_KEY_WIDTH = 13
+_COLUMN = 62
+
+
+class HelpScreen(ModalScreen[None]):
+    """Any of its keys closes it."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [("escape,q,question_mark,enter", "dismiss", "close")]
+    DEFAULT_CSS = """
+    HelpScreen { align: center middle; }
+    HelpScreen > VerticalScroll { width: 100%; height: 100%; max-width: 130; background: $surface;
+                                  border: round $primary; padding: 0 1; }
+    """
+
+    def __init__(self, *, two: bool) -> None:
+        super().__init__()
+        self._two = two
+
+    def compose(self) -> ComposeResult:
+        """Make the text."""
+        with VerticalScroll() as box:
+            box.border_title = "rsltrace view: keys"
+            box.border_subtitle = "Esc closes, ↓ scrolls"
+            yield Static(help_text(self.app.size.width, two=self._two))
+
+
+def help_text(width: int, *, two: bool) -> Content:
+    """Return the help for a screen of ``width`` cells: two columns where there is room."""
+    blocks = [_keys_block(group, two) for group in _groups(two)]
+    blocks.append(_signs_block(two))
+    blocks += [_lanes_block(), _filter_block()]
+    if width < 2 * _COLUMN + 6:
+        return Content("\n").join([line for block in blocks for line in [*block, Content("")]])
+    total = sum(len(block) + 1 for block in blocks)
+    left: list[Content] = []
+    right: list[Content] = []
+    for block in blocks:
+        column = left if len(left) + len(block) // 2 < total / 2 else right
+        column += [*block, Content("")]
+    lines = []
+    for place in range(max(len(left), len(right))):
+        one = left[place] if place < len(left) else Content("")
+        other = right[place] if place < len(right) else Content("")
+        lines.append(Content.assemble(one, " " * max(_COLUMN - one.cell_length, 1), other))
+    return Content("\n").join(lines)
+
+
+def _groups(two: bool) -> list[str]:
+    return list(dict.fromkeys(key.group for key in KEYS if two or not key.two))
+
+
+def _keys_block(group: str, two: bool) -> list[Content]:
+    lines = [Content.styled(group, "bold underline")]
+    for key in KEYS:
+        if key.group == group and (two or not key.two):
+            shown = fit(key.shown, _KEY_WIDTH)
+            lines.append(Content.assemble("  ", (shown, "bold $text-primary"), key.help))
+    if group == "Look":
+        shown = fit("Ctrl+P", _KEY_WIDTH)
+        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), "command palette"))
+    return lines
+
+
+def _signs_block(two: bool) -> list[Content]:
+    signs = [
+        (">", "the selected event"),
+        ("←", "its cause"),
+        ("→", "its effect"),
+        ("!", "raised an exception"),
+        ("w", "logged a warning or worse"),
+        ("*", "marked"),
+    ]
+    if two:
+        signs += [
+            ("=", "the same in both runs"),
+            ("≠", "differs"),
+            ("-", "in run a only"),
+            ("+", "in run b only"),
+            ("~", "the same, at another time or place"),
+            ("?", "not compared"),
+        ]
+    lines = [Content.styled("Signs at the left of an event", "bold underline")]
+    for sign, text in signs:
+        lines.append(Content.assemble("  ", (fit(sign, _KEY_WIDTH), "bold $text-primary"), text))
+    return lines
+
+
+def _lanes_block() -> list[Content]:
+    lines = [Content.styled("Lanes, zoomed in to one event per column (+)", "bold underline")]
+    pairs = [f"{letter} {kind.label}" for kind, letter in KIND_LETTERS.items()]
+    for start in range(0, len(pairs), 4):
+        lines.append(Content("  " + "  ".join(pairs[start : start + 4])))
+    return lines
+
+
+def _filter_block() -> list[Content]:
+    lines = [Content.styled("Filters (F) and searches (/)", "bold underline")]
+    for name, field in FIELDS.items():
+        shown = fit(f"{name}:", _KEY_WIDTH)
+        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), field.help))
+    lines += [
+        Content("  a bare word looks in names, logs and exceptions"),
+        Content("  all must hold; or  not  ( )  and - before a field"),
+        Content("  node:/ekf -kind:timer (level:warn or is:raised)"),
+    ]
+    return lines

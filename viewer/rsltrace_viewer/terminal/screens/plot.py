@@ -1,0 +1,231 @@
+"""Plots: what to plot at the left, the plot at the right, both runs over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import ClassVar
+
+from rich.segment import Segment as Piece
+from rich.style import Style
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal
+from textual.content import Content
+from textual.screen import Screen
+from textual.strip import Strip
+from textual.widget import Widget
+from textual.widgets import OptionList, Static
+from textual.widgets.option_list import Option
+
+from rsltrace.errors import TraceError
+from rsltrace.model.printable import printable
+from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.plots.braille import Plot, plot
+from rsltrace_viewer.model.plots.series import (
+    Series,
+    Source,
+    fields_of,
+    series_of,
+    sources_of,
+    topics_with_messages,
+)
+from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.background import walk
+
+_AXIS = 11
+
+
+class PlotView(Widget):
+    """Draws series in braille with axes."""
+
+    COMPONENT_CLASSES: ClassVar[set[str]] = {"plot--axis", "plot--a", "plot--b", "plot--both"}
+    DEFAULT_CSS = """
+    PlotView { width: 1fr; height: 1fr; background: $background; }
+    PlotView > .plot--axis { color: $text-muted; }
+    PlotView > .plot--a { color: $text-primary; }
+    PlotView > .plot--b { color: $text-warning; }
+    PlotView > .plot--both { color: $text; }
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._series: list[Series] = []
+        self._title = ""
+        self._cursor_s: float | None = None
+        self._plot: tuple[tuple[int, int], Plot] | None = None
+
+    def show(self, title: str, series: list[Series], cursor_s: float | None) -> None:
+        """Show one or two series."""
+        self._title, self._series, self._cursor_s = title, series, cursor_s
+        self._plot = None
+        self.refresh()
+
+    def _made(self) -> Plot:
+        size = (max(self.size.width - _AXIS - 1, 1), max(self.size.height - 2, 1))
+        if self._plot is None or self._plot[0] != size:
+            self._plot = size, plot(self._series, *size, self._cursor_s)
+        return self._plot[1]
+
+    def render_line(self, y: int) -> Strip:
+        """Return the title, a row of the plot, or the time axis."""
+        width = self.size.width
+        axis = self.get_component_rich_style("plot--axis")
+        if y == 0 or not any(len(one.times) for one in self._series):
+            text = self._title if y == 0 else ""
+            return Strip([Piece(fit(text, width), axis + Style(bold=True))], width)
+        made = self._made()
+        last = self.size.height - 1
+        if y == last:
+            left, right = f"{made.start:.3f} s", f"{made.end:.3f} s"
+            line = " " * _AXIS + left + right.rjust(max(width - _AXIS - len(left) - 1, 0))
+            return Strip([Piece(fit(line, width), axis)], width)
+        row = y - 1
+        value = {0: made.high, last - 2: made.low, (last - 2) // 2: (made.high + made.low) / 2}
+        label = f"{value[row]:.5g}" if row in value else ""
+        tick = "┤" if label else "│"
+        pieces = [Piece(f"{fit(label, _AXIS - 2, right=True)} {tick}", axis)]
+        styles = [axis, *(self.get_component_rich_style(f"plot--{n}") for n in ("a", "b", "both"))]
+        for character, owner in zip(made.rows[row], made.owner[row], strict=True):
+            pieces.append(Piece(character, styles[owner]))
+        return Strip(pieces).simplify().adjust_cell_length(width, axis)
+
+
+class PlotScreen(Screen[None]):
+    """Topics lead to their fields; rates and latencies are at the top."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,backspace", "back", "back"),
+        Binding("q,p", "dismiss", "close"),
+        Binding("j", "move(1)", show=False),
+        Binding("k", "move(-1)", show=False),
+    ]
+    DEFAULT_CSS = """
+    PlotScreen Static { background: $panel; padding: 0 1; height: 1; }
+    PlotScreen Horizontal { height: 1fr; }
+    PlotScreen OptionList { width: 36; height: 1fr; border: none; background: $surface; }
+    PlotScreen OptionList:focus { border: none; }
+    PlotScreen.narrow Horizontal { layout: vertical; }
+    PlotScreen.narrow OptionList { width: 1fr; height: 7; }
+    """
+
+    def __init__(self, session: Session) -> None:
+        super().__init__()
+        self._session = session
+        self._choices: list[Source | str] = []
+        self._topic = ""
+
+    def compose(self) -> ComposeResult:
+        """Make the parts."""
+        yield Static(id="what")
+        with Horizontal():
+            yield OptionList()
+            yield PlotView()
+        yield Static("↑↓ choose   Enter shows the fields of a topic   Esc back   q closes")
+
+    def on_mount(self) -> None:
+        """Offer topics, rates and latencies; plot the topic of the selected event."""
+        self.set_class(self.app.size.width < 100, "narrow")
+        self._top_level()
+
+    def _top_level(self) -> None:
+        run = self._session.a
+        self._topic = ""
+        topics = topics_with_messages(run)
+        here = self._session.same("topic")
+        first = topics.index(here[1]) if here is not None and here[1] in topics else 0
+        self._offer([*topics, *sources_of(run)], first)
+        title = self._session.title()
+        self.query_one("#what", Static).update(Content(f"plots  {title}"))
+
+    def _offer(self, choices: list[Source | str], highlighted: int = 0) -> None:
+        self._choices = choices
+        options = self.query_one(OptionList)
+        options.clear_options()
+        options.add_options([Option(Content(_words(choice))) for choice in choices])
+        if choices:
+            options.highlighted = highlighted
+        options.focus()
+
+    def on_option_list_option_highlighted(self, event: OptionList.OptionHighlighted) -> None:
+        """Plot what is under the cursor; of a topic, its first changing field."""
+        choice = self._choices[event.option_index]
+        if isinstance(choice, Source):
+            self._plot(choice)
+        else:
+            try:
+                fields = [f for f in fields_of(self._session.a, choice) if "stamp" not in f.field]
+            except TraceError as error:
+                self.query_one(PlotView).show(printable(str(error)), [], None)
+                return
+            if fields:
+                self._plot(_most_telling(fields))
+            else:
+                self.query_one(PlotView).show(f"{printable(choice)} has no numbers", [], None)
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        """Show the fields of a topic."""
+        choice = self._choices[event.option_index]
+        if isinstance(choice, str):
+            try:
+                fields = fields_of(self._session.a, choice)
+            except TraceError as error:
+                self.app.notify(str(error), severity="error", markup=False)
+                return
+            if fields:
+                self._topic = choice
+                self._offer(list(fields), fields.index(_most_telling(fields)))
+                self.query_one("#what", Static).update(Content(f"plots  {printable(choice)}"))
+
+    def _plot(self, source: Source) -> None:
+        session = self._session
+        runs = [session.a] + ([session.b] if session.b is not None else [])
+        cursor = None if session.empty else session.stamp() / 1e9
+
+        def steps() -> Iterator[list[Series]]:
+            done: list[Series] = []
+            for run in runs:
+                latest = None
+                for latest in series_of(run, source):
+                    yield [*done, latest]
+                if latest is not None:
+                    done.append(latest)
+            yield done
+
+        def arrive(series: list[Series] | None, finished: bool) -> None:
+            if not self.is_attached:
+                return
+            series = series or []
+            notes = [one.note for one in series if one.note]
+            title = f"{source.label}  {source.unit}".rstrip() + f"  ({', '.join(notes[:1])})"
+            if len(runs) > 1:
+                title += "  a solid, b dotted"
+            self.query_one(PlotView).show(printable(title), series, cursor)
+
+        walk(self.app, "plot", steps(), arrive)
+
+    def action_back(self) -> None:
+        """From the fields to the topics, from there out."""
+        if self._topic:
+            self._top_level()
+        else:
+            self.dismiss()
+
+    def action_move(self, step: int) -> None:
+        """Move in the list."""
+        options = self.query_one(OptionList)
+        options.action_cursor_down() if step > 0 else options.action_cursor_up()
+
+
+def _words(choice: Source | str) -> str:
+    if isinstance(choice, str):
+        return f"{printable(choice)}  ›"
+    return printable(choice.field or choice.label)
+
+
+def _most_telling(fields: list[Source]) -> Source:
+    """Return a field that is likely to move: a position or a velocity before a sequence number."""
+    for word in ("position.x", "linear.x", "linear_acceleration.x", "latitude", "data", "value"):
+        for source in fields:
+            if source.field.endswith(word):
+                return source
+    return next((f for f in fields if "stamp" not in f.field and "[" not in f.field), fields[0])

@@ -1,0 +1,55 @@
+"""The whole report on two runs, as `rsltrace diff` prints it."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
+from textual.content import Content
+from textual.screen import ModalScreen
+from textual.widgets import Static
+
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import report_lines
+from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
+from rsltrace.diff.result.traces import Diff
+
+_STYLES = {
+    TITLE: "bold $text-primary",
+    GOOD: "bold $text-success",
+    BAD: "bold $text-error",
+    SIDE_A: "$text-warning",
+    SIDE_B: "$text-success",
+    FAINT: "$text-muted",
+    COMMAND: "bold",
+}
+
+
+class ReportScreen(ModalScreen[None]):
+    """Any of its keys closes it."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,v,enter", "dismiss", "close")]
+    DEFAULT_CSS = """
+    ReportScreen { align: center middle; }
+    ReportScreen > VerticalScroll { width: 100%; max-width: 130; height: 100%; padding: 0 1;
+                                    background: $surface; border: round $primary; }
+    """
+
+    def __init__(self, diff: Diff) -> None:
+        super().__init__()
+        self._diff = diff
+
+    def compose(self) -> ComposeResult:
+        """Make the text."""
+        width = min(self.app.size.width, 130) - 6
+        lines = report_lines(self._diff, DiffOptions(), width=max(width, 40))
+        text = Content("\n").join(
+            Content.assemble(*((piece, _STYLES.get(style, "")) for piece, style in line))
+            for line in lines
+        )
+        with VerticalScroll() as box:
+            box.border_title = "why the runs diverge"
+            box.border_subtitle = "Esc closes, ↓ scrolls"
+            yield Static(text)

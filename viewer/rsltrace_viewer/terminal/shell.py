@@ -1,0 +1,295 @@
+"""The screen: puts the widgets together and draws what the session says.
+
+Everything there is to know about a trace is in ``Session`` and below; here is only what a screen
+needs. Whatever could take long goes through ``background.walk``. What keys do is in ``stepping``
+and ``app``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from time import perf_counter
+from typing import Any
+
+from textual import events
+from textual.app import App, ComposeResult
+from textual.containers import Container
+from textual.geometry import Size
+from textual.worker import get_current_worker
+
+from rsltrace.errors import RsltraceError
+from rsltrace_viewer.model.inspector.effects import Effects, effects_of
+from rsltrace_viewer.session import Session
+from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar
+from rsltrace_viewer.terminal.widgets.inspector import Inspector
+from rsltrace_viewer.terminal.widgets.lanes import LanesView
+from rsltrace_viewer.terminal.widgets.prompt import Prompt
+from rsltrace_viewer.terminal.widgets.timeline import Row, Timeline
+
+_WIDE = 110
+_REPORT_S = 0.25
+_EFFECTS_AT_ONCE_S = 0.004
+_INSPECT_S = 0.02
+"""Events are inspected when one has stopped at them for this long: holding a key stays smooth."""
+
+
+class Shell(App[None]):
+    """One session on the screen; what one can do with it is added by subclasses."""
+
+    TITLE = "rsltrace view"
+    CSS = """
+    Screen { layout: vertical; overflow: hidden; }
+    #body { height: 1fr; layout: vertical; }
+    #timeline { height: 5fr; width: 1fr; }
+    #inspector { height: 4fr; width: 1fr; border-top: solid $panel; }
+    .wide #body { layout: horizontal; }
+    .wide #timeline { height: 1fr; width: 5fr; }
+    .wide #inspector { height: 1fr; width: 3fr; border-top: none; border-left: solid $panel; }
+    .low #lanes { display: none; }
+    .lowest #inspector { display: none; }
+    #inspector:focus { border-top: solid $accent; }
+    .wide #inspector:focus { border-top: none; border-left: solid $accent; }
+    .only-timeline #lanes, .only-timeline #inspector { display: none; }
+    .only-inspector #lanes, .only-inspector #timeline { display: none; }
+    .only-lanes #body { display: none; }
+    .only-lanes #lanes { height: 1fr; }
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        *,
+        start: int | None = None,
+        light: bool = False,
+    ) -> None:
+        """Show ``session``, at place ``start`` (None: where it is)."""
+        super().__init__()
+        self.session = session
+        self.busy = True
+        """Whether something is about to be drawn that is not yet: for pictures and tests."""
+        self._start = start
+        self._status = ""
+        self.following = False
+        self.theme = "textual-light" if light else "textual-dark"
+
+    # Setting up.
+
+    def compose(self) -> ComposeResult:
+        """Make the parts."""
+        yield HeaderBar(id="header")
+        yield LanesView(id="lanes")
+        with Container(id="body"):
+            yield Timeline(id="timeline")
+            yield Inspector(id="inspector")
+        yield Prompt(id="prompt")
+        yield FooterBar(id="footer")
+
+    def on_mount(self) -> None:
+        """Show the first screen; everything that can wait comes after it."""
+        session = self.session
+        self._fit(self.size.width, self.size.height)
+        self.timeline.focus()
+        if self._start is not None:
+            session.go(self._start, remember=False)
+        self.timeline.empty = session.nothing if session.empty else ""
+        self._show_header()
+        self.call_after_refresh(self._after_first)
+
+    def _after_first(self) -> None:
+        self._show_rows(centre=True)
+        self._show_lanes()
+        self.call_after_refresh(self._after_second)
+
+    def _after_second(self) -> None:
+        self._show_inspector()
+        self.busy = False
+        self.first_shown()
+        walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
+        comparison = self.session.comparison
+        if comparison is not None and not comparison.identical:
+            self.run_worker(self._explain, group="diff", thread=True, exit_on_error=False)
+
+    def first_shown(self) -> None:
+        """Do what was asked for at the start, once the first screen is there."""
+
+    def _explain(self) -> None:
+        """Let the diff find the reason, then match the rest of the runs. Runs in a thread."""
+        comparison = self.session.comparison
+        worker = get_current_worker()
+        assert comparison is not None  # started for two runs only
+        try:
+            comparison.finish_diff()
+        except RsltraceError as error:
+            self.call_from_thread(self.notify, str(error), severity="error")
+        if not worker.is_cancelled:
+            self.call_from_thread(self._explained)
+        shown = perf_counter()
+        while not comparison.done and not worker.is_cancelled:
+            try:
+                block = comparison.fetch()
+            except RsltraceError as error:
+                self.call_from_thread(self.notify, str(error), severity="error")
+                return
+            # On the app's thread: the view must not change while a screen is drawn from it.
+            self.call_from_thread(self.session.take_block, block)
+            if comparison.done or perf_counter() - shown > _REPORT_S:
+                self.call_from_thread(self._show_rows)
+                shown = perf_counter()
+
+    def _explained(self) -> None:
+        self._show_header()
+        self._show_inspector(top=False)
+
+    def _summaries(self) -> Iterator[int]:
+        for number in self.session.lane_maker.order():
+            self.session.lane_maker.summarise(number)
+            yield number
+
+    @property
+    def timeline(self) -> Timeline:
+        """The list of events."""
+        return self.screen_stack[0].query_one(Timeline)
+
+    @property
+    def inspector(self) -> Inspector:
+        """The selected event."""
+        return self.screen_stack[0].query_one(Inspector)
+
+    @property
+    def lanes(self) -> LanesView:
+        """The overview."""
+        return self.screen_stack[0].query_one(LanesView)
+
+    @property
+    def prompt(self) -> Prompt:
+        """The question line."""
+        return self.screen_stack[0].query_one(Prompt)
+
+    def _fit(self, width: int, height: int) -> None:
+        """Use the screen there is."""
+        screen = self.screen_stack[0]
+        screen.set_class(width >= _WIDE, "wide")
+        screen.set_class(height < 16, "low")
+        screen.set_class(height < 11 or (width < _WIDE and height < 14), "lowest")
+        self.lanes.fit_labels(self.session.lane_maker.labels, width)
+        most = max(4, height // 5)
+        self.lanes.styles.height = min(len(self.session.lane_maker.labels), most) + 1
+
+    # Drawing.
+
+    def _show_header(self, size: Size | None = None) -> None:
+        session, size = self.session, size or self.size
+        verdict, bad = "", False
+        if session.comparison is not None:
+            verdict, bad = session.comparison.verdict(), not session.comparison.identical
+        self.screen_stack[0].query_one(HeaderBar).show(
+            session.title(),
+            session.facts(),
+            verdict,
+            bad=bad,
+            lines=2 if size.height >= 20 else 1 if size.height >= 10 else 0,
+            width=size.width,
+        )
+
+    def _show_rows(self, *, centre: bool = False) -> None:
+        timeline, session = self.timeline, self.session
+        timeline.show(self._row, session.rows.count, session.columns(timeline.row_width))
+        if session.rows.count:
+            timeline.go(session.row_of_place(), centre=centre)
+        self._show_footer()
+
+    def _row(self, row: int) -> Row:
+        event, sign, marked, related = self.session.row(row)
+        return Row(event, sign, marked, related)
+
+    def _show_lanes(self) -> None:
+        lanes, session = self.lanes, self.session
+        if not lanes.size.width:
+            return
+        made, position = session.lanes(lanes.columns)
+        divergence = None
+        if session.comparison is not None:
+            divergence = session.comparison.divergence_in(made.window)
+        lanes.show(made, position, own=session.own_lane(), divergence=divergence)
+
+    def _show_inspector(self, *, top: bool = True) -> None:
+        session = self.session
+        self.inspector.show(session.lines(), top=top)
+        here = session.current()
+        if here is not None and session.effects is None:
+            walk(
+                self,
+                "effects",
+                effects_of(*here),
+                self._effects_arrived,
+                at_once_s=_EFFECTS_AT_ONCE_S,
+            )
+
+    def _effects_arrived(self, effects: Effects | None, done: bool) -> None:
+        here = self.session.current()
+        if effects is None or here is None or effects.event != here[1]:
+            return
+        self.session.effects = effects
+        self.inspector.show(self.session.lines(), top=False)
+        if effects.found:
+            self.timeline.redraw()
+
+    def _show_footer(self) -> None:
+        session = self.session
+        status = self._status
+        if not status and session.filter_text:
+            status = f"filter: {session.rows.count:,} of {session.view.count:,}"
+        if not status and not session.empty:
+            following = "following  " if self.following else ""
+            status = f"{following}{session.place + 1:,}/{session.view.count:,}"
+        searching = "match" if session.search is not None else "divergence" if session.b else ""
+        self.screen_stack[0].query_one(FooterBar).show(
+            two=session.b is not None, searching=searching, status=status
+        )
+
+    def _say(self, status: str) -> None:
+        self._status = status
+        self._show_footer()
+
+    def go(self, place: int, *, remember: bool = True, centre: bool = False) -> None:
+        """Select a place and show everything about it."""
+        session = self.session
+        if session.empty:
+            return
+        related = session.effects is not None or bool(session.place != place)
+        session.go(place, remember=remember)
+        self._status = ""
+        self.timeline.go(session.row_of_place(), centre=centre)
+        if related:
+            self.timeline.redraw()
+        self._show_lanes()
+        self._show_footer()
+        self.busy = True
+        self.set_timer(_INSPECT_S, self._inspect_if_still(session.place))
+
+    def _inspect_if_still(self, place: int) -> Any:
+        def inspect() -> None:
+            if self.session.place == place and self.screen_stack:
+                self._show_inspector()
+                self.busy = False
+
+        return inspect
+
+    def on_resize(self, event: events.Resize) -> None:
+        """Use the new size, which the app and its parts will have a moment later."""
+        self._fit(event.size.width, event.size.height)
+        self._show_header(event.size)
+        self.call_after_refresh(self._redraw)
+
+    def on_timeline_resized(self) -> None:
+        """Lay the columns out again."""
+        self._show_rows()
+
+    def on_lanes_view_resized(self) -> None:
+        """Count again."""
+        self._show_lanes()
+
+    def _redraw(self) -> None:
+        self._show_rows()
+        self._show_lanes()

@@ -1,0 +1,75 @@
+"""The lines at the top and the bottom: what is open and how it compares; which keys there are."""
+
+from __future__ import annotations
+
+from textual import events
+from textual.content import Content
+from textual.widgets import Static
+
+from rsltrace_viewer.model.cells import cells, fit, wrap
+from rsltrace_viewer.terminal.keys import footer_keys
+
+
+class HeaderBar(Static):
+    """What is open, in a line; with two traces how they compare, in one or two more."""
+
+    DEFAULT_CSS = """
+    HeaderBar { height: auto; background: $panel; color: $text; padding: 0 1; }
+    """
+
+    def show(
+        self, title: str, facts: str, verdict: str, *, bad: bool, lines: int, width: int
+    ) -> None:
+        """Show a title, facts about it, and the verdict on two runs in at most ``lines``, on a
+        screen of ``width`` cells."""
+        width = max(width - 2, 1)
+        title = fit(title, min(width, cells(title)))
+        rest = f"  {facts}"
+        room = width - cells(title)
+        rest = rest if cells(rest) <= room else fit(rest, room)
+        parts: list[tuple[str, str] | str] = [(title, "bold"), (rest, "$text-muted")]
+        if verdict and lines:
+            style = "bold $text-error" if bad else "bold $text-success"
+            wrapped = wrap(verdict, width)
+            shown = wrapped[:lines]
+            if len(wrapped) > lines:
+                shown[-1] = fit(f"{shown[-1]} {wrapped[lines]}", width)
+            parts += [("\n" + line, style) for line in shown]
+        self.update(Content.assemble(*parts))
+
+
+class FooterBar(Static):
+    """The most needed keys, as many as fit. A click does what the key does."""
+
+    DEFAULT_CSS = """
+    FooterBar { height: 1; background: $panel; color: $text; padding: 0 1; }
+    """
+
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
+        super().__init__(id=id)
+        self._places: list[tuple[int, str]] = []
+
+    def show(self, *, two: bool, searching: str, status: str) -> None:
+        """Show the keys, and a status at the right."""
+        width = self.size.width - 2
+        room = width - (cells(status) + 2 if status else 0)
+        parts: list[Content | tuple[str, str] | str] = []
+        self._places = []
+        used = 0
+        for shown, words, action in footer_keys(two=two, searching=searching):
+            length = cells(shown) + cells(words) + 3
+            if used + length > room:
+                continue
+            used += length
+            parts += [(shown, "bold $text-primary"), f" {words}  "]
+            self._places.append((used, action))
+        if status:
+            parts += [" " * max(width - used - cells(status), 1), (status, "bold")]
+        self.update(Content.assemble(*parts), layout=False)
+
+    async def on_click(self, event: events.Click) -> None:
+        """Do what the key does that was clicked."""
+        for end, action in self._places:
+            if event.x - 1 < end:
+                await self.app.run_action(f"app.{action}")
+                return

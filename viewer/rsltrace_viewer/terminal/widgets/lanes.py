@@ -1,0 +1,239 @@
+"""The overview: one lane per node, time from left to right, the selected event as a column."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from rich.segment import Segment as Piece
+from rich.style import Style
+from textual import events
+from textual.binding import Binding, BindingType
+from textual.geometry import Region
+from textual.message import Message
+from textual.strip import Strip
+from textual.widget import Widget
+
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace_viewer.model.cells import cells, fit
+from rsltrace_viewer.model.lanes import Lane, Lanes
+from rsltrace_viewer.model.timeline.short_names import ShortNames
+
+_BLOCKS = " ▁▂▃▄▅▆▇█"
+_LABEL_MAX = 28
+
+
+class LanesView(Widget, can_focus=True):
+    """Draws ``Lanes``. Left and right move by a column when it has the focus."""
+
+    COMPONENT_CLASSES: ClassVar[set[str]] = {
+        f"lanes--{name}"
+        for name in ("axis", "label", "own", "bar", "cursor", "raised", "divergence", "empty")
+    }
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("left,h", "move(-1)", "a column back", show=False),
+        Binding("right", "move(1)", "a column on", show=False),
+    ]
+    DEFAULT_CSS = """
+    LanesView { background: $surface; height: 6; }
+    LanesView > .lanes--axis { color: $text-muted; }
+    LanesView > .lanes--label { color: $text-muted; }
+    LanesView > .lanes--own { color: $text; text-style: bold; }
+    LanesView > .lanes--bar { color: $text-primary; }
+    LanesView > .lanes--cursor { color: $text-accent; background: $accent 30%; text-style: bold; }
+    LanesView > .lanes--raised { color: $text-error; text-style: bold; }
+    LanesView > .lanes--divergence { color: $text-error; background: $error 30%; }
+    LanesView > .lanes--empty { color: $text-muted; }
+    """
+
+    class Picked(Message):
+        """A column was clicked: ``position`` is a time, or an event where each has its column."""
+
+        def __init__(self, position: int, *, order: bool, label: str) -> None:
+            super().__init__()
+            self.position = position
+            self.order = order
+            self.label = label
+
+    class Resized(Message):
+        """There is another number of columns."""
+
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
+        super().__init__(id=id)
+        self.lanes: Lanes | None = None
+        self.cursor: int = 0
+        self._position = 0
+        self._own = ""
+        self._divergence: int | None = None
+        self._label_width = 8
+        self._names = ShortNames(())
+        self._styles: dict[str, Style] = {}
+
+    @property
+    def columns(self) -> int:
+        """How many columns there are for events."""
+        return max(self.size.width - self._label_width - 3, 1)
+
+    def fit_labels(self, labels: list[str], width: int) -> None:
+        """Make room for the names of the lanes in ``width`` cells."""
+        shown = [printable(label) for label in labels]
+        longest = max(map(cells, shown), default=4)
+        self._names = ShortNames(shown)
+        self._label_width = max(4, min(longest, _LABEL_MAX, width // 6))
+
+    def show(self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None) -> None:
+        """Show lanes with the cursor at a time (or index), in the lane named ``own``.
+
+        ``divergence`` is the time (or index) where two runs diverge.
+        """
+        before = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
+        axis = self._position
+        self.lanes = lanes
+        self._position = position
+        self._own = own
+        self.cursor = lanes.window.column(position, lanes.columns)
+        self._divergence = (
+            None if divergence is None else lanes.window.column(divergence, lanes.columns)
+        )
+        now = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
+        width, last = self.size.width, self.size.height - 1
+        if now[0] is before[0] and now[2:] == before[2:] and now[1] in self._labels(lanes):
+            # Only the name of the lane one is in, and the time, can be different.
+            if now[1] != before[1]:
+                for name in {now[1], before[1]} & set(self._labels(lanes)):
+                    y = self._labels(lanes).index(name) - now[4]
+                    self.refresh(Region(0, y, width, 1))
+            if axis != position:
+                self.refresh(Region(0, last, width, 1))
+        else:
+            self.refresh()
+
+    @staticmethod
+    def _labels(lanes: Lanes) -> list[str]:
+        return [lane.label for lane in lanes.lanes]
+
+    def notify_style_update(self) -> None:
+        """Forget the styles of the old theme."""
+        self._styles.clear()
+        super().notify_style_update()
+
+    def on_resize(self, event: events.Resize) -> None:
+        """Count the columns again."""
+        self.post_message(self.Resized())
+
+    def on_click(self, event: events.Click) -> None:
+        """Go to the column that was clicked, in the lane that was clicked."""
+        column = event.x - self._label_width - 2
+        if self.lanes is None or not 0 <= column < self.lanes.columns:
+            return
+        place = self._first_lane() + event.y
+        names = [lane.label for lane in self.lanes.lanes]
+        label = names[place] if event.y < self.size.height - 1 and place < len(names) else ""
+        window = self.lanes.window
+        position = window.at(column, self.lanes.columns)
+        self.post_message(self.Picked(position, order=window.order, label=label))
+
+    def action_move(self, step: int) -> None:
+        """Go to the next (or previous) column with something in it."""
+        lanes = self.lanes
+        if lanes is None:
+            return
+        column = self.cursor + step
+        while 0 <= column < lanes.columns:
+            if any(_has(lane, column) for lane in lanes.lanes):
+                position = lanes.window.at(column, lanes.columns)
+                order = lanes.window.order
+                self.post_message(self.Picked(position, order=order, label=""))
+                return
+            column += step
+
+    def _style(self, name: str) -> Style:
+        style = self._styles.get(name)
+        if style is None:
+            style = self._styles[name] = self.get_component_rich_style(f"lanes--{name}")
+        return style
+
+    def _first_lane(self) -> int:
+        """Which lane is on top: the selected one stays in sight when there are too many."""
+        if self.lanes is None:
+            return 0
+        room = self.size.height - 1
+        names = [lane.label for lane in self.lanes.lanes]
+        if len(names) <= room or self._own not in names:
+            return 0
+        return max(0, min(names.index(self._own) - room // 2, len(names) - room))
+
+    def render_line(self, y: int) -> Strip:
+        """Return a lane, or the axis at the bottom."""
+        width = self.size.width
+        if self.lanes is None:
+            return Strip([Piece(" " * width, self._style("empty"))], width)
+        if y == self.size.height - 1:
+            return self._axis(self.lanes, width)
+        place = self._first_lane() + y
+        if place >= len(self.lanes.lanes):
+            return Strip([Piece(" " * width, self._style("empty"))], width)
+        return self._lane(self.lanes.lanes[place], width)
+
+    def _lane(self, lane: Lane, width: int) -> Strip:
+        own = lane.label == self._own
+        label = self._names.fit(printable(lane.label), self._label_width)
+        pieces = [
+            Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))
+        ]
+        text = lane.letters or "".join(_BLOCKS[level] for level in lane.levels)
+        bar = self._style("bar")
+        for column, character in enumerate(text):
+            style = bar
+            if column in lane.raised:
+                character, style = "!", self._style("raised")
+            if column == self._divergence:
+                character = "┆" if character == " " else character
+                style = style + self._style("divergence")
+            if column == self.cursor:
+                character = "│" if character == " " else character
+                style = style + self._style("cursor")
+            pieces.append(Piece(character, style))
+        return Strip(pieces).simplify().adjust_cell_length(width, bar)
+
+    def _axis(self, lanes: Lanes, width: int) -> Strip:
+        window = lanes.window
+        if window.order:
+            left, right = f"event {max(window.start, 0)}", f"{window.end - 1}"
+            here = f"▲ {self._position}"
+            scale = "one column is one event"
+        else:
+            left = f"{format_seconds(window.start)[:-6]} s"
+            right = f"{format_seconds(window.end - 1)[:-6]} s"
+            here = f"▲ {format_seconds(self._position)[:-3]} s"
+            scale = f"{format_duration(window.length // max(lanes.columns, 1))} per column"
+        if lanes.known < 1:
+            scale += f", {lanes.known:.0%} read"
+        line = [" "] * lanes.columns
+        _put(line, 0, left)
+        _put(line, lanes.columns - len(right), right)
+        middle = (lanes.columns - len(scale)) // 2
+        if abs(self.cursor - lanes.columns // 2) > len(scale) // 2 + len(here) + 2:
+            _put(line, middle, scale)
+        if self._divergence is not None and 0 <= self._divergence < lanes.columns:
+            _put(line, self._divergence, "≠")
+        if 0 <= self.cursor < lanes.columns:
+            start = min(self.cursor, max(lanes.columns - len(here), 0))
+            text = here if start == self.cursor else f"{here[2:]} ▲"
+            start = start if start == self.cursor else self.cursor - len(text) + 1
+            _put(line, max(start, 0), text, gap=True)
+        text = " " * (self._label_width + 2) + "".join(line)
+        return Strip([Piece(fit(text, width), self._style("axis"))], width)
+
+
+def _has(lane: Lane, column: int) -> bool:
+    return lane.letters[column] != " " if lane.letters else lane.levels[column] > 0
+
+
+def _put(line: list[str], start: int, text: str, *, gap: bool = False) -> None:
+    if gap:
+        _put(line, start - 1, " ")
+        _put(line, start + len(text), " ")
+    for offset, character in enumerate(text):
+        if 0 <= start + offset < len(line):
+            line[start + offset] = character

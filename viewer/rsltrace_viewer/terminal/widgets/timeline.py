@@ -1,0 +1,252 @@
+"""The list of events. Only the rows on screen are read and drawn, whatever the trace's length."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
+
+from rich.segment import Segment as Piece
+from rich.style import Style
+from textual import events
+from textual.geometry import Region, Size
+from textual.message import Message
+from textual.scroll_view import ScrollView
+from textual.strip import Strip
+
+from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.timeline.columns import Columns
+from rsltrace_viewer.model.timeline.events import EventText
+from rsltrace_viewer.model.view import Sign
+from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
+
+_MARGIN = 3
+"""Rows kept in sight above and below the cursor."""
+_DRAWN_MAX = 1000
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """What a row says: the event, how it compares, whether it is marked, and b's other hashes."""
+
+    event: EventText
+    sign: Sign | None = None
+    marked: bool = False
+    related: str = ""
+    """``cause`` or ``effect`` of the selected event."""
+
+
+_SIGN_STYLES = {
+    Sign.MATCH: "muted",
+    Sign.DIFFERS: "differs",
+    Sign.ONLY_A: "only-a",
+    Sign.ONLY_B: "only-b",
+    Sign.MOVED: "moved",
+    Sign.UNKNOWN: "muted",
+}
+_STYLED = {
+    "index": "muted",
+    "time": "time",
+    "node": "node",
+    "kind": "muted",
+    "input": "muted",
+    "output": "muted",
+}
+
+
+class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
+    """Rows that somebody else provides (``source``), a header, and a cursor."""
+
+    COMPONENT_CLASSES: ClassVar[set[str]] = {
+        f"timeline--{name}"
+        for name in (
+            "header",
+            "muted",
+            "time",
+            "node",
+            "plain",
+            "cursor",
+            "related",
+            "mark",
+            "lead",
+            "error",
+            "warning",
+            "differs",
+            "only-a",
+            "only-b",
+            "moved",
+        )
+    }
+    DEFAULT_CSS = """
+    Timeline { background: $background; scrollbar-size: 1 1; overflow-x: hidden;
+               overflow-y: scroll; }
+    Timeline > .timeline--header { color: $text-muted; text-style: bold; background: $surface; }
+    Timeline > .timeline--muted { color: $text-muted; }
+    Timeline > .timeline--time { color: $text; }
+    Timeline > .timeline--node { color: $text-primary; }
+    Timeline > .timeline--plain { color: $text; }
+    Timeline > .timeline--cursor { background: $primary 30%; text-style: bold; }
+    Timeline > .timeline--related { background: $secondary 25%; }
+    Timeline > .timeline--lead { color: $text; text-style: bold; }
+    Timeline > .timeline--mark { color: $text-accent; text-style: bold; }
+    Timeline > .timeline--error { color: $text-error; text-style: bold; }
+    Timeline > .timeline--warning { color: $text-warning; }
+    Timeline > .timeline--differs { color: $text-error; text-style: bold; }
+    Timeline > .timeline--only-a { color: $text-warning; text-style: bold; }
+    Timeline > .timeline--only-b { color: $text-success; text-style: bold; }
+    Timeline > .timeline--moved { color: $text-secondary; }
+    """
+
+    class Picked(Message):
+        """A row was clicked."""
+
+        def __init__(self, row: int) -> None:
+            super().__init__()
+            self.row = row
+
+    class Resized(Message):
+        """There is another number of cells to lay columns out in."""
+
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
+        super().__init__(id=id)
+        self.cursor = 0
+        self.empty = "no events"
+        self._source: Callable[[int], Row] | None = None
+        self._count = 0
+        self._columns = Columns(0)
+        self._styles: dict[str, Style] = {}
+        self._drawn: dict[int, tuple[Row, bool]] = {}
+        """What each row looked like when it was drawn last."""
+
+    @property
+    def page(self) -> int:
+        """How many rows are in sight."""
+        return max(self.scrollable_content_region.height - 1, 1)
+
+    @property
+    def row_width(self) -> int:
+        """Cells of a row."""
+        return self.scrollable_content_region.width
+
+    def show(self, source: Callable[[int], Row], count: int, columns: Columns) -> None:
+        """Show ``count`` rows from ``source``; the cursor keeps its row if there is one."""
+        self._source = source
+        self._columns = columns
+        if count != self._count:
+            self._count = count
+            set_virtual_size(self, Size(max(self.row_width, 1), count + 1))
+        self.cursor = max(min(self.cursor, count - 1), 0)
+        self.refresh()
+
+    def go(self, row: int, *, centre: bool = False) -> None:
+        """Move the cursor to ``row`` and bring it into sight."""
+        old, self.cursor = self.cursor, max(min(row, self._count - 1), 0)
+        top = round(self.scroll_y)
+        page = self.page
+        margin = min(_MARGIN, (page - 1) // 2)
+        wanted = top
+        if centre or not top - page < self.cursor < top + 2 * page:
+            wanted = self.cursor - page // 2
+        elif self.cursor < top + margin:
+            wanted = self.cursor - margin
+        elif self.cursor >= top + page - margin:
+            wanted = self.cursor - page + margin + 1
+        wanted = max(min(wanted, self._count - page), 0)
+        if wanted != top:
+            self.scroll_to(y=wanted, animate=False, force=True, immediate=True)
+            self.refresh()
+        else:
+            for row in {old, self.cursor}:
+                self._refresh_row(row)
+
+    def page_to(self, row: int, pages: int) -> None:
+        """Move the cursor to ``row`` and the view by whole pages, so that nothing is skipped."""
+        self.scroll_to(
+            y=self.scroll_y + pages * self.page, animate=False, force=True, immediate=True
+        )
+        self.go(row)
+        self.refresh()
+
+    def redraw(self) -> None:
+        """Draw the rows again whose look has changed."""
+        top = round(self.scroll_y)
+        for y in range(1, self.size.height):
+            row = top + y - 1
+            if row < self._count and self._drawn.get(row) != self._look(row):
+                self._refresh_row(row)
+
+    def _look(self, row: int) -> tuple[Row, bool] | None:
+        return (self._source(row), row == self.cursor) if self._source is not None else None
+
+    def notify_style_update(self) -> None:
+        """Forget the styles of the old theme."""
+        self._styles.clear()
+        super().notify_style_update()
+
+    def on_resize(self, event: events.Resize) -> None:
+        """Lay out again."""
+        set_virtual_size(self, Size(max(self.row_width, 1), self._count + 1))
+        self.post_message(self.Resized())
+
+    def on_click(self, event: events.Click) -> None:
+        """Select the row that was clicked."""
+        row = round(self.scroll_y) + event.y - 1
+        if event.y >= 1 and row < self._count:
+            self.post_message(self.Picked(row))
+
+    def _refresh_row(self, row: int) -> None:
+        y = row - round(self.scroll_y) + 1
+        if 0 < y < self.size.height:
+            self.refresh(Region(0, y, self.size.width, 1))
+
+    def _style(self, name: str) -> Style:
+        style = self._styles.get(name)
+        if style is None:
+            style = self.get_component_rich_style(f"timeline--{name}")
+            if name in ("cursor", "related"):
+                style = background_of(style)
+            self._styles[name] = style
+        return style
+
+    def render_line(self, y: int) -> Strip:
+        """Return line ``y`` of the widget: the header, or a row."""
+        width = self.size.width
+        if y == 0:
+            return Strip([Piece(fit(self._columns.header(), width), self._style("header"))], width)
+        row = round(self.scroll_y) + y - 1
+        if self._source is None or not 0 <= row < self._count:
+            text = f"  {self.empty}" if y == 2 and not self._count else ""
+            return Strip([Piece(fit(text, width), self._style("muted"))], width)
+        shown = self._source(row)
+        if len(self._drawn) > _DRAWN_MAX:
+            self._drawn.clear()
+        self._drawn[row] = shown, row == self.cursor
+        return self._row(row, shown, width)
+
+    def _row(self, row: int, shown: Row, width: int) -> Strip:
+        selected = row == self.cursor
+        event = shown.event
+        mark = "!" if event.raised else "*" if shown.marked else "w" if event.warns else " "
+        sign = shown.sign.value if shown.sign is not None else " "
+        lead = ">" if selected else {"cause": "←", "effect": "→"}.get(shown.related, " ")
+        pieces = [Piece(lead, self._style("lead"))]
+        for name, text in self._columns.cells(event, sign=sign, mark=mark):
+            pieces.append(Piece(text + " ", self._style(self._style_of(name, shown, mark))))
+        strip = Strip(pieces).adjust_cell_length(width, self._style("plain"))
+        over = "cursor" if selected else "related" if shown.related else ""
+        if not over:
+            return strip
+        style = self._style(over)
+        return Strip([Piece(text, (old or style) + style) for text, old, _ in strip], width)
+
+    def _style_of(self, name: str, shown: Row, mark: str) -> str:
+        sign = shown.sign
+        if name in ("sign", "index") and sign is not None:
+            return _SIGN_STYLES[sign]
+        if sign in (Sign.ONLY_A, Sign.ONLY_B, Sign.DIFFERS) and name != "time":
+            return _SIGN_STYLES[sign] if name in ("input", "output", "outputs") else "plain"
+        if name == "mark":
+            return {"!": "error", "w": "warning"}.get(mark, "mark")
+        if name == "outputs":
+            return "error" if shown.event.raised else "warning" if shown.event.warns else "plain"
+        return _STYLED.get(name, "plain")

@@ -1,1 +1,0 @@
-"""One widget per file; each draws what ``rsltrace_viewer.model`` computed."""
