@@ -1,6 +1,9 @@
 # Two commands do everything on a fresh machine, set-up included:
 #   make demo   record the sample job twice and compare; show where two other runs diverge
 #   make test   lint, types, architecture and tests
+# What takes long or needs a quiet machine has targets of its own, which CI runs, too:
+#   make test-native   comparisons with rclpy's own executors over DDS, in real time
+#   make test-long     long campaigns, and everything random with many more cases
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
 PYTHON ?= python3
@@ -11,7 +14,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-kilted rclpy-tests lint types architecture unit setup docs samples bench pictures clean
+.PHONY: demo test test-native test-long test-kilted rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -45,8 +48,20 @@ types: $(INSTALLED)
 architecture: $(INSTALLED)
 	$(BIN)/lint-imports
 
-unit: $(INSTALLED)
-	$(BIN)/python -m pytest -n auto $(PYTEST)
+# The tests start hundreds of processes: none of them shall have to compile our modules again,
+# wherever PYTHONDONTWRITEBYTECODE is set.
+compiled: $(INSTALLED)
+	@$(BIN)/python -m compileall -q rsltrace viewer
+
+unit: compiled
+	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST)
+
+test-native: compiled
+	$(BIN)/python -m pytest -m native $(PYTEST)
+
+LONG := HYPOTHESIS_PROFILE=long RSLTRACE_RUNS=100 RSLTRACE_PLANTED=40
+test-long: compiled
+	$(LONG) $(BIN)/python -m pytest -n auto --dist worksteal -m 'long or repeated or hypothesis' $(PYTEST)
 
 # rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
 RCLPY ?=

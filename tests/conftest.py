@@ -1,12 +1,15 @@
-"""How hypothesis looks for counterexamples: the same ones every time, with all the time it needs.
+"""For all tests: how hypothesis searches, what garbage collection walks, which sets stay out.
 
 A loaded machine must not fail a test, nor may a test pass today and fail tomorrow. To look for new
 counterexamples: ``HYPOTHESIS_PROFILE=explore python -m pytest …``.
 """
 
+import gc
 import os
 import signal
+from collections.abc import Generator
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile(
@@ -15,8 +18,44 @@ settings.register_profile(
 settings.register_profile(
     "explore", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
 )
+settings.register_profile("long", settings.get_profile("same"), max_examples=1000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 # A shell that starts us in the background has us ignore Ctrl-C, and so would all that we start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+APART = ("native", "long")
+"""Marked sets that run when they are asked for: with ``-m``, or by the name of a file or test."""
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Thousands of tests are made, and none becomes garbage."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
+def pytest_collection_finish() -> None:
+    """Every simulated run collects garbage when it ends; it need not walk all tests each time."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the sets of ``APART`` unless they are asked for."""
+    if config.option.markexpr:
+        return
+    named = {(config.invocation_params.dir / arg.split("::")[0]).resolve() for arg in config.args}
+    left_out = [
+        item
+        for item in items
+        if item.path not in named and any(item.get_closest_marker(name) for name in APART)
+    ]
+    if left_out:
+        items[:] = [item for item in items if item not in set(left_out)]
+        config.hook.pytest_deselected(items=left_out)

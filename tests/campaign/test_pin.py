@@ -12,7 +12,7 @@ import pytest
 from rsltrace.campaign.perturb import can_fix_addresses
 from rsltrace.trace.reader import Trace
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.ros
 
 SHOW = (
     "log(' '.join([str(os.environ.get(n)) for n in "

@@ -17,7 +17,7 @@ import pytest
 
 from rsltrace.campaign.perturb import KINDS, surroundings
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = pytest.mark.ros
 
 ORDER_OF_A_SET = "log(' '.join({'a', 'b', 'c', 'd', 'e', 'f'}))"
 AS_IT_IS = "guard: {order: allow}\n"
@@ -42,6 +42,7 @@ def test_one_digest_is_stated_as_what_was_tried(rsltrace: Command, job: WriteJob
     assert "hash seed" in second
 
 
+@pytest.mark.long
 def test_without_the_pin_the_hash_seed_shows(
     rsltrace: Command, job: WriteJob, tmp_path: Path
 ) -> None:
@@ -64,6 +65,7 @@ def test_without_the_pin_the_hash_seed_shows(
     assert rsltrace(*shlex.split(narrow)[1:]).stdout.startswith(f"digest {digest} ")
 
 
+@pytest.mark.long
 def test_a_job_that_differs_by_itself_is_told_so(rsltrace: Command, job: WriteJob) -> None:
     path = job("log(str(time.time_ns()))", "guard: false\n")
     done = rsltrace("verify", path, "--runs", "3", "--json")
@@ -85,6 +87,7 @@ def test_a_job_that_fails_is_trouble(rsltrace: Command, job: WriteJob) -> None:
     assert "there is no such job file" in missing.stderr
 
 
+@pytest.mark.long
 def test_a_run_that_crashes_is_trouble_and_says_where(rsltrace: Command, job: WriteJob) -> None:
     crash = (
         "os.getcwd().endswith('x') and "
@@ -97,6 +100,7 @@ def test_a_run_that_crashes_is_trouble_and_says_where(rsltrace: Command, job: Wr
     assert "| woe" in done.stderr
 
 
+@pytest.mark.long
 def test_a_run_that_hangs_is_killed(rsltrace: Command, job: WriteJob) -> None:
     hang = "os.getcwd().endswith('x') and signal.pause()"
     done = rsltrace("verify", job(hang), "--runs", "2", "--timeout", "20", timeout=300)
@@ -135,6 +139,7 @@ def _processes_with(text: str) -> list[str]:
     return found
 
 
+@pytest.mark.long
 def test_what_record_takes_verify_takes(rsltrace: Command, job: WriteJob, tmp_path: Path) -> None:
     job("log(str(self.declare_parameter('rate', 0).value) + os.environ.get('X', ''))")
     (tmp_path / "more.yaml").write_text("n: {ros__parameters: {rate: 7}}\n")

@@ -16,6 +16,9 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from click.testing import CliRunner
+
+from rsltrace.cli.main import cli
 
 SAMPLES = Path(__file__).parent.parent.parent / "sample_traces"
 PAIR = SAMPLES / "nondeterministic_callback"
@@ -25,20 +28,29 @@ Done = subprocess.CompletedProcess[str]
 
 
 @pytest.fixture
-def diff(tmp_path: Path) -> Callable[..., Done]:
-    def call(*arguments: object, **environment: str) -> Done:
-        return subprocess.run(
-            [sys.executable, "-m", "rsltrace", "diff", *map(str, arguments)],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONIOENCODING": "utf-8", **environment},
-            capture_output=True,
-            text=True,
-            encoding="utf-8",
-            timeout=300,
-            check=False,
-        )
+def diff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
+    """Run the command in this process; what only a process shows, the tests of terminals ask."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object, charset: str = "utf-8") -> Done:
+        try:
+            runner = CliRunner(mix_stderr=False, charset=charset)  # click before 8.2
+        except TypeError:
+            runner = CliRunner(charset=charset)
+        words = ["diff", *map(str, arguments)]
+        result = runner.invoke(cli, words, catch_exceptions=False)
+        return Done(words, result.exit_code, result.stdout, result.stderr)
 
     return call
+
+
+def test_the_exit_status_is_that_of_the_process(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("hello")
+    for other, status in ((A, 0), (B, 1), ("notes.txt", 2)):
+        command = [sys.executable, "-m", "rsltrace", "diff", str(A), str(other)]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        assert done.returncode == status
+        assert bool(done.stderr) == (status == 2)
 
 
 def test_exit_status_0_for_identical_runs(diff: Callable[..., Done]) -> None:
@@ -328,7 +340,7 @@ def test_a_small_terminal_is_enough(sample: str) -> None:
 
 
 def test_a_terminal_without_unicode(diff: Callable[..., Done]) -> None:
-    done = diff(A, B, PYTHONIOENCODING="ascii")
+    done = diff(A, B, charset="ascii")
     assert done.stdout.isascii()
     assert "\\u" not in done.stdout
     assert "`- 64 /obstacle_filter" in done.stdout
@@ -375,10 +387,7 @@ def test_nothing_is_written_beside_the_traces(diff: Callable[..., Done], tmp_pat
 def test_a_bug_is_trouble_and_not_a_divergence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from click.testing import CliRunner
-
     import rsltrace.diff.traces.diff
-    from rsltrace.cli.main import cli
 
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a bug")

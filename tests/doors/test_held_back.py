@@ -13,7 +13,8 @@ from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
-from tests.ros.test_mains import main_spec
+
+from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 

@@ -15,10 +15,10 @@ from typing import Any
 import pytest
 import rclpy
 from rclpy.node import Node
-from tests.ros.test_mains import main_spec
 
 import rsltrace
 from rsltrace.errors import UnsupportedError
+from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
 

@@ -20,7 +20,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.native]
 
 SCRIPT = Path(__file__).with_name("qos_matrix.py")
 COUNT = 120

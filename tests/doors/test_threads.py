@@ -17,9 +17,9 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, Si
 from rclpy.node import Node
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
-from tests.ros.test_mains import Counter, listener, main_spec, seconds
 
 from rsltrace.errors import DeadlockError, NodeError
+from tests.doors.test_mains import Counter, listener, main_spec, seconds
 
 pytestmark = pytest.mark.ros
 

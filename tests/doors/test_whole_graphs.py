@@ -13,9 +13,9 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-from tests.ros.test_mains import main_spec, seconds
 
 from rsltrace.errors import DeadlockError
+from tests.doors.test_mains import main_spec, seconds
 
 pytestmark = pytest.mark.ros
 

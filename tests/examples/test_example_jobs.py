@@ -73,7 +73,6 @@ def test_the_robot_drives_its_laps_and_knows_where_it_is(
 
 
 @pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")
-@pytest.mark.slow
 def test_the_real_robot_is_followed_to_its_end(capfd: pytest.CaptureFixture[str]) -> None:
     result, log = run("sensor_fusion/job_husky.yaml", capfd)
     assert result.sim_seconds == "396.000000000"

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[2]
 THROUGHPUT = ROOT / "benchmarks" / "throughput.py"
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.slow,
+    pytest.mark.native,
     pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy"),
 ]
 

@@ -17,7 +17,7 @@ import pytest
 BAG = Path(__file__).resolve().parents[3] / "shared" / "data" / "husky_outdoor"
 pytestmark = [
     pytest.mark.skipif(not BAG.exists(), reason="the Husky recording is not here"),
-    pytest.mark.slow,
+    pytest.mark.long,
 ]
 Load = Callable[[str, str], ModuleType]
 Point = tuple[float, float]

@@ -124,7 +124,6 @@ def test_the_command_lists_and_filters_its_cases() -> None:
 
 
 @pytest.mark.ros
-@pytest.mark.slow
 def test_both_rsltrace_cases_do_the_same_work(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     figures = {}

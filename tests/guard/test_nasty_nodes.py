@@ -30,7 +30,7 @@ from rsltrace.campaign.perturb import (
 from rsltrace.trace.reader import Trace
 from tests.guard.nasty_nodes import CASES, DETECTED, DETERMINISTIC
 
-pytestmark = [pytest.mark.ros, pytest.mark.slow]
+pytestmark = [pytest.mark.ros, pytest.mark.long]
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "guard.md"
 RUNS = 2

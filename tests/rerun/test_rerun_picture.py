@@ -16,7 +16,7 @@ from rsltrace_viewer.rerun_export import picture
 from rsltrace_viewer.rerun_export.export import export
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.native,
     pytest.mark.skipif(sys.version_info < (3, 11), reason="needs Rerun 0.41"),
     pytest.mark.skipif(
         picture.software_driver() is None,

@@ -23,13 +23,12 @@ from rsltrace.campaign.perturb import record_in, surroundings
 
 pytestmark = [
     pytest.mark.ros,
-    pytest.mark.slow,
     pytest.mark.skipif(
         importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs"
     ),
 ]
 
-RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "100")), 20)
+RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "4")), 20)
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +71,7 @@ def everybody(prefix: Path, folder: Path) -> Path:
     return job
 
 
+@pytest.mark.native
 def test_programs_do_what_they_do_over_dds(prefix: Path, tmp_path: Path) -> None:
     natively = demos.run_natively(prefix, tmp_path / "native")
     # Over DDS the census was taken before the clients came; so here.
@@ -90,6 +90,7 @@ def test_programs_do_what_they_do_over_dds(prefix: Path, tmp_path: Path) -> None
     assert "camera serves /camera/change_state lifecycle_msgs/srv/ChangeState" in ours["census"]
 
 
+@pytest.mark.repeated
 def test_one_digest_whatever_surrounds_the_run(prefix: Path, tmp_path: Path) -> None:
     job = everybody(prefix, tmp_path)
 

@@ -230,6 +230,7 @@ def test_what_cannot_be_run_is_said_before_a_file_is_made(
     assert not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.repeated
 def test_mains_and_threads_give_one_digest_however_the_process_differs(
     rsltrace: Any, tmp_path: Path, workspace: Path
 ) -> None:
