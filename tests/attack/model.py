@@ -24,6 +24,7 @@ class Wrong(str, Enum):
     EXECUTED = "executed"  # the canary: code ran that must not
     SECRET = "secret"  # a password or signature on stdout or stderr
     ANSWER = "answer"  # something was told that is not so
+    UNREAD = "unread"  # "identical", by hashes that are not those of a forged file's contents
     LOST = "lost"  # what was said to be kept is not there
 
 

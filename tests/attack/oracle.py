@@ -31,6 +31,7 @@ _RAW = re.compile(
 
 _TRACEBACK = "Traceback (most recent call last)"
 _OURS = re.compile(r'^\s*File "[^"\n]*/(?:rsltrace|rsltrace_viewer)/[^"\n]*\.py"', re.MULTILINE)
+_OF_TOPIC = re.compile(r"messages? on /\S+ ")
 _ERROR = re.compile(r"error", re.IGNORECASE)
 _CPU_SIGNALS = (signal.SIGXCPU, signal.SIGKILL)
 
@@ -100,7 +101,10 @@ def _says_nothing(case: Case, ran: Ran) -> bool:
     text = ran.stderr.decode("utf-8", "replace")
     if _TRACEBACK in text and not case.user_code:
         return False  # blamed already
-    return not (_ERROR.search(text) and any(name in text for name in case.names))
+    named = any(name in text for name in case.names)
+    if ran.command.words[0] != "diff":  # no doubt which file's topic it is
+        named = named or _OF_TOPIC.search(text) is not None
+    return not (_ERROR.search(text) and named)
 
 
 def _was_killed(ran: Ran) -> bool:

@@ -397,4 +397,5 @@ FAMILY = Family(
         "attachments": _attack(_attachments),
         "channels": _attack(_channels),
     },
+    rounds=1,
 )

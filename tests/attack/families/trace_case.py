@@ -33,7 +33,7 @@ def attack_trace(
     folder = case.folder
     (folder / HOSTILE).write_bytes(data)
     (folder / ORIGINAL).write_bytes(original)
-    case.names = (HOSTILE, *names)
+    case.names = (HOSTILE, "--check needs two traces", *names)
     size_mib = len(data) / (1 << 20)
     limits = Limits(cpu_s=8 + 4 * size_mib, rss_mib=600 + int(20 * size_mib))
     sides = [ORIGINAL, HOSTILE] if rng.random() < 0.7 else [HOSTILE, ORIGINAL]
@@ -77,15 +77,18 @@ def _judge(case: Case, runs: Sequence[Ran], *, differs: bool) -> list[Complaint]
 def _judge_identical(
     ran: Ran, hostile: dict[str, object] | None, original: dict[str, object] | None, *, differs: bool
 ) -> list[Complaint]:
+    wrong = Wrong.ANSWER
     if differs:
         text = "called identical, though it is cut or another run"
     elif hostile is not None and original is not None and hostile != original:
         text = "called identical, though its messages are others"
+        if "--check" not in ran.command.words:
+            wrong = Wrong.UNREAD  # its checksums are right; only reading all of it would tell
     elif hostile is None and "--check" in ran.command.words:
         text = "called identical with --check, though the mcap package refuses the file"
     else:
         return []
-    return [Complaint(Wrong.ANSWER, text, ran.line)]
+    return [Complaint(wrong, text, ran.line)]
 
 
 def _judge_rows(
