@@ -75,7 +75,7 @@ def _keep(case: Case, runs: list[Ran], verdict: Verdict, kept: Path) -> None:
     with contextlib.suppress(OSError, shutil.Error):  # pipes and devices stay behind
         shutil.copytree(case.folder, place, symlinks=True, ignore=_too_much)
     place.mkdir(parents=True, exist_ok=True)
-    lines = [verdict.reproducer, ""]
+    lines = [verdict.reproducer, case.note, ""]
     for complaint in verdict.complaints:
         lines += [f"{complaint.wrong.value}: {complaint.text}", f"    {complaint.command}", ""]
     for ran in runs:
@@ -176,5 +176,5 @@ def slice_of(families: Iterable[Family]) -> Iterator[tuple[Family, int]]:
     """Yield what ``make test`` tries: each attack that does not wait, a few seeds of it."""
     for family in families:
         for seed in range(family.rounds * len(family.attacks)):
-            if family.attack_of(seed) not in family.slow:
+            if family.in_slice(seed):
                 yield family, seed

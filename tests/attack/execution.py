@@ -112,6 +112,10 @@ def _in_child(command: Command, places: tuple[Path, Path]) -> NoReturn:
         os.environ.update({"COLUMNS": "100", "NO_COLOR": "1", **dict(command.environment)})
         _redirect(command, places)
         _limit(command)
+        if command.user is not None:
+            os.setgroups([])
+            os.setresgid(command.user, command.user, command.user)
+            os.setresuid(command.user, command.user, command.user)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM):
             signal.signal(number, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -224,7 +228,9 @@ def _read(place: Path) -> bytes:
         return b""
 
 
-def run_shell(script: str, cwd: Path, environment: dict[str, str]) -> subprocess.CompletedProcess[bytes]:
+def run_shell(
+    script: str, cwd: Path, environment: dict[str, str]
+) -> subprocess.CompletedProcess[bytes]:
     """Run what somebody pastes into a shell."""
     return subprocess.run(
         ["/bin/sh", "-c", script],

@@ -71,6 +71,7 @@ class Command:
     kill: Kill | None = None
     environment: tuple[tuple[str, str], ...] = ()
     program: tuple[str, ...] = ()
+    user: int | None = None
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,7 @@ class Verdict:
     def keys(self) -> frozenset[str]:
         """What ``known`` calls its complaints."""
         return frozenset(
-            f"{self.family}/{self.attack}: {complaint.wrong.value}"
-            for complaint in self.complaints
+            f"{self.family}/{self.attack}: {complaint.wrong.value}" for complaint in self.complaints
         )
 
     @property

@@ -24,9 +24,7 @@ READING = frozenset((OK, USAGE))
 COMPARING = frozenset((OK, DIFFERENT, USAGE, RUN))
 RECORDING = frozenset((OK, USAGE, RUN))
 
-_RAW = re.compile(
-    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]"
-)
+_RAW = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Control characters other than tab and newline, and what turns the direction of text around."""
 
 _TRACEBACK = "Traceback (most recent call last)"

@@ -201,7 +201,15 @@ def _metadata(rng: Random, case: Case, corpus: Corpus) -> None:
     action = rng.randrange(8)
     if action == 0:
         outside = rng.choice(
-            ("../original/" + storage, "/etc/passwd", "/dev/zero", "../../../../etc/shadow", "pipe", ".", "")
+            (
+                "../original/" + storage,
+                "/etc/passwd",
+                "/dev/zero",
+                "../../../../etc/shadow",
+                "pipe",
+                ".",
+                "",
+            )
         )
         if outside == "pipe":
             os.mkfifo(folder / "pipe")
@@ -210,7 +218,9 @@ def _metadata(rng: Random, case: Case, corpus: Corpus) -> None:
         lines = text.splitlines()
         at = rng.choice([i for i, line in enumerate(lines) if ":" in line])
         key, _, _ = lines[at].partition(":")
-        value = rng.choice((str(hostile.number(rng)), "-1", "x", "[]", "{}", "null", "9" * 5000, ".nan"))
+        value = rng.choice(
+            (str(hostile.number(rng)), "-1", "x", "[]", "{}", "null", "9" * 5000, ".nan")
+        )
         lines[at] = f"{key}: {value}"
         text = "\n".join(lines)
     elif action == 2:
@@ -218,7 +228,9 @@ def _metadata(rng: Random, case: Case, corpus: Corpus) -> None:
         lines.pop(rng.randrange(len(lines)))
         text = "\n".join(lines)
     elif action == 3:
-        text = rng.choice(("", "[" * 50_000, "\0", "x: *y", "- " * 20_000, "rosbag2_bagfile_information:"))
+        text = rng.choice(
+            ("", "[" * 50_000, "\0", "x: *y", "- " * 20_000, "rosbag2_bagfile_information:")
+        )
     elif action == 4:
         laughs = "".join(f"x{i}: &x{i} [{', '.join([f'*x{i - 1}'] * 9)}]\n" for i in range(1, 9))
         text = "x0: &x0 [lol]\n" + laughs + text
@@ -270,6 +282,6 @@ FAMILY = Family(
         "metadata": _metadata,
         "strange-places": _strange_places,
     },
-    rounds=3,
+    rounds=1,
     ros=True,
 )

@@ -25,7 +25,9 @@ def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
     def attack(rng: Random, case: Case, corpus: Corpus) -> None:
         folder = case.folder
         put_robot(folder)
-        (folder / "job.yaml").write_text(_JOB % (rng.choice(("20s", "60s")), rng.choice((16, 500, 4096))))
+        (folder / "job.yaml").write_text(
+            _JOB % (rng.choice(("20s", "60s")), rng.choice((16, 500, 4096)))
+        )
         old = ""
         words = ["record", "job.yaml", "-o", recordings.OUTPUT, "--quiet"]
         if rng.random() < 0.5:
@@ -55,7 +57,11 @@ def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
 
 
 def _judge(case: Case, runs: Sequence[Ran], old: str, status: int) -> list[Complaint]:
-    whole = frozenset((status,)) if status > 0 and (case.folder / recordings.OUTPUT).exists() else frozenset()
+    whole = (
+        frozenset((status,))
+        if status > 0 and (case.folder / recordings.OUTPUT).exists()
+        else frozenset()
+    )
     if old and recordings.fingerprint(case) == old:
         whole = frozenset()  # it had not begun
     return recordings.judge(case, runs, old=old, whole_if=whole)
@@ -69,6 +75,6 @@ FAMILY = Family(
         "sigint": _attack(signal.SIGINT, 130),
         "sighup": _attack(signal.SIGHUP, 129),
     },
-    rounds=3,
+    rounds=1,
     ros=True,
 )

@@ -9,7 +9,7 @@ from random import Random
 from tests.attack import oracle
 from tests.attack.corpus import Corpus, put_robot
 from tests.attack.families import recordings
-from tests.attack.families.common import Family
+from tests.attack.families.common import Attack, Family
 from tests.attack.model import Case, Command, Complaint, Limits, Ran, Wrong
 
 _JOB = """\
@@ -31,7 +31,8 @@ _GROUPS: dict[str, str] = {
     "overwrite_output delete_folder",
     "surroundings": "chdir umask small_files clears_environment",
     "ends": "exit_at_once exit_zero_at_once abort segfault kill_self",
-    "signals": "terminate_self hang_up_self interrupt_self set_timer set_alarm profile_timer handlers",
+    "signals": "terminate_self hang_up_self interrupt_self set_timer set_alarm profile_timer "
+    "handlers",
     "exceptions": "raises raises_escapes raises_unprintable raises_group sys_exit sys_exit_text "
     "keyboard_interrupt generator_exit memory_error recursion recursion_of_data no_super",
     "misuse": "negative_period nan_period huge_period zero_period wrong_field wrong_type "
@@ -43,7 +44,7 @@ _GROUPS: dict[str, str] = {
     "interpreter": "raises_at_exit raises_when_collected no_collector breaks_open breaks_os_write "
     "breaks_modules breaks_hash excepthook settrace",
 }
-_WHERE = ("before", "constructor", "timer", "timer", "message", "destroy")
+_WHERE = ("constructor", "timer", "timer", "message", "destroy")
 
 _SIGNALS_OF = {
     "abort": {-6},
@@ -61,17 +62,19 @@ _SIGNALS_OF = {
     "closed_stdout": {1, 120},
 }
 _TAMPERING = frozenset(_GROUPS["output"].split())
-_TAKING = frozenset("delete_output rename_output replace_output truncate_output delete_folder".split())
-_UNANNOUNCED = frozenset("exit_at_once exit_zero_at_once abort segfault kill_self profile_timer".split())
+_TAKING = frozenset(
+    "delete_output rename_output replace_output truncate_output delete_folder".split()
+)
+_UNANNOUNCED = frozenset(
+    "exit_at_once exit_zero_at_once abort segfault kill_self profile_timer".split()
+)
 """After these nobody can say anything; what counts is what is left on the disk."""
 
 
-def _attack(group: str) -> object:
-    actions = _GROUPS[group].split()
-
+def _attack(what: str) -> Attack:
     def attack(rng: Random, case: Case, corpus: Corpus) -> None:
-        steps = [_step(rng, rng.choice(actions))]
-        if rng.random() < 0.25:
+        steps = [_step(rng, what)]
+        if rng.random() < 0.15:
             other = rng.choice(list(_GROUPS))
             steps.append(_step(rng, rng.choice(_GROUPS[other].split())))
         attack_with(rng, case, corpus, steps)
@@ -81,6 +84,8 @@ def _attack(group: str) -> object:
 
 def _step(rng: Random, what: str) -> dict[str, object]:
     if what == "no_super":
+        return {"where": "before", "what": what, "at": 0}
+    if rng.random() < 0.1:
         return {"where": "before", "what": what, "at": 0}
     return {"where": rng.choice(_WHERE), "what": what, "at": rng.choice((1, 3, 12))}
 
@@ -142,9 +147,17 @@ def _judge(
     return found
 
 
+_SLICE = (
+    "close_descriptors close_and_take dup2_over_all closed_stdout fork_and_go_on fork_and_raise "
+    "delete_output truncate_output replace_output overwrite_output chdir small_files segfault "
+    "set_timer set_alarm hang_up_self raises_escapes sys_exit recursion no_super negative_period "
+    "wrong_field destroy_publisher log_escapes"
+)
+
 FAMILY = Family(
     "nodes",
-    {group: _attack(group) for group in _GROUPS},  # type: ignore[misc]
-    rounds=3,
+    {what: _attack(what) for group in _GROUPS.values() for what in group.split()},
+    sliced=frozenset(_SLICE.split()),
+    rounds=1,
     ros=True,
 )

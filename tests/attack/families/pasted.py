@@ -1,7 +1,7 @@
 """The ``next:`` line of a report is there to be pasted; a stranger's trace must not be in it.
 
-Each line is pasted into a shell, in a folder with nothing of the stranger's. There ``rsltrace`` only
-writes down how it was called. Then each of these calls is made in earnest. The canary lies where
+Each line is pasted into a shell, in a folder with nothing of the stranger's. There ``rsltrace``
+only writes down how it was called. Then each of these calls is made in earnest. The canary lies where
 such words would lead: a module on the path, a launch file, jobs elsewhere.
 """
 
@@ -87,14 +87,24 @@ def _names_of_nodes(rng: Random, case: Case, parts: list[Part]) -> None:
     text = rng.choice(hostile.texts(case.canary)).encode("utf-8", "surrogatepass")
 
     def one(data: bytes, nth: int) -> bytes:
-        return with_strings(data, "/rsltrace/entities", lambda n, old: old and text if n == 0 else old)
+        return with_strings(
+            data, "/rsltrace/entities", lambda n, old: old and text if n == 0 else old
+        )
 
     mcap_parts.change_messages(parts, "/rsltrace/entities", one)
 
 
 def _attack(change: Callable[[Random, Case, list[Part]], None]) -> Callable[..., None]:
     def attack(rng: Random, case: Case, corpus: Corpus) -> None:
-        pair = rng.choice(("delayed_input", "delayed_input", "nondeterministic_callback", "schedule", "missing_event"))
+        pair = rng.choice(
+            (
+                "delayed_input",
+                "delayed_input",
+                "nondeterministic_callback",
+                "schedule",
+                "missing_event",
+            )
+        )
         folder = case.folder
         elsewhere = folder / "elsewhere"
         hostile.canary_module(elsewhere, case.canary)
@@ -175,6 +185,6 @@ FAMILY = Family(
         "job-name": _attack(_name_of_job),
         "node-names": _attack(_names_of_nodes),
     },
-    rounds=6,
+    rounds=4,
     ros=True,
 )

@@ -59,7 +59,9 @@ def judge(
         text = f"what is left cannot be read: {told.stderr.decode(errors='replace')[-300:]}"
         found.append(Complaint(Wrong.LOST, ("--force: " if old else "") + text, line))
     elif old and (match := _EVENTS.search(told.stdout.decode())) and match[1] == "0":
-        found.append(Complaint(Wrong.LOST, "--force: the old trace gave way to one of 0 events", line))
+        found.append(
+            Complaint(Wrong.LOST, "--force: the old trace gave way to one of 0 events", line)
+        )
     return found
 
 

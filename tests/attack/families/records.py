@@ -34,7 +34,9 @@ def _attack(change: Change, *, differs: bool = False, rehash: bool = False) -> C
         if rehash and rng.random() < 0.7:
             mcap_parts.rehash(parts)
         repair = rng.random() < 0.85
-        attack_trace(case, rng, mcap_parts.put_together(parts, repair=repair), data, differs=differs)
+        attack_trace(
+            case, rng, mcap_parts.put_together(parts, repair=repair), data, differs=differs
+        )
 
     return attack
 
@@ -356,13 +358,17 @@ def _channels(rng: Random, parts: list[Part]) -> None:
     elif action == 2:
         record.message_encoding = rng.choice(("", "json", "ros1", "cdr\0"))
     elif action == 3:
-        record.topic = rng.choice(("/rsltrace/events", "/rsltrace/outputs", "/rosout", "/ticks", ""))
+        record.topic = rng.choice(
+            ("/rsltrace/events", "/rsltrace/outputs", "/rosout", "/ticks", "")
+        )
     elif action == 4:
         bomb = "a0: &a0 [x,x]\n" + "".join(
             f"a{i}: &a{i} [*a{i - 1},*a{i - 1},*a{i - 1},*a{i - 1},*a{i - 1},*a{i - 1}]\n"
             for i in range(1, 12)
         )
-        record.metadata["offered_qos_profiles"] = rng.choice((bomb, "[" * 50_000, "- !!python/x", "-"))
+        record.metadata["offered_qos_profiles"] = rng.choice(
+            (bomb, "[" * 50_000, "- !!python/x", "-")
+        )
     else:
         parts.insert(parts.index(part), Part(part.opcode, part.body))
     part.record = record

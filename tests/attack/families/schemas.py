@@ -27,9 +27,7 @@ def _doubling(rng: Random) -> str:
     """Each type has two (or more) of the next: 2^n fields, or none of them with any bytes."""
     depth, width = rng.choice(((20, 2), (30, 2), (60, 2), (12, 10), (200, 3)))
     last = rng.choice(("", "uint8 x\n", "string s\n", "uint8[] data\n"))
-    types = {
-        f"p/T{i}": "".join(f"p/T{i + 1} f{j}\n" for j in range(width)) for i in range(depth)
-    }
+    types = {f"p/T{i}": "".join(f"p/T{i + 1} f{j}\n" for j in range(width)) for i in range(depth)}
     types[f"p/T{depth}"] = last
     return _with_types("p/T0 root\n", types)
 
@@ -72,7 +70,9 @@ def _wide(rng: Random) -> str:
 
 
 def _huge(rng: Random) -> str:
-    return rng.choice(("# comment\n" * 300_000, "x" * 3_000_000, "uint8 " + "a" * 1_000_000, "\n" * 10**6))
+    return rng.choice(
+        ("# comment\n" * 300_000, "x" * 3_000_000, "uint8 " + "a" * 1_000_000, "\n" * 10**6)
+    )
 
 
 def _syntax(rng: Random) -> str:
@@ -102,7 +102,7 @@ def _syntax(rng: Random) -> str:
             f"{_LINE}\nMSG: \n" * 1000,
             "\ufeffuint8 x\r\nuint8 y\r",
             "((((" * 10_000,
-            "string s \"" + "\\" * 100_001,
+            'string s "' + "\\" * 100_001,
         )
     )
 
@@ -116,8 +116,7 @@ def _attack(make: Callable[[Random], str]) -> Callable[..., None]:
         chosen = {
             part.record.id  # type: ignore[attr-defined]
             for part in parts
-            if part.opcode == Opcode.SCHEMA
-            and part.record.name.startswith("rsltrace_msgs") == own  # type: ignore[attr-defined]
+            if part.opcode == Opcode.SCHEMA and part.record.name.startswith("rsltrace_msgs") == own  # type: ignore[attr-defined]
         }
         if rng.random() < 0.5:
             chosen = set(rng.sample(sorted(chosen), 1))
@@ -138,7 +137,9 @@ def _attack(make: Callable[[Random], str]) -> Callable[..., None]:
 
 def _lengthen(rng: Random, parts: list[mcap_parts.Part]) -> None:
     """Give messages contents that make the most of such types: long, or with great counts."""
-    tail = rng.choice((b"", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x10\x00", bytes(5000)))
+    tail = rng.choice(
+        (b"", b"\xff\xff\xff\xff", b"\xff\xff\xff\x7f", b"\x00\x00\x10\x00", bytes(5000))
+    )
     if not tail:
         return
     for topic in mcap_parts.channel_ids(parts):

@@ -144,7 +144,9 @@ def _attachments(rng: Random, case: Case, part: Part) -> None:
 def _file_name(rng: Random, case: Case, corpus: Corpus) -> None:
     """The name of the file itself, in answers and in errors."""
     data = rng.choice(corpus.traces)
-    name = rng.choice(("\x1b]0;owned\x07.mcap", "a\nb.mcap", "\x9b31m.mcap", "-x.mcap", "%s é.mcap"))
+    name = rng.choice(
+        ("\x1b]0;owned\x07.mcap", "a\nb.mcap", "\x9b31m.mcap", "-x.mcap", "%s é.mcap")
+    )
     attack_trace(case, rng, data, data)
     hurt = rng.choice((data, data[:5000], data[:20], b""))
     (case.folder / name).write_bytes(hurt)
@@ -152,7 +154,9 @@ def _file_name(rng: Random, case: Case, corpus: Corpus) -> None:
     case.names = (*case.names, "mcap")
     for number, command in enumerate(case.commands):
         words = tuple(given if word == HOSTILE else word for word in command.words)
-        case.commands[number] = type(command)(words, command.allowed, command.cwd, limits=command.limits)
+        case.commands[number] = type(command)(
+            words, command.allowed, command.cwd, limits=command.limits
+        )
     case.judge = None
 
 

@@ -75,7 +75,11 @@ def _judge(case: Case, runs: Sequence[Ran], *, differs: bool) -> list[Complaint]
 
 
 def _judge_identical(
-    ran: Ran, hostile: dict[str, object] | None, original: dict[str, object] | None, *, differs: bool
+    ran: Ran,
+    hostile: dict[str, object] | None,
+    original: dict[str, object] | None,
+    *,
+    differs: bool,
 ) -> list[Complaint]:
     wrong = Wrong.ANSWER
     if differs:

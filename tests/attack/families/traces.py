@@ -74,7 +74,12 @@ def _block_twice(rng: Random, case: Case, corpus: Corpus) -> None:
     data = rng.choice(corpus.traces)
     size = rng.choice((1, 8, 512, 4096))
     at = rng.randrange(len(data) - size)
-    attack_trace(case, rng, data[:at] + data[at : at + size] * rng.choice((2, 3, 50)) + data[at + size :], data)
+    attack_trace(
+        case,
+        rng,
+        data[:at] + data[at : at + size] * rng.choice((2, 3, 50)) + data[at + size :],
+        data,
+    )
 
 
 def _block_lost(rng: Random, case: Case, corpus: Corpus) -> None:

@@ -70,7 +70,7 @@ def close_descriptors(node):
 def close_and_take(node):
     """What is opened next gets the number that was the trace's."""
     os.closerange(3, 4096)
-    node.mine = open("mine.txt", "w")
+    node.mine = open("mine.txt", "w")  # noqa: SIM115
     node.mine.write("mine")
     node.mine.flush()
 
@@ -162,7 +162,8 @@ def truncate_output(node):
 def replace_output(node):
     for path in _traces():
         os.unlink(path)
-        open(path, "w").write("mine")
+        with open(path, "w") as file:
+            file.write("mine")
 
 
 def append_to_output(node):
@@ -443,7 +444,10 @@ def breaks_open(node):
 
 
 def breaks_os_write(node):
-    os.write = os.pwrite = os.fsync = os.replace = os.rename = lambda *args: 0
+    def fails(*args, **options):
+        raise OSError(5, "broken")
+
+    os.write = os.pwrite = os.fsync = os.replace = os.rename = fails
 
 
 def breaks_modules(node):

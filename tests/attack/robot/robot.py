@@ -1,4 +1,4 @@
-"""A small healthy robot: timers, topics, a service, parameters, logs; what the attack starts from."""
+"""A small healthy robot: timers, topics, a service, parameters, logs."""
 
 from rclpy.node import Node
 from std_msgs.msg import String, UInt64
