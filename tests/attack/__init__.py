@@ -4,6 +4,6 @@
     python -m tests.attack --family traces --seed 1234    one case again, by its seed
 
 ``families`` are the generators: each makes a case (files, commands, what must hold) from a seed
-alone. ``execution`` runs the commands under limits, ``oracle`` judges, ``campaign`` counts and keeps
-what gave way. Only what users have is attacked: the command and the names of ``rsltrace``.
+alone. ``execution`` runs the commands under limits, ``oracle`` judges, ``campaign`` counts and
+keeps what gave way. Only what users have is attacked: the command and the names of ``rsltrace``.
 """

@@ -72,18 +72,16 @@ class Corpus:
         if folder.exists():
             return folder
         store = get_typestore(Stores.ROS2_JAZZY)
-        with Reader(self.bag) as reader:
-            with Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
-                made = {}
-                for connection in reader.connections:
-                    if connection.msgtype not in store.types:
-                        continue
-                    made[connection.id] = writer.add_connection(
-                        connection.topic, connection.msgtype, typestore=store
-                    )
-                for connection, stamp, data in reader.messages():
-                    if connection.id in made:
-                        writer.write(made[connection.id], stamp, data)
+        sqlite = Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3)
+        with Reader(self.bag) as reader, sqlite as writer:
+            made = {
+                one.id: writer.add_connection(one.topic, one.msgtype, typestore=store)
+                for one in reader.connections
+                if one.msgtype in store.types
+            }
+            for one, stamp, data in reader.messages():
+                if one.id in made:
+                    writer.write(made[one.id], stamp, data)
         return folder
 
     def _made(self, name: str, words: Sequence[str]) -> Path:

@@ -39,7 +39,7 @@ def entry_point() -> Callable[[], object]:
 
 
 def preload(*, ros: bool) -> None:
-    """Import what commands need, so that forks have it. Without ``ros``, what runs nodes is left."""
+    """Import what commands need, so that forks have it; ``ros``: what runs nodes, too."""
     import pkgutil
 
     import rsltrace
@@ -169,7 +169,7 @@ def _redirect(command: Command, places: tuple[Path, Path]) -> None:
     sys.stdin = open(0, closefd=False)  # noqa: SIM115
     for name, number in (("stdout", 1), ("stderr", 2)):
         closed = getattr(command, name) == "closed"
-        stream = None if closed else open(number, "w", closefd=False, encoding="utf-8")
+        stream = None if closed else open(number, "w", closefd=False, encoding="utf-8")  # noqa: SIM115
         setattr(sys, name, stream)  # as Python sets them when it starts
 
 

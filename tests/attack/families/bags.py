@@ -172,12 +172,12 @@ def _sql(rng: Random, case: Case, corpus: Corpus) -> None:
             ["DROP TABLE IF EXISTS schema"],
             [
                 "ALTER TABLE messages RENAME TO m",
-                "CREATE VIEW messages AS WITH RECURSIVE c(id, topic_id, timestamp, data) AS "
-                "(SELECT 1, 1, 1, x'00' UNION ALL SELECT id + 1, 1, id, x'00' FROM c) SELECT * FROM c",
+                "CREATE VIEW messages AS WITH RECURSIVE c(id, topic_id, timestamp, data) AS ("
+                "SELECT 1, 1, 1, x'00' UNION ALL SELECT id + 1, 1, id, x'00' FROM c) SELECT * FROM c",
             ],
             [
                 "ALTER TABLE topics RENAME TO t",
-                "CREATE VIEW topics AS SELECT * FROM t, t AS t1, t AS t2, t AS t3, t AS t4, t AS t5",
+                "CREATE VIEW topics AS SELECT t.* FROM t, t AS u, t AS v, t AS w, t AS x, t AS y",
             ],
             ["CREATE TRIGGER x AFTER UPDATE ON topics BEGIN DELETE FROM messages; END"],
         )

@@ -6,6 +6,7 @@ import dataclasses
 import hashlib
 import os
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -21,6 +22,7 @@ from tests.attack.model import Case, Command, Complaint, Limits, Ran, Wrong
 _INPUTS = ("a.mcap", "b.mcap", "job.yaml", "robot.py")
 _BROKEN_PIPE = 141
 _NOBODY = 65534
+_DEVICES = {"null": 3, "full": 7}
 _LIMITS = Limits(cpu_s=12, rss_mib=700)
 
 _WRITING: tuple[tuple[str, ...], ...] = (
@@ -182,9 +184,10 @@ def _strange_outputs(rng: Random, case: Case, corpus: Corpus) -> None:
     (folder / "link").symlink_to("a.mcap")
     (folder / "hard").hardlink_to(folder / "a.mcap")
     (folder / "circle").symlink_to("circle")
+    _devices(folder)
     place = rng.choice(
-        "a.mcap job.yaml robot.py link hard circle folder folder/x/y.mcap /dev/full /dev/null . .. / "
-        "/proc/self/mem /proc/nowhere job.yaml/x".split()
+        "a.mcap job.yaml robot.py link hard circle folder folder/x/y.mcap full null . "
+        "/proc/nowhere job.yaml/x".split()
     )
     words = rng.choice(
         (
@@ -199,14 +202,32 @@ def _strange_outputs(rng: Random, case: Case, corpus: Corpus) -> None:
             ("check", "job.yaml", "--graph", place),
         )
     )
-    if words[0] in ("view", "check") or (words[0] in ("diff", "export") and place in ("..", "/")):
-        place_is_input = place in ("a.mcap", "job.yaml", "robot.py", "link", "hard")
-        if words[0] in ("view", "check") and not place_is_input:
-            words = ("diff", "a.mcap", "b.mcap", "-o", place)
     case.names = (*case.names, place, "a.mcap")
     case.note = f"writes to {place}"
     case.commands.append(_command(case, words))
-    case.judge = lambda runs: _inputs_kept(case, before, runs[-1])
+    case.judge = lambda runs: (
+        _inputs_kept(case, before, runs[-1]) + _devices_kept(case.folder, runs[-1])
+    )
+
+
+def _devices(folder: Path) -> None:
+    """Make devices of the case's own: those of the machine must survive that we are root."""
+    for name, number in _DEVICES.items():
+        try:
+            os.mknod(folder / name, stat.S_IFCHR | 0o666, os.makedev(1, number))
+        except PermissionError:
+            os.mkfifo(folder / name)
+
+
+def _devices_kept(folder: Path, ran: Ran) -> list[Complaint]:
+    gone = [name for name in _DEVICES if not _is_special(folder / name)]
+    if not gone:
+        return []
+    return [Complaint(Wrong.LOST, f"a device or pipe was replaced: {gone}", ran.line)]
+
+
+def _is_special(place: Path) -> bool:
+    return place.is_char_device() or place.is_fifo()
 
 
 def _another_user(rng: Random, case: Case, corpus: Corpus) -> None:

@@ -234,7 +234,8 @@ def _tags(rng: Random, case: Case, corpus: Corpus) -> None:
             f"nodes: !!python/object/apply:eval [{json.dumps(code)}]\n",
             f"nodes: !!python/object/apply:os.system ['echo tag > {case.canary}']\n",
             "nodes: !!python/name:os.system\n",
-            f"!!python/object/new:type\n  args: [x, !!python/tuple [], {{}}]\n  state: {json.dumps(code)}\n",
+            "!!python/object/new:type\n  args: [x, !!python/tuple [], {}]\n"
+            f"  state: {json.dumps(code)}\n",
             "nodes: !!binary |\n  R0lGODlhDAAMAIQAAP\n",
             "seed: !!int '7'\nnodes: []\n",
             "seed: !!float nan\nnodes: []\n",

@@ -1,8 +1,8 @@
 """The ``next:`` line of a report is there to be pasted; a stranger's trace must not be in it.
 
 Each line is pasted into a shell, in a folder with nothing of the stranger's. There ``rsltrace``
-only writes down how it was called. Then each of these calls is made in earnest. The canary lies where
-such words would lead: a module on the path, a launch file, jobs elsewhere.
+only writes down how it was called. Then each of these calls is made in earnest. The canary lies
+where such words would lead: a module on the path, a launch file, jobs elsewhere.
 """
 
 from __future__ import annotations

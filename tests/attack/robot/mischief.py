@@ -2,6 +2,9 @@
 
 Each step is ``{"where": …, "what": …, "at": n}``. Where: ``before`` super().__init__(), in the
 ``constructor``, in the ``n``-th ``timer`` callback, in a ``message`` callback, in ``destroy``.
+
+Files are hurt in the folder of this module alone, and only if that is a case's: the attack copies
+it there. Wherever the process has gone meanwhile, nothing else is touched.
 """
 
 import array
@@ -70,13 +73,13 @@ def close_descriptors(node):
 def close_and_take(node):
     """What is opened next gets the number that was the trace's."""
     os.closerange(3, 4096)
-    node.mine = open("mine.txt", "w")  # noqa: SIM115
+    node.mine = open(os.path.join(_folder(), "mine.txt"), "w")  # noqa: SIM115
     node.mine.write("mine")
     node.mine.flush()
 
 
 def dup2_over_all(node):
-    handle = os.open("mine.txt", os.O_RDWR | os.O_CREAT | os.O_APPEND)
+    handle = os.open(os.path.join(_folder(), "mine.txt"), os.O_RDWR | os.O_CREAT | os.O_APPEND)
     for number in range(3, 200):
         if number != handle:
             os.dup2(handle, number)
@@ -140,8 +143,14 @@ def popen(node):
     subprocess.run(["true"], check=True)
 
 
+def _folder():
+    folder = os.path.dirname(os.path.abspath(__file__))
+    assert "/rsltrace-attack-" in folder, folder
+    return folder
+
+
 def _traces():
-    return [path for path in glob.glob("*") if path.endswith(".mcap") or ".mcap" in path]
+    return glob.glob(os.path.join(_folder(), "*.mcap*"))
 
 
 def delete_output(node):
@@ -151,7 +160,7 @@ def delete_output(node):
 
 def rename_output(node):
     for path in _traces():
-        os.rename(path, "moved-" + path)
+        os.rename(path, path + "-moved")
 
 
 def truncate_output(node):
@@ -180,7 +189,7 @@ def overwrite_output(node):
 
 
 def delete_folder(node):
-    shutil.rmtree(os.getcwd(), ignore_errors=True)
+    shutil.rmtree(_folder(), ignore_errors=True)
 
 
 def chdir(node):
