@@ -1,0 +1,80 @@
+"""Recordings that are ended from outside, at any moment: what was written can be read."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Sequence
+from random import Random
+
+from tests.attack import oracle
+from tests.attack.corpus import Corpus, put_robot
+from tests.attack.families import recordings
+from tests.attack.families.common import Family
+from tests.attack.model import Case, Command, Complaint, Kill, Limits, Ran
+
+_JOB = """\
+nodes:
+  - {node: robot:Driver, parameters: {period: 0.001}}
+  - node: robot:Arm
+stop: {duration: %s}
+record: {segment_events: %d}
+"""
+
+
+def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
+    def attack(rng: Random, case: Case, corpus: Corpus) -> None:
+        folder = case.folder
+        put_robot(folder)
+        (folder / "job.yaml").write_text(
+            _JOB % (rng.choice(("20s", "60s")), rng.choice((16, 500, 4096)))
+        )
+        old = ""
+        words = ["record", "job.yaml", "-o", recordings.OUTPUT, "--quiet"]
+        if rng.random() < 0.5:
+            (folder / recordings.OUTPUT).write_bytes(corpus.robot)
+            old = recordings.fingerprint(case)
+            words.append("--force")
+        fresh = rng.random() < 0.3
+        if not fresh:
+            words.append("--no-pin")
+        grown = rng.choice((0, 1, 2000, rng.randrange(200_000), rng.randrange(1_500_000)))
+        delay = rng.uniform(0.0, 0.6) if grown == 0 else 0.0
+        case.user_code = True
+        case.names = ("job.yaml", recordings.OUTPUT, "interrupted")
+        case.commands.append(
+            Command(
+                tuple(words),
+                oracle.RECORDING | {status, -number},
+                folder,
+                fresh=fresh,
+                kill=Kill(number, grown, delay),
+                limits=Limits(cpu_s=40, rss_mib=500),
+            )
+        )
+        case.judge = lambda runs: _judge(case, runs, old, status)
+
+    return attack
+
+
+def _judge(case: Case, runs: Sequence[Ran], old: str, status: int) -> list[Complaint]:
+    whole = (
+        frozenset((status,))
+        if status > 0 and (case.folder / recordings.OUTPUT).exists()
+        else frozenset()
+    )
+    if old and recordings.fingerprint(case) == old:
+        whole = frozenset()  # it had not begun
+    return recordings.judge(case, runs, old=old, whole_if=whole)
+
+
+FAMILY = Family(
+    "kills",
+    {
+        "sigkill": _attack(signal.SIGKILL, -signal.SIGKILL),
+        "sigterm": _attack(signal.SIGTERM, 143),
+        "sigint": _attack(signal.SIGINT, 130),
+        "sighup": _attack(signal.SIGHUP, 129),
+    },
+    rounds=1,
+    ros=True,
+)
