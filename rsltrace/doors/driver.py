@@ -8,17 +8,15 @@ Who only listens leaves no mark.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from greenlet import getcurrent, greenlet
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
+from rsltrace.doors.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.trace.chain import hash64
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.world import World
 
 NODE_NAME = "outside"
 _OUTSIDE = EventKind.OUTSIDE
@@ -55,21 +53,21 @@ class Outside:
 
     def __init__(self, world: World) -> None:
         self._world = world
-        self._core = world.core
+        self._domain = world.domain
         self._node: Any = None
         self._publishers: dict[str, Any] = {}
 
     def enter(self) -> None:
         """Stand outside: what is done to nodes from now on is nobody's callback."""
-        core = self._core
-        core.current_handle = core.current_node = None
-        core.current_entity = 0
+        event = self._domain.event
+        event.handle = event.node = None
+        event.entity = 0
 
     def leave(self) -> None:
         """Go on with the run. What was done to nodes directly becomes one event."""
-        core = self._core
-        if core.pending or (core.recorder is not None and core.recorder.outputs):
-            core.run_outside(lambda: "the outside", _OUTSIDE, 0, None, lambda: None)
+        recorder = self._domain.dispatcher.recorder
+        if self._domain.entities.pending or (recorder is not None and recorder.outputs):
+            self._world.run_outside("the outside", _OUTSIDE, lambda: None)
 
     def publish(self, topic: str, message: Any, qos: Any) -> int:
         """Publish a message now; return to how many subscriptions it goes.
@@ -77,23 +75,21 @@ class Outside:
         :raises RunError: if the topic has another type.
         """
         self.leave()
-        core = self._core
+        dispatcher = self._domain.dispatcher
         message_type: Any = type(message)
         codec = codec_for(message_type)
         self._check_type(topic, codec.type_name)
         data = codec.serialize(message)
         publisher = self._publishers.get(topic)
         if publisher is None:
-            core.run_outside(
-                lambda: f"publishing {topic} from outside",
+            self._world.run_outside(
+                f"publishing {topic} from outside",
                 _OUTSIDE,
-                0,
-                None,
                 lambda: self._create_publisher(topic, message_type, qos),
             )
             publisher = self._publishers[topic]
-        digest = hash64(data) if core.recorder is not None else 0
-        core.execute(
+        digest = hash64(data) if dispatcher.recorder is not None else 0
+        dispatcher.execute(
             publisher,
             publisher.entity_id,
             publisher.node,
@@ -108,7 +104,7 @@ class Outside:
         return len(publisher.subscriptions)
 
     def _check_type(self, topic: str, type_name: str) -> None:
-        graph = self._core.graph
+        graph = self._domain.graph
         endpoints: list[Any] = [*graph.publishers(topic), *graph.subscriptions(topic)]
         for endpoint in endpoints:
             if endpoint.type_name != type_name:
@@ -130,20 +126,20 @@ class Outside:
     def call(self, function: Callable[[], Any]) -> Call:
         """Call ``function`` as one event and return how it went; it may be waiting by now."""
         self.leave()
-        core = self._core
+        runners, event = self._world.stacks.runners, self._domain.event
         call = Call(function)
         name = f"{getattr(function, '__qualname__', 'a function')}, called from outside"
 
         def run() -> None:
             if call.run():
-                core.flags |= _RAISED  # the caller gets the error, the run goes on
+                event.flags |= _RAISED  # the caller gets the error, the run goes on
 
         def body() -> None:
-            core.run_outside(lambda: name, _OUTSIDE, 0, None, run)
+            self._world.run_outside(name, _OUTSIDE, run)
             # Whoever switched here goes on: the caller, or the loop's runner after a wait.
-            getcurrent().parent = core.runners.pop()
+            runners.step_aside()
 
-        core.runners.append(getcurrent())
+        runners.waiting.append(getcurrent())
         greenlet(body).switch()
         self.enter()
         return call

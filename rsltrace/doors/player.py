@@ -1,21 +1,24 @@
-"""Play recorded messages into the graph at their recorded times: exact, no polling."""
+"""The door for recordings: messages of bags are published at their recorded times, without polling.
+
+It knows no client library: a recorded topic has a type by name, and whoever opens it says how the
+recorded bytes become canonical CDR.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rsltrace.doors.rclpy.boundary.pubsub import PublisherHandle
-from rsltrace.doors.rclpy.wire.interfaces import get_message_class
-from rsltrace.errors import BagError, SetupError
+from rsltrace.errors import BagError
 from rsltrace.loop.loop import ORDER_BAG
+from rsltrace.middleware.domain import Domain
+from rsltrace.middleware.interface import MessageType
+from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.publisher import Publisher
 from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
+from rsltrace.middleware.transport import Transport
 from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.chain import hash64
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.node import NodeHandle
-    from rsltrace.doors.rclpy.core import Core
 
 _BAG = int(EventKind.BAG)
 _NAMES = {"reliability": Reliability, "durability": Durability, "history": History}
@@ -30,14 +33,16 @@ class Player:
     ``on_end`` is called when the last message has been published.
     """
 
-    def __init__(self, core: Core, messages: Iterator[Message], on_end: Callable[[], None]) -> None:
-        self._core = core
+    def __init__(
+        self, domain: Domain, messages: Iterator[Message], on_end: Callable[[], None]
+    ) -> None:
+        self._dispatcher = domain.dispatcher
         self._messages = messages
         self._on_end = on_end
         self._publisher: BagPublisher
         self._raw = b""
-        self._schedule = core.loop.schedule
-        self._hash = hash64 if core.recorder is not None else _no_hash
+        self._schedule = domain.loop.schedule
+        self._hash = hash64 if domain.dispatcher.recorder is not None else _no_hash
         self.played = 0
 
     def start(self) -> None:
@@ -55,14 +60,14 @@ class Player:
     def _publish(self) -> None:
         publisher = self._publisher
         try:
-            data = publisher._canonical(self._raw)
+            data = publisher.canonical(self._raw)
         except ValueError as error:
             raise BagError(
                 f"message {self.played + 1} of the bag, on {publisher.topic}, is not a "
                 f"{publisher.type_name}: {error}"
             ) from error
         digest = self._hash(data)
-        self._core.execute(
+        self._dispatcher.execute(
             publisher,
             publisher.entity_id,
             publisher.node,
@@ -81,52 +86,38 @@ def _no_hash(data: bytes) -> int:
     return 0
 
 
-class BagPublisher(PublisherHandle):
+class BagPublisher(Publisher):
     """A recorded topic. It is dispatched by the player only."""
+
+    def __init__(
+        self,
+        transport: Transport,
+        node: Participant,
+        topic: str,
+        type: MessageType,
+        qos: Qos,
+        canonical: Callable[[bytes], bytes],
+    ) -> None:
+        super().__init__(transport, node, topic, type, qos)
+        self.canonical = canonical
 
     def dispatch(self) -> None:
         raise AssertionError("never in a queue")
 
 
-def check_type(*, bag: str, topic: str, type_name: str) -> type:
-    """Return the message class of a recorded topic.
-
-    :raises BagError: if its type is not installed.
-    """
-    try:
-        return get_message_class(type_name)
-    except SetupError as error:
-        raise BagError(
-            f"{bag}: topic {topic} has type {type_name}, which is not installed here. Install its "
-            f"package, or leave the topic out (exclude: [{topic}])\n  {error}"
-        ) from error
-
-
-def begins_with_header(message_class: Any) -> bool:
-    """Return whether the first field of a message is a ``std_msgs/Header``."""
-    fields = message_class.get_fields_and_field_types()
-    return next(iter(fields.values()), "") == "std_msgs/Header"
-
-
 def make_publisher(
-    core: Core,
-    node: NodeHandle,
-    *,
-    bag: str,
+    domain: Domain,
+    node: Participant,
     topic: str,
-    type_name: str,
+    type: MessageType,
+    canonical: Callable[[bytes], bytes],
     qos: dict[str, Any],
 ) -> BagPublisher:
-    """Create the publisher of a recorded topic."""
-    message_class = check_type(bag=bag, topic=topic, type_name=type_name)
-    return BagPublisher(core, node, message_class, topic, recorded_qos(qos))
-
-
-def progress_publisher(core: Core, node: NodeHandle, topic: str) -> BagPublisher:
-    """Create the publisher of the player's progress, a Float32."""
-    return BagPublisher(
-        core, node, get_message_class("std_msgs/msg/Float32"), topic, recorded_qos({})
-    )
+    """Create the publisher of a recorded topic; ``canonical`` gives canonical CDR, or raises
+    ValueError for what is no message of that type."""
+    publisher = BagPublisher(domain.transport, node, topic, type, recorded_qos(qos), canonical)
+    domain.graph.add_publisher(publisher)
+    return publisher
 
 
 def recorded_qos(values: dict[str, Any]) -> Qos:

@@ -1,4 +1,4 @@
-"""Whom a run has met: every node, topic, service and timer there has been, and unused parameters.
+"""Who and what there has been in a run: every node, topic, service and timer.
 
 A rule of a job that fits none of them does nothing, and nobody would notice.
 """
@@ -6,14 +6,10 @@ A rule of a job that fits none of them does nothing, and nobody would notice.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from rsltrace.loop.recorded import THE_RUN, described
 from rsltrace.model.entity import Entity, EntityKind
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _ACTIONS = (EntityKind.ACTION_CLIENT, EntityKind.ACTION_SERVER)
 _ACTION_TOPICS = ("feedback", "status")
@@ -32,7 +28,7 @@ class Asker(NamedTuple):
     namespace: str
 
 
-class Met:
+class Census:
     """The names there have been, each once, in the order of their coming."""
 
     def __init__(self) -> None:
@@ -83,28 +79,3 @@ class Met:
     def topics(self) -> dict[str, None]:
         """Every topic that somebody publishes or subscribes."""
         return {topic: None for _, topic in (*self.publishers, *self.subscriptions)}
-
-
-@dataclass(frozen=True, slots=True)
-class Parameters:
-    """The parameters of a node: those it has declared, and those it was given besides.
-
-    ``entry_key`` is the key of the job's entry that made the node, empty if none did.
-    """
-
-    entry_key: str
-    declared: tuple[str, ...]
-    unused: tuple[str, ...]
-
-
-def parameters_of(core: Core) -> dict[str, Parameters]:
-    """Return the parameters of the nodes there are now. Who allows undeclared ones uses all."""
-    found = {}
-    for handle in core.graph.nodes:
-        node = handle.wrapper
-        if node is None or node._allow_undeclared_parameters:
-            continue
-        declared = tuple(node._parameters)
-        unused = tuple(name for name in node._parameter_overrides if name not in node._parameters)
-        found[handle.fully_qualified_name] = Parameters(handle.entry_key, declared, unused)
-    return found

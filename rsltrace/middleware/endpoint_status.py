@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.qos_events import EventHandle
-    from rsltrace.middleware.qos import PolicyKind
+from rsltrace.middleware.qos import PolicyKind
 
 MATCHED = "matched"
 INCOMPATIBLE = "incompatible"
@@ -19,7 +17,7 @@ LIVELINESS_LOST = "liveliness_lost"
 
 @dataclass
 class MatchedStatus:
-    """Stands in for ``rmw_matched_status_t``."""
+    """``rmw_matched_status_t``."""
 
     total_count: int = 0
     total_count_change: int = 0
@@ -29,7 +27,7 @@ class MatchedStatus:
 
 @dataclass
 class IncompatibleQosStatus:
-    """Stands in for ``rmw_requested_qos_incompatible_event_status_t``."""
+    """``rmw_requested_qos_incompatible_event_status_t``."""
 
     total_count: int = 0
     total_count_change: int = 0
@@ -38,7 +36,7 @@ class IncompatibleQosStatus:
 
 @dataclass
 class CountStatus:
-    """Stands in for the statuses that only count: deadlines, lost messages, lost liveliness."""
+    """The statuses that only count: deadlines, lost messages, lost liveliness."""
 
     total_count: int = 0
     total_count_change: int = 0
@@ -46,7 +44,7 @@ class CountStatus:
 
 @dataclass
 class LivelinessChangedStatus:
-    """Stands in for ``rmw_liveliness_changed_status_t``: publishers that are alive, or not."""
+    """``rmw_liveliness_changed_status_t``: publishers that are alive, or not."""
 
     alive_count: int = 0
     not_alive_count: int = 0
@@ -61,13 +59,20 @@ _KINDS: dict[str, type] = {
 }
 
 
-class EndpointEvents:
-    """The statuses of one endpoint, and the event handles that want to hear of them."""
+class Listener(Protocol):
+    """Wants to hear of one status."""
 
-    __slots__ = ("_statuses", "handles")
+    def trigger(self) -> None:
+        """There is news, perhaps."""
+
+
+class EndpointEvents:
+    """The statuses of one endpoint, and who wants to hear of each."""
+
+    __slots__ = ("_statuses", "listeners")
 
     def __init__(self) -> None:
-        self.handles: dict[str, EventHandle] = {}
+        self.listeners: dict[str, Listener] = {}
         self._statuses: dict[str, Any] = {}
 
     def matched(self, change: int) -> None:
@@ -87,9 +92,9 @@ class EndpointEvents:
             setattr(status, field, getattr(status, field) + change)
             field += "_change"
             setattr(status, field, getattr(status, field) + change)
-        handle = self.handles.get(name)
-        if handle is not None:
-            handle.trigger()
+        listener = self.listeners.get(name)
+        if listener is not None:
+            listener.trigger()
 
     def news(self, name: str) -> bool:
         """Return whether there is something to take."""

@@ -6,111 +6,117 @@ hashes of addresses).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TypeVar
 
 from rsltrace.errors import UnsupportedError
-from rsltrace.middleware.qos import incompatible_policies
+from rsltrace.middleware.entity import DomainEntity
+from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.publisher import Publisher
+from rsltrace.middleware.qos import Qos, incompatible_policies
+from rsltrace.middleware.services import Client, Service
+from rsltrace.middleware.subscription import Subscription
 
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.entity_handle import EntityHandle
-    from rsltrace.doors.rclpy.boundary.node import NodeHandle
-    from rsltrace.doors.rclpy.boundary.pubsub import PublisherHandle, SubscriptionHandle
-    from rsltrace.doors.rclpy.boundary.services import ClientHandle, ServiceHandle
-
-EndT = TypeVar("EndT", bound="EntityHandle")
+EndT = TypeVar("EndT", bound=DomainEntity)
 
 
 class Graph:
     """The nodes and endpoints of one world."""
 
     def __init__(self) -> None:
-        self.nodes: list[NodeHandle] = []
-        self._publishers: dict[str, list[PublisherHandle]] = {}
-        self._subscriptions: dict[str, list[SubscriptionHandle]] = {}
-        self._clients: dict[str, list[ClientHandle]] = {}
-        self._services: dict[str, list[ServiceHandle]] = {}
+        self.nodes: list[Participant] = []
+        self._publishers: dict[str, list[Publisher]] = {}
+        self._subscriptions: dict[str, list[Subscription]] = {}
+        self._clients: dict[str, list[Client]] = {}
+        self._services: dict[str, list[Service]] = {}
 
-    def node_named(self, fully_qualified_name: str) -> NodeHandle | None:
+    def node_named(self, fully_qualified_name: str) -> Participant | None:
         """Return the node of that name, or None."""
         for node in self.nodes:
             if node.fully_qualified_name == fully_qualified_name:
                 return node
         return None
 
-    def publishers(self, topic: str) -> list[PublisherHandle]:
+    def publishers(self, topic: str) -> list[Publisher]:
         """Return the publishers of a topic in creation order."""
         return self._publishers.get(topic, [])
 
-    def subscriptions(self, topic: str) -> list[SubscriptionHandle]:
+    def subscriptions(self, topic: str) -> list[Subscription]:
         """Return the subscriptions of a topic in creation order."""
         return self._subscriptions.get(topic, [])
 
-    def clients(self, service: str) -> list[ClientHandle]:
+    def clients(self, service: str) -> list[Client]:
         """Return the clients of a service in creation order."""
         return self._clients.get(service, [])
 
-    def all_clients(self) -> list[ClientHandle]:
+    def all_clients(self) -> list[Client]:
         """Return every client."""
         return [client for clients in self._clients.values() for client in clients]
 
-    def services(self, service: str) -> list[ServiceHandle]:
+    def services(self, service: str) -> list[Service]:
         """Return the servers of a service in creation order."""
         return self._services.get(service, [])
 
     # -- joining and leaving -------------------------------------------------------------------
 
-    def add_publisher(self, publisher: PublisherHandle) -> None:
+    def add_node(self, node: Participant) -> None:
+        """Make a participant known."""
+        self.nodes.append(node)
+        node.graph = self
+
+    def add_publisher(self, publisher: Publisher) -> None:
         """Connect a new publisher with the subscriptions that are there."""
         self._check_type(publisher)
         self._publishers.setdefault(publisher.topic, []).append(publisher)
+        publisher.graph = self
         for subscription in self.subscriptions(publisher.topic):
             self._connect(publisher, subscription)
 
-    def add_subscription(self, subscription: SubscriptionHandle) -> None:
+    def add_subscription(self, subscription: Subscription) -> None:
         """Connect a new subscription; it gets what transient-local publishers kept for it."""
         self._check_type(subscription)
         self._subscriptions.setdefault(subscription.topic, []).append(subscription)
+        subscription.graph = self
         for publisher in self.publishers(subscription.topic):
             self._connect(publisher, subscription)
 
-    def remove_publisher(self, publisher: PublisherHandle) -> None:
-        """Disconnect a publisher."""
-        self._publishers[publisher.topic].remove(publisher)
-        for subscription in publisher.subscriptions:
-            subscription.publishers.remove(publisher)
-            subscription.events.matched(-1)
-        publisher.subscriptions = []
-        for link in publisher.links or ():
-            link.close()
-        if publisher.links is not None:
-            publisher.links.clear()
-
-    def remove_subscription(self, subscription: SubscriptionHandle) -> None:
-        """Disconnect a subscription."""
-        self._subscriptions[subscription.topic].remove(subscription)
-        for publisher in subscription.publishers:
-            publisher.disconnect(subscription)
-            publisher.events.matched(-1)
-        subscription.publishers = []
-
-    def add_client(self, client: ClientHandle) -> None:
+    def add_client(self, client: Client) -> None:
         """Make a client known."""
         self._clients.setdefault(client.service, []).append(client)
+        client.graph = self
 
-    def remove_client(self, client: ClientHandle) -> None:
-        """Forget a client."""
-        self._clients[client.service].remove(client)
-
-    def add_service(self, service: ServiceHandle) -> None:
+    def add_service(self, service: Service) -> None:
         """Make a server known."""
         self._services.setdefault(service.service, []).append(service)
+        service.graph = self
 
-    def remove_service(self, service: ServiceHandle) -> None:
-        """Forget a server."""
-        self._services[service.service].remove(service)
+    def remove(self, member: DomainEntity) -> None:
+        """Forget a member, and disconnect it from its peers."""
+        if isinstance(member, Publisher):
+            self._publishers[member.topic].remove(member)
+            for subscription in member.subscriptions:
+                subscription.publishers.remove(member)
+                subscription.events.matched(-1)
+            member.disconnect_all()
+        elif isinstance(member, Subscription):
+            self._subscriptions[member.topic].remove(member)
+            for publisher in self.publishers(member.topic):
+                if publisher in member.publishers:
+                    publisher.disconnect(member)
+                    publisher.events.matched(-1)
+            member.publishers = []
+        elif isinstance(member, Client):
+            self._clients[member.service].remove(member)
+        elif isinstance(member, Service):
+            self._services[member.service].remove(member)
+        elif isinstance(member, Participant):
+            self.nodes.remove(member)
 
-    def _connect(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> None:
+    def settled_request(self, topic: str, requested: Qos) -> Qos:
+        """Return what a new subscription's QoS comes to, given the publishers that are there."""
+        peers = [publisher.qos for publisher in self.publishers(topic)]
+        return requested.resolved(publisher=False, peers=peers)
+
+    def _connect(self, publisher: Publisher, subscription: Subscription) -> None:
         apart = incompatible_policies(publisher.qos, subscription.qos)
         if apart:
             publisher.events.incompatible(apart[0])
@@ -122,8 +128,8 @@ class Graph:
         subscription.events.matched(+1)
         publisher.send_history(subscription)
 
-    def _check_type(self, endpoint: PublisherHandle | SubscriptionHandle) -> None:
-        others: list[PublisherHandle | SubscriptionHandle] = [
+    def _check_type(self, endpoint: Publisher | Subscription) -> None:
+        others: list[Publisher | Subscription] = [
             *self.publishers(endpoint.topic),
             *self.subscriptions(endpoint.topic),
         ]
@@ -137,15 +143,7 @@ class Graph:
 
     # -- queries ---------------------------------------------------------------------------------
 
-    def interfaces_of(self, node: NodeHandle) -> Iterator[Any]:
-        """Yield the classes of the messages, services and actions that a node uses."""
-        yield from (end.msg_type for end in self.publishers_of(node))
-        yield from (end.msg_type for end in self.subscriptions_of(node))
-        yield from (end.srv_type for end in self.services_of(node))
-        yield from (end.srv_type for end in self.clients_of(node))
-        yield from (action.action_type for action in node.actions)
-
-    def endpoints_of(self, node: NodeHandle) -> list[EntityHandle]:
+    def endpoints_of(self, node: Participant) -> list[DomainEntity]:
         """Return a node's publishers, subscriptions, services and clients."""
         return [
             *self.publishers_of(node),
@@ -154,19 +152,19 @@ class Graph:
             *self.clients_of(node),
         ]
 
-    def publishers_of(self, node: NodeHandle) -> list[PublisherHandle]:
+    def publishers_of(self, node: Participant) -> list[Publisher]:
         """Return the publishers of a node, topic by topic."""
         return _of(node, self._publishers)
 
-    def subscriptions_of(self, node: NodeHandle) -> list[SubscriptionHandle]:
+    def subscriptions_of(self, node: Participant) -> list[Subscription]:
         """Return the subscriptions of a node, topic by topic."""
         return _of(node, self._subscriptions)
 
-    def services_of(self, node: NodeHandle) -> list[ServiceHandle]:
+    def services_of(self, node: Participant) -> list[Service]:
         """Return the servers of a node, service by service."""
         return _of(node, self._services)
 
-    def clients_of(self, node: NodeHandle) -> list[ClientHandle]:
+    def clients_of(self, node: Participant) -> list[Client]:
         """Return the clients of a node, service by service."""
         return _of(node, self._clients)
 
@@ -190,7 +188,7 @@ class Graph:
         return [(name, sorted(services[name])) for name in sorted(services)]
 
 
-def _of(node: NodeHandle, ends: dict[str, list[EndT]]) -> list[EndT]:
+def _of(node: Participant, ends: dict[str, list[EndT]]) -> list[EndT]:
     return [end for named in ends.values() for end in named if end.node is node]
 
 

@@ -7,22 +7,20 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
 from rsltrace.chance.network import NetworkPlan
-from rsltrace.loop.loop import ORDER_RELEASE
+from rsltrace.loop.loop import ORDER_RELEASE, Release
+from rsltrace.middleware.dispatcher import Dispatcher
 from rsltrace.middleware.endpoint_status import MESSAGE_LOST
-from rsltrace.middleware.qos import INFINITE_NS, Reliability
+from rsltrace.middleware.entity import DomainEntity
+from rsltrace.middleware.qos import INFINITE_NS, Qos, Reliability
 from rsltrace.middleware.qos_timing import RequestedLease, finite
 from rsltrace.middleware.quick_link import Send, direct_send, quick_send
+from rsltrace.middleware.receiver import Receiver
+from rsltrace.middleware.subscription import Delivery, Subscription
 from rsltrace.model.draw import Draw, encode_draw
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.pubsub import Delivery, PublisherHandle, SubscriptionHandle
-    from rsltrace.doors.rclpy.boundary.services import ClientHandle, Exchange, ServiceHandle
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.loop.loop import Release
 
 # Canonical CDR, publishing event, which of its outputs, content hash, publication stamp (ns) and
 # number: what a Delivery has from [4] on.
@@ -36,102 +34,34 @@ _LOST = {
 }
 
 
-class Network:
-    """Makes the links of one world, from the plan of its job."""
-
-    def __init__(self, core: Core, plan: NetworkPlan) -> None:
-        self._core = core
-        self._plan = plan
-        self._counts: dict[tuple[str, str, str], int] = {}
-        self._ends: dict[int, tuple[str, int]] = {}
-        self._requests: dict[tuple[int, int], Exchanges] = {}
-        self._responses: dict[tuple[int, int], Exchanges] = {}
-
-    def link(self, publisher: PublisherHandle, subscription: SubscriptionHandle) -> Link:
-        """Return the link of two endpoints that have just been connected."""
-        channel = self._plan.topic_channel(
-            publisher.topic,
-            self._end("publisher", publisher.topic, publisher),
-            self._end("subscription", publisher.topic, subscription),
-            reliable=subscription.qos.reliability is Reliability.RELIABLE,
-        )
-        return Link(self._core, publisher, subscription, channel)
-
-    def request(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
-        """Bring a request to the server."""
-        key = (client.entity_id, server.entity_id)
-        way = self._requests.get(key)
-        if way is None:
-            channel = self._service_channel(client, server, "request")
-            way = self._requests[key] = Exchanges(self._core, server, channel)
-        way.send(exchange)
-
-    def response(self, client: ClientHandle, server: ServiceHandle, exchange: Exchange) -> None:
-        """Bring a response to the client."""
-        key = (client.entity_id, server.entity_id)
-        way = self._responses.get(key)
-        if way is None:
-            channel = self._service_channel(client, server, "response")
-            way = self._responses[key] = Exchanges(self._core, client, channel)
-        way.send(exchange)
-
-    def _service_channel(
-        self, client: ClientHandle, server: ServiceHandle, what: str
-    ) -> Channel | None:
-        return self._plan.service_channel(
-            client.service,
-            self._end("client", client.service, client),
-            self._end("service", client.service, server),
-            what,
-        )
-
-    def _end(self, kind: str, name: str, endpoint: Any) -> tuple[str, int]:
-        """Return (node, how many such endpoints it has made before this one)."""
-        end = self._ends.get(endpoint.entity_id)
-        if end is None:
-            node = endpoint.node.fully_qualified_name
-            key = (kind, name, node)
-            ordinal = self._counts.get(key, 0)
-            self._counts[key] = ordinal + 1
-            end = self._ends[endpoint.entity_id] = (node, ordinal)
-        return end
-
-
-def note(core: Core, entity: int, draw: int) -> None:
-    """Write down what chance has decided, as an output of the event under way."""
-    if core.recorder is not None:
-        core.recorder.draw(entity, draw)
-
-
 class Exchanges:
     """The requests of one client to one server, or the responses."""
 
-    def __init__(self, core: Core, receiver: Any, channel: Channel | None) -> None:
-        self._core = core
+    def __init__(self, dispatcher: Dispatcher, receiver: Receiver, channel: Channel | None) -> None:
+        self._dispatcher = dispatcher
         self._receiver = receiver
         self._entity = receiver.entity_id
         self._channel = channel
         self._plain = channel.plain if channel is not None and channel.keep_order else None
         self._last_ns = 0
 
-    def send(self, exchange: Exchange) -> None:
+    def send(self, exchange: Any) -> None:
         """Send a request or response on its way."""
-        core = self._core
-        loop = core.loop
+        dispatcher = self._dispatcher
+        loop = dispatcher.loop
         now_ns = loop.now_ns
-        arrival_ns = now_ns + core.busy_ns
+        arrival_ns = now_ns + dispatcher.event.busy_ns
         channel = self._channel
         if self._plain is not None:  # the usual case: some time, in order
             delay_ns = self._plain(arrival_ns)
             if arrival_ns + delay_ns < self._last_ns:
                 delay_ns = self._last_ns - arrival_ns
             self._last_ns = arrival_ns = arrival_ns + delay_ns
-            if core.recorder is not None:
-                core.recorder.draw(self._entity, _DELAY | delay_ns)
+            dispatcher.draw(self._entity, _DELAY | delay_ns)
         elif channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             draw = _LOST[delay_ns] if delay_ns < 0 else encode_draw(Draw.DELAY, delay_ns)
-            note(core, self._entity, draw)
+            dispatcher.draw(self._entity, draw)
             if delay_ns < 0:
                 return
             arrival_ns += delay_ns
@@ -145,7 +75,7 @@ class Exchanges:
             return None
         return self._receiver.arrived(release[4])
 
-    def _arrive(self, exchange: Exchange) -> None:
+    def _arrive(self, exchange: Any) -> None:
         if not self._receiver.destroyed:
             self._receiver.deliver(exchange)
 
@@ -160,66 +90,56 @@ class Link:
 
     def __init__(
         self,
-        core: Core,
-        publisher: PublisherHandle,
-        subscription: SubscriptionHandle,
+        dispatcher: Dispatcher,
+        offered: Qos,
+        subscription: Subscription,
         channel: Channel | None,
     ) -> None:
         self.subscription = subscription
-        self._core = core
-        self._publisher = publisher
+        self._loop = dispatcher.loop
+        self._dispatcher = dispatcher
         self._channel = channel
-        self._held: deque[tuple[Message, list[int]]] = deque(maxlen=publisher.qos.keep)
+        self._held: deque[tuple[Message, list[int]]] = deque(maxlen=offered.keep)
         self._lost = 0
         self.last_ns = 0
         self._receiver = subscription.entity_id
         self._lifespan_ns = min(
             limit if finite(limit) else INFINITE_NS
-            for limit in (publisher.qos.lifespan_ns, subscription.qos.lifespan_ns)
+            for limit in (offered.lifespan_ns, subscription.qos.lifespan_ns)
         )
         self._timed = self._lifespan_ns != INFINITE_NS or subscription.timed
         self._lease: RequestedLease | None = None
         lease_ns = subscription.qos.lease_ns
         if finite(lease_ns):
             events = subscription.events
-            self._lease = RequestedLease(core.loop, lease_ns, subscription.qos.liveliness, events)
+            self._lease = RequestedLease(self._loop, lease_ns, subscription.qos.liveliness, events)
             for outage in channel.outages if channel is not None else ():
                 self._lease.cut_off(outage.from_ns, outage.to_ns)
         self.send: Send = self._send
         if not self._timed and channel is None:
-            self.send = direct_send(core, self)
+            self.send = direct_send(dispatcher, self)
         elif not self._timed and channel is not None and channel.plain and channel.keep_order:
-            self.send = quick_send(core, self, channel.plain)
-
-    @classmethod
-    def between(
-        cls, core: Core, publisher: PublisherHandle, subscription: SubscriptionHandle
-    ) -> Link:
-        """Make the link of two endpoints, with the model that the job has for it."""
-        if core.network is None:
-            return cls(core, publisher, subscription, None)
-        return core.network.link(publisher, subscription)
+            self.send = quick_send(dispatcher, self, channel.plain)
 
     def _send(
         self, data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
     ) -> None:
-        core = self._core
-        loop = core.loop
-        now_ns = loop.now_ns
-        arrival_ns = now_ns + core.busy_ns
+        dispatcher = self._dispatcher
+        now_ns = self._loop.now_ns
+        arrival_ns = now_ns + dispatcher.event.busy_ns
         message = (data, event, position, digest, stamp_ns, count)
         channel = self._channel
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             if delay_ns < 0:
-                note(core, self._receiver, _LOST[delay_ns])
+                dispatcher.draw(self._receiver, _LOST[delay_ns])
                 self._lost += 1
                 return
-            note(core, self._receiver, encode_draw(Draw.DELAY, delay_ns))
+            dispatcher.draw(self._receiver, encode_draw(Draw.DELAY, delay_ns))
             arrivals_ns = [arrival_ns + delay_ns]
             if channel.duplicate_ns >= 0:
                 copy_ns = arrival_ns + channel.duplicate_ns
-                note(core, self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+                dispatcher.draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
                 arrivals_ns.append(copy_ns)
             self.last_ns = max(self.last_ns, *arrivals_ns)
             if channel.held_until_ns >= 0:
@@ -231,7 +151,7 @@ class Link:
         self._bring(message, arrival_ns)
 
     def _bring(self, message: Message, arrival_ns: int) -> None:
-        loop = self._core.loop
+        loop = self._loop
         now_ns = loop.now_ns
         if arrival_ns <= now_ns and not self.expects(self._arrive):
             self._arrive((now_ns, ORDER_RELEASE, 0, self._arrive, *message))
@@ -240,7 +160,7 @@ class Link:
 
     def expects(self, arrive: Callable[[Release], Any]) -> bool:
         """Whether a message is due now that has not arrived yet: none must overtake it."""
-        scheduled, now_ns = self._core.loop.scheduled, self._core.loop.now_ns
+        scheduled, now_ns = self._loop.scheduled, self._loop.now_ns
         return bool(scheduled and scheduled[0][0] <= now_ns) and any(
             release[3] == arrive and release[0] <= now_ns for release in scheduled
         )
@@ -252,7 +172,7 @@ class Link:
         if self._lost:
             lost, self._lost = self._lost, 0
             subscription.events.add(MESSAGE_LOST, total=lost)
-        loop = self._core.loop
+        loop = self._loop
         arrived: Delivery = (loop.now_ns, *release[1:])
         if self._timed:
             if self._lease is not None:
@@ -276,7 +196,7 @@ class Link:
 
     def sign_of_life(self) -> None:
         """Tell the subscription that its publisher is alive; takes no time, outages hide it."""
-        channel, now_ns = self._channel, self._core.loop.now_ns
+        channel, now_ns = self._channel, self._loop.now_ns
         hidden = channel is not None and channel.cut_off_until(now_ns) is not None
         if self._lease is not None and not hidden:
             self._lease.seen()
@@ -294,7 +214,7 @@ class Link:
 
     def _hold(self, message: Message, arrivals_ns: list[int], until_ns: int) -> None:
         if not self._held:
-            self._core.loop.schedule(until_ns, self._release)
+            self._loop.schedule(until_ns, self._release)
         elif len(self._held) == self._held.maxlen:
             self._lost += 1
         self._held.append((message, arrivals_ns))
@@ -303,7 +223,70 @@ class Link:
         """Let go of what has waited through an outage."""
         held = list(self._held)
         self._held.clear()
-        loop = self._core.loop
+        loop = self._loop
         for message, arrivals_ns in held:
             for arrival_ns in arrivals_ns:
                 loop.schedule_release(max(arrival_ns, loop.now_ns), self._arrive, *message)
+
+
+class Network:
+    """Makes the links of one world, from the plan of its job."""
+
+    def __init__(self, dispatcher: Dispatcher, plan: NetworkPlan) -> None:
+        self._dispatcher = dispatcher
+        self._plan = plan
+        self._counts: dict[tuple[str, str, str], int] = {}
+        self._ends: dict[int, tuple[str, int]] = {}
+        self._requests: dict[tuple[int, int], Exchanges] = {}
+        self._responses: dict[tuple[int, int], Exchanges] = {}
+
+    def link(
+        self, publisher: DomainEntity, topic: str, qos: Qos, subscription: Subscription
+    ) -> Link:
+        """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
+        channel = self._plan.topic_channel(
+            topic,
+            self._end("publisher", topic, publisher),
+            self._end("subscription", topic, subscription),
+            reliable=subscription.qos.reliability is Reliability.RELIABLE,
+        )
+        return Link(self._dispatcher, qos, subscription, channel)
+
+    def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
+        """Bring a request to the server."""
+        key = (client.entity_id, server.entity_id)
+        way = self._requests.get(key)
+        if way is None:
+            channel = self._service_channel(service, client, server, "request")
+            way = self._requests[key] = Exchanges(self._dispatcher, server, channel)
+        way.send(exchange)
+
+    def response(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
+        """Bring a response to the client."""
+        key = (client.entity_id, server.entity_id)
+        way = self._responses.get(key)
+        if way is None:
+            channel = self._service_channel(service, client, server, "response")
+            way = self._responses[key] = Exchanges(self._dispatcher, client, channel)
+        way.send(exchange)
+
+    def _service_channel(
+        self, service: str, client: Receiver, server: Receiver, what: str
+    ) -> Channel | None:
+        return self._plan.service_channel(
+            service,
+            self._end("client", service, client),
+            self._end("service", service, server),
+            what,
+        )
+
+    def _end(self, kind: str, name: str, endpoint: DomainEntity) -> tuple[str, int]:
+        """Return (node, how many such endpoints it has made before this one)."""
+        end = self._ends.get(endpoint.entity_id)
+        if end is None:
+            node = endpoint.node.fully_qualified_name
+            key = (kind, name, node)
+            ordinal = self._counts.get(key, 0)
+            self._counts[key] = ordinal + 1
+            end = self._ends[endpoint.entity_id] = (node, ordinal)
+        return end

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
 
-from rsltrace.doors.rclpy.boundary.action_client import ActionClientHandle
-from rsltrace.doors.rclpy.boundary.entity_handle import callback_name
-from rsltrace.doors.rclpy.wire.interfaces import type_name as name_of_type
+from rsltrace.middleware.entity import DomainEntity
+from rsltrace.middleware.graph import Graph
+from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.publisher import Publisher
 from rsltrace.middleware.qos import Liveliness, incompatible_policies
 from rsltrace.middleware.qos_timing import finite
+from rsltrace.middleware.subscription import Subscription
 from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
 from rsltrace.model.stamp import format_duration
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.node import NodeHandle
-    from rsltrace.doors.rclpy.core import Core
 
 _ACTION = "/_action/"
 
@@ -67,33 +64,26 @@ class Overview:
         return [link for link in self.links if link.kind == kind]
 
 
-def overview(core: Core, *, everything: bool = False) -> Overview:
-    """Return the present graph of a world; ``everything`` with what every node has."""
-    graph = core.graph
+def overview(graph: Graph, waiting: Iterable[str], *, everything: bool = False) -> Overview:
+    """Return the present graph; ``everything`` with what every node has."""
     nodes = tuple(_node(node) for node in graph.nodes)
-    links = [*_topics(core), *_services(core), *_actions(core)]
+    links = [*_topics(graph), *_services(graph), *_actions(graph)]
     if not everything:
         links = [link for link in links if not _is_everywhere(link)]
     links.sort(key=lambda link: (link.kind, link.name))
     return Overview(
         nodes,
         tuple(links),
-        waiting=tuple(wait.waits_for() for wait in core.blocked if not wait.is_patient()),
+        waiting=tuple(waiting),
         problems=tuple(problem for link in links for problem in _problems(link)),
     )
 
 
-def _node(node: NodeHandle) -> NodeView:
-    timers = () if node.wrapper is None else tuple(node.wrapper.timers)
-    return NodeView(
-        node.fully_qualified_name,
-        node.trace_type(),
-        tuple((callback_name(timer.callback), timer.handle.state.period_ns) for timer in timers),
-    )
+def _node(node: Participant) -> NodeView:
+    return NodeView(node.fully_qualified_name, node.trace_type(), tuple(node.timer_periods()))
 
 
-def _topics(core: Core) -> Iterator[Link]:
-    graph = core.graph
+def _topics(graph: Graph) -> Iterator[Link]:
     for name, (type_name,) in graph.topic_names_and_types():
         publishers, subscriptions = graph.publishers(name), graph.subscriptions(name)
         yield Link(
@@ -115,31 +105,30 @@ def _topics(core: Core) -> Iterator[Link]:
         )
 
 
-def _services(core: Core) -> Iterator[Link]:
-    for name, (type_name, *_) in core.graph.service_names_and_types():
+def _services(graph: Graph) -> Iterator[Link]:
+    for name, (type_name, *_) in graph.service_names_and_types():
         yield Link(
             "service",
             name,
             type_name,
-            tuple(End(_name_of(client)) for client in core.graph.clients(name)),
-            tuple(End(_name_of(server)) for server in core.graph.services(name)),
+            tuple(End(_name_of(client)) for client in graph.clients(name)),
+            tuple(End(_name_of(server)) for server in graph.services(name)),
         )
 
 
-def _actions(core: Core) -> Iterator[Link]:
+def _actions(graph: Graph) -> Iterator[Link]:
     ends: dict[tuple[str, str], tuple[list[End], list[End]]] = {}
-    for node in core.graph.nodes:
+    for node in graph.nodes:
         for action in node.actions:
-            key = (action.name, name_of_type(action.action_type))
-            is_client = isinstance(action, ActionClientHandle)
-            ends.setdefault(key, ([], []))[0 if is_client else 1].append(
+            key = (action.name, action.type_name)
+            ends.setdefault(key, ([], []))[0 if action.is_client else 1].append(
                 End(node.fully_qualified_name)
             )
     for (name, type_name), (clients, servers) in ends.items():
         yield Link("action", name, type_name, tuple(clients), tuple(servers))
 
 
-def _end(endpoint: Any) -> End:
+def _end(endpoint: Publisher | Subscription) -> End:
     qos = endpoint.qos
     history = "keep all" if qos.keep is None else f"keep last {qos.keep}"
     words = [word.name.lower().replace("_", " ") for word in (qos.reliability, qos.durability)]
@@ -151,7 +140,7 @@ def _end(endpoint: Any) -> End:
     return End(_name_of(endpoint), ", ".join(words))
 
 
-def _name_of(endpoint: Any) -> str:
+def _name_of(endpoint: DomainEntity) -> str:
     return "(no node)" if endpoint.node is None else str(endpoint.node.fully_qualified_name)
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any
 
 
 class Reliability(IntEnum):
@@ -78,22 +77,6 @@ class Qos:
     lease_ns: int
     avoid_ros_namespace_conventions: bool = False
 
-    @classmethod
-    def from_rmw(cls, profile: Any) -> Qos:
-        """Read an ``rmw_qos_profile_t`` of rclpy."""
-        values = profile.to_dict()
-        return cls(
-            history=History(int(values["history"])),
-            depth=int(values["depth"]),
-            reliability=Reliability(int(values["reliability"])),
-            durability=Durability(int(values["durability"])),
-            deadline_ns=_limit(values["deadline"].nanoseconds),
-            lifespan_ns=_limit(values["lifespan"].nanoseconds),
-            liveliness=Liveliness(int(values["liveliness"])),
-            lease_ns=_limit(values["liveliness_lease_duration"].nanoseconds),
-            avoid_ros_namespace_conventions=bool(values["avoid_ros_namespace_conventions"]),
-        )
-
     def resolved(self, *, publisher: bool, peers: list[Qos]) -> Qos:
         """Replace system defaults and "best available" by what the middleware settles on.
 
@@ -134,22 +117,6 @@ class Qos:
     def keep(self) -> int | None:
         """How many messages a queue holds; None: all."""
         return None if self.history is History.KEEP_ALL else max(self.depth, 1)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return what ``TopicEndpointInfo`` takes for a QoS profile."""
-        from rclpy.duration import Duration
-
-        return {
-            "history": int(self.history),
-            "depth": self.depth,
-            "reliability": int(self.reliability),
-            "durability": int(self.durability),
-            "lifespan": Duration(nanoseconds=self.lifespan_ns or INFINITE_NS),
-            "deadline": Duration(nanoseconds=self.deadline_ns or INFINITE_NS),
-            "liveliness": int(self.liveliness),
-            "liveliness_lease_duration": Duration(nanoseconds=self.lease_ns or INFINITE_NS),
-            "avoid_ros_namespace_conventions": self.avoid_ros_namespace_conventions,
-        }
 
     def to_yaml(self) -> str:
         """Return the one-element YAML list that rosbag2 keeps as ``offered_qos_profiles``."""
@@ -209,11 +176,20 @@ def incompatible_policies(offered: Qos, requested: Qos) -> list[PolicyKind]:
     return found
 
 
-def _limit(duration_ns: int) -> int:
-    return 0 if duration_ns >= INFINITE_NS else int(duration_ns)
-
-
 def _yaml_duration(key: str, duration_ns: int) -> list[str]:
     # rosbag2 writes "infinite" as the largest pair that its duration type holds.
     sec, nsec = divmod(duration_ns or INFINITE_NS, 1_000_000_000)
     return [f"  {key}:", f"    sec: {sec}", f"    nsec: {nsec}"]
+
+
+DEFAULT_QOS = Qos(
+    history=History.KEEP_LAST,
+    depth=10,
+    reliability=Reliability.RELIABLE,
+    durability=Durability.VOLATILE,
+    deadline_ns=0,
+    lifespan_ns=0,
+    liveliness=Liveliness.AUTOMATIC,
+    lease_ns=0,
+)
+"""What rclcpp and rclpy call the default profile."""

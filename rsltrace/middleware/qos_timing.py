@@ -2,13 +2,12 @@
 
 A watch looks at the clock only when its time may be up, not at every message; and only where there
 is a callback that wants to know, so that a run without one can still end because nothing is left.
-What happens when follows Fast DDS; ``tests/doors/test_qos_native.py`` compares the two.
+What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` compares the two.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from rsltrace.loop.loop import EventLoop
 from rsltrace.middleware.endpoint_status import (
     DEADLINE_MISSED,
     LIVELINESS_CHANGED,
@@ -16,9 +15,6 @@ from rsltrace.middleware.endpoint_status import (
     EndpointEvents,
 )
 from rsltrace.middleware.qos import INFINITE_NS, Liveliness, Qos
-
-if TYPE_CHECKING:
-    from rsltrace.loop.loop import EventLoop
 
 
 class _Watch:
@@ -66,7 +62,7 @@ class Deadline(_Watch):
         self._events = events
 
     def _wanted(self) -> bool:
-        return DEADLINE_MISSED in self._events.handles
+        return DEADLINE_MISSED in self._events.listeners
 
     def _up(self) -> None:
         self._events.add(DEADLINE_MISSED, total=1)
@@ -82,7 +78,7 @@ class OfferedLease(_Watch):
         self._events = events
 
     def _wanted(self) -> bool:
-        return LIVELINESS_LOST in self._events.handles
+        return LIVELINESS_LOST in self._events.listeners
 
     def _up(self) -> None:
         self._events.add(LIVELINESS_LOST, total=1)
@@ -125,7 +121,7 @@ class RequestedLease(_Watch):
         self.over = True
 
     def _wanted(self) -> bool:
-        return LIVELINESS_CHANGED in self._events.handles
+        return LIVELINESS_CHANGED in self._events.listeners
 
     def _up(self) -> None:
         self._becomes(False)

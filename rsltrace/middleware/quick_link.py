@@ -9,20 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from heapq import heappush
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rsltrace.chance.distribution import Sampler
 from rsltrace.loop.loop import ORDER_RELEASE, Release
+from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.receiver import Receiver
+from rsltrace.middleware.subscription import Subscription
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import OutputKind
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import OUTPUT_CONTENT
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.entity_handle import Receiver
-    from rsltrace.doors.rclpy.boundary.pubsub import SubscriptionHandle
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.middleware.links import Link
 
 Send = Callable[[bytes, int, int, int, int, int], None]
 """Sends a message on its way: what a ``Delivery`` has from the CDR on."""
@@ -32,35 +29,46 @@ _DRAW = int(OutputKind.DRAW)
 _pack_output = OUTPUT_CONTENT.pack
 
 
-def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
+class OrderedLink(Protocol):
+    """A link that keeps the order; ``last_ns`` is when the last message arrives."""
+
+    subscription: Subscription
+    last_ns: int
+
+    def expects(self, arrive: Callable[[Release], object]) -> bool:
+        """Whether a message is due now that has not arrived yet."""
+
+
+def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Send:
     """Return how ``link`` sends, if it does nothing but delay and keeps the order."""
-    loop = core.loop
+    loop = dispatcher.loop
+    under_way = dispatcher.event
     subscription = link.subscription
     entity = subscription.entity_id
     scheduled, next_place = loop.scheduled, loop.next_place
 
-    def arrive(release: Release) -> SubscriptionHandle | None:
+    def arrive(release: Release) -> Subscription | None:
         if subscription.destroyed:
             return None
         subscription.queue.append(release)
-        if subscription.wrapper is not None:
+        if subscription.active:
             return subscription
-        subscription.find_wrapper()
+        subscription.awaken()
         return None
 
     def send(
         data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
     ) -> None:
         leaves_ns = loop.now_ns
-        if core.busy_ns:
-            leaves_ns += core.busy_ns
+        if under_way.busy_ns:
+            leaves_ns += under_way.busy_ns
         delay_ns = delay(leaves_ns)
         arrival_ns = leaves_ns + delay_ns
         if arrival_ns < link.last_ns:
             arrival_ns = link.last_ns
             delay_ns = arrival_ns - leaves_ns
         link.last_ns = arrival_ns
-        recorder = core.recorder
+        recorder = dispatcher.recorder
         if recorder is not None:  # what Recorder.draw does
             packed = _pack_output(_DELAY | delay_ns, entity, _DRAW)
             recorder.output_hash = hash64(packed, recorder.output_hash)
@@ -78,12 +86,13 @@ def quick_send(core: Core, link: Link, delay: Sampler) -> Send:
     return send
 
 
-def direct_send(core: Core, link: Link) -> Send:
+def direct_send(dispatcher: Dispatcher, link: OrderedLink) -> Send:
     """Return how ``link`` sends, if there is nothing the matter with it.
 
     Only what an execution time holds back waits in the loop's queue, and what must not overtake it.
     """
-    loop = core.loop
+    loop = dispatcher.loop
+    under_way = dispatcher.event
     scheduled = loop.scheduled
     subscription = link.subscription
     arrived = subscription.arrived
@@ -95,7 +104,7 @@ def direct_send(core: Core, link: Link) -> Send:
         data: bytes, event: int, position: int, digest: int, stamp_ns: int, count: int
     ) -> None:
         now_ns = loop.now_ns
-        late_ns = core.busy_ns
+        late_ns = under_way.busy_ns
         if late_ns or (scheduled and scheduled[0][0] <= now_ns and link.expects(arrive)):
             what = (data, event, position, digest, stamp_ns, count)
             loop.schedule_release(now_ns + late_ns, arrive, *what)

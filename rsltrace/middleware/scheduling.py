@@ -6,24 +6,18 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.chance.distribution import Distribution, Sampler
 from rsltrace.chance.stream import Stream
-from rsltrace.doors.rclpy.boundary.entity_handle import EntityHandle
-from rsltrace.doors.rclpy.stacks.blocking_calls import Wait
-from rsltrace.doors.rclpy.stacks.tasks import TaskRun
 from rsltrace.loop.ordered import OrderedLoop, Place, Workers
 from rsltrace.loop.policy import Candidate, Policy
-from rsltrace.middleware.links import note
+from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.entity import Runnable
+from rsltrace.middleware.event import OutsideEvent, Owner
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import EventKind
 
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.node import NodeHandle
-    from rsltrace.doors.rclpy.core import Core
-
-_LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
 _TAKES_TIME = frozenset(
     map(
         int,
@@ -74,11 +68,18 @@ class SchedulingPlan:
     start_ns: int = 0
 
 
+class Schedulable(Protocol):
+    """What is in a queue of the loop: it can say what a policy has to know of it."""
+
+    def runnable(self) -> Runnable:
+        """Return what there is to know."""
+
+
 class Scheduling:
     """Describes to the loop what may run, and gives callbacks their durations."""
 
-    def __init__(self, core: Core, loop: OrderedLoop, plan: SchedulingPlan) -> None:
-        self._core = core
+    def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        self._dispatcher = dispatcher
         self._loop = loop
         self._plan = plan
         self._workers: dict[object, Workers] = {}
@@ -87,39 +88,25 @@ class Scheduling:
         loop.policy = plan.policy
         loop.place = self.place
         if plan.execution:
-            self._execute = core.execute
-            core.execute = self._timed  # type: ignore[method-assign]
+            self._execute = dispatcher.execute
+            dispatcher.execute = self._timed  # type: ignore[method-assign]
 
     # -- what may run --------------------------------------------------------------------------
 
-    def place(self, item: Any) -> Place:
+    def place(self, item: Schedulable | Any) -> Place:
         """Describe something that may run."""
-        if isinstance(item, Wait):  # a callback under way goes on: it has its worker
-            return Place(_candidate(item, None, item.entity_id, "resume", "", ()), None, None)
-        node: NodeHandle | None = getattr(item, "node", None)
-        wrapper = getattr(item, "wrapper", None)
-        group = getattr(wrapper, "callback_group", None)
-        exclusive = group if hasattr(group, "_active_entity") else None
-        names: tuple[str, ...] = ()
-        if node is not None and group is not None:
-            names = _names_in_group(node, group)
-        if isinstance(item, TaskRun):
-            candidate = _candidate(item, node, item.entity, "task", item.label(), ())
-            exclusive = None
-        elif isinstance(item, EntityHandle):
-            kind = item.kind.label.replace(" ", "_")
-            candidate = _candidate(item, node, item.entity_id, kind, item.trace_name(), names)
-        else:
-            # A thread that user code has started is on no executor.
-            candidate = _candidate(item, node, 0, "thread", item.describe(), ())
-            return Place(candidate, None, None)
-        return Place(candidate, self._workers_of(node), exclusive)
+        what: Runnable = item.runnable()
+        owner = what.node.fully_qualified_name if what.node is not None else ""
+        candidate = Candidate(
+            owner, what.name, what.kind, what.entity, what.period_ns, what.group_names, item
+        )
+        return Place(candidate, self._workers_of(what), what.group)
 
-    def _workers_of(self, node: NodeHandle | None) -> Workers | None:
-        """Return the executor of a node; none for nodes that an executor of the user's own runs."""
-        if not self._plan.occupies or node is None or node.mailbox is not None:
+    def _workers_of(self, what: Runnable) -> Workers | None:
+        """Return the simulated executor that something runs on, if it does on any."""
+        if not self._plan.occupies or what.node is None or not what.executor:
             return None
-        name = node.fully_qualified_name
+        name = what.node.fully_qualified_name
         key: object = name
         count = 1
         for index, rule in enumerate(self._plan.executors):
@@ -137,7 +124,7 @@ class Scheduling:
         self,
         handle: Any,
         entity: int,
-        node: NodeHandle | None,
+        node: Owner | None,
         kind: int,
         callback: Callable[..., object],
         args: tuple[Any, ...],
@@ -145,30 +132,29 @@ class Scheduling:
         cause_output: int,
         input_hash: int,
     ) -> None:
-        """Stand in for ``Core.execute``: draw how long the callback takes, then run it."""
-        core, charge = self._core, self._loop.charge
+        """Stand in for ``Dispatcher.execute``: draw how long the callback takes, then run it."""
+        event, charge = self._dispatcher.event, self._loop.charge
         duration = None
-        if kind in _TAKES_TIME and isinstance(handle, (EntityHandle, TaskRun)):
+        if kind in _TAKES_TIME and not isinstance(handle, OutsideEvent):
             duration = self._duration_of(handle, entity, node)
-        duration_ns = 0 if duration is None else duration(core.loop.now_ns)
+        duration_ns = 0 if duration is None else duration(self._loop.now_ns)
         if duration is not None:
-            note(core, entity, encode_draw(Draw.EXECUTION, duration_ns))
-        before, core.busy_ns = core.busy_ns, duration_ns
+            self._dispatcher.draw(entity, encode_draw(Draw.EXECUTION, duration_ns))
+        before, event.busy_ns = event.busy_ns, duration_ns
         self._execute(
             handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
         )
-        core.busy_ns = before
-        core.took_ns = duration_ns
+        event.busy_ns = before
+        event.took_ns = duration_ns
         charge.duration_ns += duration_ns
 
-    def _duration_of(self, handle: Any, entity: int, node: NodeHandle | None) -> Sampler | None:
+    def _duration_of(self, handle: Any, entity: int, node: Owner | None) -> Sampler | None:
         if entity in self._durations:
             return self._durations[entity]
         sampler = None
         if node is not None:
             owner = node.fully_qualified_name
-            kind = handle.kind.label if isinstance(handle, EntityHandle) else "task"
-            name = handle.trace_name() if isinstance(handle, EntityHandle) else ""
+            kind, name = handle.execution_name()
             key = (owner, kind, name)
             ordinal = self._counts[key] = self._counts.get(key, -1) + 1
             for rule in self._plan.execution:
@@ -182,34 +168,3 @@ class Scheduling:
                     break
         self._durations[entity] = sampler
         return sampler
-
-
-def _candidate(
-    item: Any,
-    node: NodeHandle | None,
-    entity_id: int,
-    kind: str,
-    name: str,
-    group: tuple[str, ...],
-) -> Candidate:
-    owner = node.fully_qualified_name if node is not None else ""
-    return Candidate(owner, name, kind, entity_id, _period_ns(item, node), group, item)
-
-
-def _period_ns(item: Any, node: NodeHandle | None) -> int | None:
-    """Return a timer's period, or that of the fastest timer of a node that runs."""
-    state = getattr(item, "state", None)
-    if state is not None and hasattr(state, "period_ns"):
-        return int(state.period_ns)
-    timers = getattr(getattr(node, "wrapper", None), "timers", ())
-    return min((timer.handle.state.period_ns for timer in timers), default=None)
-
-
-def _names_in_group(node: NodeHandle, group: Any) -> tuple[str, ...]:
-    names = []
-    for attribute in _LISTS:
-        for wrapper in getattr(node.wrapper, attribute, ()):
-            handle = getattr(wrapper, "handle", None)
-            if getattr(wrapper, "callback_group", None) is group and handle is not None:
-                names.append(handle.trace_name())
-    return tuple(names)

@@ -54,7 +54,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.stop = session.stop or Stop("checked")
             session.finish()
             raise error
-        found = overview(session.world.core, everything=everything)
+        found = overview(session.world.domain.graph, session.world.blocked(), everything=everything)
         found = replace(found, problems=(*found.problems, *_played_and_published(found)))
         unused = session.unused()
         session.stop = Stop("checked")

@@ -133,10 +133,10 @@ class Driver:
             self._counted = self.loop.events
             if self._steps != 0 and self._may_advance(next_ns):
                 return False
-        core = self.session.world.core
-        core.runners.append(getcurrent())
-        assert core.main is not None
-        core.main.switch()
+        runners = self.session.world.stacks.runners
+        runners.waiting.append(getcurrent())
+        assert runners.main is not None
+        runners.main.switch()
         return True
 
     def _may_advance(self, next_ns: int | None) -> bool:
@@ -180,7 +180,7 @@ class Driver:
 
     def check_outside(self) -> None:
         """Raise RunError if the present code is a node's, or that of another thread."""
-        if threading.get_ident() != self.session.world.core.thread:
+        if threading.get_ident() != self.session.world.stacks.runners.thread:
             raise RunError("a simulation is driven by the thread that has entered it")
         if self._who is _Who.RUN:
             raise RunError("a node cannot drive the simulation that it is part of")

@@ -18,7 +18,7 @@ from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.middleware.dispatcher import Dispatcher
 
 _PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000
@@ -44,7 +44,7 @@ class Observer:
 
 
 def housekeeping(
-    core: Callable[[], Core], observer: Observer, end_ns: int | None
+    dispatcher: Callable[[], Dispatcher], observer: Observer, end_ns: int | None
 ) -> Callable[[], int]:
     """Return what is done between time steps: progress, and collecting garbage.
 
@@ -55,15 +55,15 @@ def housekeeping(
 
     def between_steps() -> int:
         nonlocal collect_at
-        events = core().loop.events
+        events = dispatcher().loop.events
         if events >= collect_at:
             collect_at = events + _GC_EVERY_EVENTS
-            with core().outside_events():
+            with dispatcher().outside_events():
                 gc.collect(1)
         if observer.progress is None:
             return collect_at
         with engage(None):  # whoever watches lives in real time
-            observer.progress(core().loop.now_ns, end_ns, events)
+            observer.progress(dispatcher().loop.now_ns, end_ns, events)
         return min(collect_at, events + _PROGRESS_EVERY_EVENTS)
 
     return between_steps

@@ -20,7 +20,7 @@ from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
-from rsltrace.middleware.census import Met, parameters_of
+from rsltrace.middleware.census import Census
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.inputs import check_output
@@ -37,7 +37,7 @@ from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.executables import why_not
 from rsltrace.run.plans.guarding import Guarding, guarding
 from rsltrace.run.plans.network import network_plan
-from rsltrace.run.plans.recorded_order import following, keep_choices, note_choices
+from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from rsltrace.chance.network import NetworkPlan
     from rsltrace.doors.rclpy.entry import Entry
     from rsltrace.doors.rclpy.world import World
-    from rsltrace.middleware.recorded_run import Following
+    from rsltrace.middleware.recorded_run import RecordedRun
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class Session:
         self._guarded: Guarding
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
-        self._following: Following | None
+        self._recorded: RecordedRun | None
 
     def __enter__(self) -> Session:
         """Open everything. Whatever can be known to be wrong is found before a file is made.
@@ -146,7 +146,7 @@ class Session:
         self._stack.__exit__(kind, error, where)
 
     def _open(self, stack: ExitStack) -> None:
-        from rsltrace.doors.rclpy.installation import check_free
+        from rsltrace.doors.rclpy.boundary.installation import check_free
 
         check_free()
         expanded = expand(self.job, why_not=why_not)
@@ -155,13 +155,13 @@ class Session:
         stack.enter_context(search_path(self.job))
         self._guarded = guarding(stack, self.job)
         self._make_world(stack)
-        self._guarded.begin(self.world.core, self._replay)
+        self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
             self._import_what_is_named()
         check_bag_types(self._bags)
         if self._output is not None:
             self._open_trace(stack, self._output)
-        self._watchdog = Watchdog(self.world.core)
+        self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
         if self._observer.interrupt is not None:
             self._observer.interrupt(self._interrupt)
         stack.enter_context(quiet_gc())
@@ -191,7 +191,9 @@ class Session:
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
-            between_steps=housekeeping(lambda: self.world.core, self._observer, self.end_ns),
+            between_steps=housekeeping(
+                lambda: self.world.domain.dispatcher, self._observer, self.end_ns
+            ),
         )
         loop.min_step_ns = job.min_time_step_ns
         self.world = world = stack.enter_context(
@@ -200,10 +202,10 @@ class Session:
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
-        world.core.met = Met() if has_rules(job) else None
-        self._following = following(job, world.core, stack)
+        world.domain.entities.census = Census() if has_rules(job) else None
+        self._recorded = recorded_run(job, world.domain, stack)
         if isinstance(loop, OrderedLoop):
-            recorded = None if self._following is None else self._following.order
+            recorded = None if self._recorded is None else self._recorded.order
             with self._guarded.engaged():
                 world.use_scheduling(loop, scheduling_plan(job, self.start_ns, recorded))
         world.use_clocks(clocks_of(job), self.start_ns)
@@ -212,7 +214,7 @@ class Session:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
         job, world = self.job, self.world
         self.loop.stop_conditions = tuple(
-            stop_conditions(job, self.start_ns, world.core.outside_events)
+            stop_conditions(job, self.start_ns, world.domain.dispatcher.outside_events)
         )
         with world.importing():
             self._entries = [
@@ -229,7 +231,7 @@ class Session:
             TraceWriter(path, force=self._force, events_per_segment=job.record.segment_events)
         )
         recorder = Recorder(writer, keep_payload=payload_filter(job))
-        self.world.core.recorder = recorder
+        self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
         writer.add_metadata(METADATA_SOURCES, sources(job))
@@ -260,22 +262,23 @@ class Session:
     @property
     def digest(self) -> str:
         """The digest so far, empty for a run that records nothing."""
-        recorder = self.world.core.recorder
+        recorder = self.world.domain.dispatcher.recorder
         return "" if recorder is None else recorder.digest
 
     def begin(self) -> None:
         """Construct the nodes and jump to the start. What goes wrong is in ``error``."""
-        core = self.world.core
         if self.job.stop.topic is not None:
             from rsltrace.doors.rclpy.exit_code_topic import watch_exit_code
 
             watch = watch_exit_code(
-                core, self.job.stop.topic, where=locate(self.job, ("stop", "topic", "exit_code"))
+                self.loop,
+                self.job.stop.topic,
+                where=locate(self.job, ("stop", "topic", "exit_code")),
             )
-            core.watch(self.job.stop.topic.name, watch)
+            self.world.domain.watch(self.job.stop.topic.name, watch)
         with self._failures(), self._engaged():
             self.world.plan(self._entries)
-            core.fed = bool(self._bags)
+            self.world.stacks.programs.fed = bool(self._bags)
             for entry in self._entries:
                 if not self.world.construct(entry):
                     say_where(self.job, entry, self.world.error)
@@ -301,19 +304,22 @@ class Session:
             yield
         except (RunError, BagError) as error:
             # Raised by the loop itself (a livelock) or the bag player, not by a callback.
-            core = self.world.core
-            core.error = error if isinstance(error, RunError) else RunError(str(error))
-            self.stop = Stop(str(error).splitlines()[0], core.error.exit_code)
+            failed = error if isinstance(error, RunError) else RunError(str(error))
+            self.world.domain.outcome.error = failed
+            self.stop = Stop(str(error).splitlines()[0], failed.exit_code)
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
         """Return what in the job had nothing to do so far; ``lasted``: the run is over."""
-        core = self.world.core
+        from rsltrace.doors.rclpy.parameters import parameters_of
+
+        domain = self.world.domain
         lasted_ns = self.loop.now_ns - self.start_ns if lasted else None
-        parameters = {**core.parameters, **parameters_of(core)}
+        parameters = {**self.world.parameters, **parameters_of(domain.graph)}
         rules: list[str] = []
-        if core.met is not None:
-            rules += unused_rules(self.job, core.met, self._plan, lasted_ns)
-            rules += unused_ros_parameters(self.job, core.met, parameters)
+        census = domain.entities.census
+        if census is not None:
+            rules += unused_rules(self.job, census, self._plan, lasted_ns)
+            rules += unused_ros_parameters(self.job, census, parameters)
         return (*rules, *unused_parameters(self.job, parameters))
 
     def finish(self) -> RunResult:
@@ -321,12 +327,12 @@ class Session:
 
         :raises OutputError: if the rest of the trace cannot be written.
         """
-        loop, core = self.loop, self.world.core
+        loop, outcome = self.loop, self.world.domain.outcome
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
         unused = self.unused(lasted=True) if self.world.error is None else ()
-        if self._following is not None and self.world.error is None:
-            unused = (*self._following.notes(), *unused)
+        if self._recorded is not None and self.world.error is None:
+            unused = (*self._recorded.notes(), *unused)
         with self._engaged():
             self.world.destroy()
         error = self.world.error
@@ -340,11 +346,12 @@ class Session:
                     "end_time": str(loop.now_ns),
                     "stop_reason": stop.reason,
                     "exit_code": str(exit_code),
-                    "ended_after": str(core.ended_after),
+                    "ended_after": str(outcome.ended_after),
                 }
             )
         digest = self.digest
-        core.recorder = None  # what finalizers say from now on comes too late
+        # What finalizers say from now on comes too late.
+        self.world.domain.dispatcher.recorder = None
         return RunResult(
             path=self._output,
             digest=digest,
@@ -354,6 +361,6 @@ class Session:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
-            notes=(*self._notes, *core.notes, *unused),
+            notes=(*self._notes, *outcome.notes, *unused),
             guarded=self._guarded.counts,
         )

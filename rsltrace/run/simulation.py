@@ -300,7 +300,7 @@ class Simulation:
         tap = Tap(topic, callback, depth)
         if topic not in self._taps:
             self._taps[topic] = []
-            self._session.world.core.watch(topic, self._watcher(self._taps[topic]))
+            self._session.world.domain.watch(topic, self._watcher(self._taps[topic]))
         self._taps[topic].append(tap)
         return tap
 
@@ -312,12 +312,13 @@ class Simulation:
 
     def _watcher(self, taps: list[Tap]) -> Callable[[Any, bytes], None]:
         from rsltrace.doors.rclpy.wire.codec import codec_for
+        from rsltrace.doors.rclpy.wire.interfaces import class_of
 
         driver = self._driver
 
-        def watch(message_class: Any, data: bytes) -> None:
+        def watch(publisher: Any, data: bytes) -> None:
             for tap in taps:
-                message = codec_for(message_class).deserialize(data)
+                message = codec_for(class_of(publisher)).deserialize(data)
                 tap.add(driver.loop.now_ns, message)
                 if tap.callback is not None:
                     driver.tell_later(tap.callback, message)

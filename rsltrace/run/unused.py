@@ -12,9 +12,10 @@ from fnmatch import fnmatchcase
 
 from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
 from rsltrace.doors.rclpy.arguments import RosArguments
+from rsltrace.doors.rclpy.parameters import Parameters
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.census import Met, Parameters
+from rsltrace.middleware.census import Census
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
 from rsltrace.run.plans.guarding import entry_key
@@ -33,14 +34,16 @@ def has_rules(job: Job) -> bool:
 
 
 def unused_rules(
-    job: Job, met: Met, plan: NetworkPlan | None, lasted_ns: int | None = None
+    job: Job, census: Census, plan: NetworkPlan | None, lasted_ns: int | None = None
 ) -> Iterator[str]:
     """Yield what a job's rules name that was not there; ``lasted_ns`` is how long the run was."""
-    topics = [*met.topics, *QUIET_TOPICS]
-    nodes = list(met.nodes)
-    for place, glob, names, what in _single(job, topics, list(met.services), nodes):
+    topics = [*census.topics, *QUIET_TOPICS]
+    nodes = list(census.nodes)
+    for place, glob, names, what in _single(job, topics, list(census.services), nodes):
         if not _fits(glob, names):
-            other, others = ("topics", topics) if what == "service" else ("services", met.services)
+            other, others = (
+                ("topics", topics) if what == "service" else ("services", census.services)
+            )
             if what != "node" and _fits(glob, others):
                 yield f"{locate(job, place)}: {glob!r} fits {other} only: name it as such"
             else:
@@ -49,12 +52,12 @@ def unused_rules(
         if rule.name not in topics:
             yield f"{rule.where}: no topic is called {rule.name!r}{_instead(rule.name, topics)}"
     for place, glob in _record_globs(job):
-        names = [*topics, *met.services]
+        names = [*topics, *census.services]
         if not _fits(glob, names):
             yield _note(job, place, "topic or service", glob, names)
-    yield from unused_remappings(job, met)
-    yield from _links(job, met)
-    yield from _entities(job, met)
+    yield from unused_remappings(job, census)
+    yield from _links(job, census)
+    yield from _entities(job, census)
     yield from _hidden(job, nodes)
     if job.delay is not None and lasted_ns is not None:
         for index, outage in enumerate(job.delay.outages):
@@ -98,19 +101,19 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
             )
 
 
-def unused_ros_parameters(job: Job, met: Met, nodes: dict[str, Parameters]) -> Iterator[str]:
+def unused_ros_parameters(job: Job, census: Census, nodes: dict[str, Parameters]) -> Iterator[str]:
     """Yield the parameters among ``ros_arguments`` that no node which gets them has declared."""
     words = job.ros_arguments
     for index, word in enumerate(words[1:], start=1):
         if words[index - 1] not in ("-p", "--param"):
             continue
         arguments = RosArguments(["--ros-args", "-p", word])
-        given = {name: list(arguments.parameters(name)) for name in met.nodes}
+        given = {name: list(arguments.parameters(name)) for name in census.nodes}
         name = next((found[0] for found in given.values() if found), None)
         place = locate(job, ("ros_arguments", index))
         if name is None:
             who = word.partition(":=")[0].rpartition(":")[0]
-            yield f"{place}: no node is called {who!r}{_instead(who, list(met.nodes))}"
+            yield f"{place}: no node is called {who!r}{_instead(who, list(census.nodes))}"
             continue
         who_gets = [node for node, found in given.items() if found]
         if any(node not in nodes or name in nodes[node].declared for node in who_gets):
@@ -156,15 +159,15 @@ def _record_globs(job: Job) -> Iterator[tuple[Loc, str]]:
                 yield loc, glob
 
 
-def _links(job: Job, met: Met) -> Iterator[str]:
+def _links(job: Job, census: Census) -> Iterator[str]:
     for index, link in enumerate(job.delay.links if job.delay is not None else ()):
         place: Loc = ("delay", "links", index)
-        if not _fits(link.topic, met.topics):
-            yield _note(job, (*place, "topic"), "topic", link.topic, list(met.topics))
+        if not _fits(link.topic, census.topics):
+            yield _note(job, (*place, "topic"), "topic", link.topic, list(census.topics))
             continue
         for key, glob, ends, what in (
-            ("from", link.sender, met.publishers, "publishes"),
-            ("to", link.receiver, met.subscriptions, "subscribes"),
+            ("from", link.sender, census.publishers, "publishes"),
+            ("to", link.receiver, census.subscriptions, "subscribes"),
         ):
             there = [node for node, topic in ends if fnmatchcase(topic, link.topic)]
             if not _fits(glob, there):
@@ -175,7 +178,7 @@ def _links(job: Job, met: Met) -> Iterator[str]:
                 )
 
 
-def _entities(job: Job, met: Met) -> Iterator[str]:
+def _entities(job: Job, census: Census) -> Iterator[str]:
     """Yield the rules for entities of nodes, in ``execution`` and ``policy``."""
     rules: list[tuple[Loc, str, str, str | None]] = []
     if job.execution is not None:
@@ -186,10 +189,10 @@ def _entities(job: Job, met: Met) -> Iterator[str]:
         key = "group_of" if rule.group_of is not None else "entity"
         rules.append((("policy", "priority", index), rule.node, key, rule.group_of or rule.entity))
     for place, node, key, entity in rules:
-        if not _fits(node, met.nodes):
-            yield _note(job, (*place, "node"), "node", node, list(met.nodes))
+        if not _fits(node, census.nodes):
+            yield _note(job, (*place, "node"), "node", node, list(census.nodes))
         elif entity is not None:
-            names = [name for owner, name in met.entities if fnmatchcase(owner, node)]
+            names = [name for owner, name in census.entities if fnmatchcase(owner, node)]
             if not _fits(entity, names):
                 near = _near(entity, names) or _there(names)
                 yield (

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc, nearest
-from rsltrace.middleware.census import Asker, Met
+from rsltrace.middleware.census import Asker, Census
 from rsltrace.run.plans.guarding import entry_key
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
@@ -25,7 +25,7 @@ def has_remappings(job: Job) -> bool:
     return bool(job.ros_arguments) or any(spec.remappings for spec in job.nodes)
 
 
-def unused_remappings(job: Job, met: Met) -> Iterator[str]:
+def unused_remappings(job: Job, census: Census) -> Iterator[str]:
     """Yield the remappings of ``nodes`` and ``ros_arguments`` that had nothing to do.
 
     What several nodes are given alike (``<set_remap>`` of a launch file, an anchor of YAML) has
@@ -35,17 +35,17 @@ def unused_remappings(job: Job, met: Met) -> Iterator[str]:
     given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
     for index, spec in enumerate(job.nodes):
         key = entry_key(spec, job.nodes[:index])
-        own = [asker for asker in met.asked if asker.entry_key == key]
+        own = [asker for asker in census.asked if asker.entry_key == key]
         everybody += own  # nodes of hooks, of callbacks and the bag player get no arguments
         for old, new in spec.remappings.items() if own else ():
             loc: Loc = ("nodes", index, "remappings", old)
             given.setdefault((old, new), (spec.origin or locate(job, loc), []))[1].extend(own)
     for (old, _), (place, askers) in given.items():
-        if not _is_used(old, askers, met):
-            yield f"{place}: {_note(old, askers, met)}"
+        if not _is_used(old, askers, census):
+            yield f"{place}: {_note(old, askers, census)}"
     for index, old in _rules(job.ros_arguments):
-        if not _is_used(old, everybody, met):
-            yield f"{locate(job, ('ros_arguments', index))}: {_note(old, everybody, met)}"
+        if not _is_used(old, everybody, census):
+            yield f"{locate(job, ('ros_arguments', index))}: {_note(old, everybody, census)}"
 
 
 def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
@@ -55,7 +55,7 @@ def _rules(words: tuple[str, ...]) -> Iterator[tuple[int, str]]:
             yield index, word.partition(":=")[0]
 
 
-def _is_used(old: str, askers: Iterable[Asker], met: Met) -> bool:
+def _is_used(old: str, askers: Iterable[Asker], census: Census) -> bool:
     bare = old.rpartition(":")[2]
     if bare.startswith("__") or bare in _USUAL:
         return True
@@ -63,7 +63,7 @@ def _is_used(old: str, askers: Iterable[Asker], met: Met) -> bool:
     return any(
         rule.remap_topic(name, asker.name, asker.namespace, None, service=service) == _ELSEWHERE
         for asker in askers
-        for name, service in met.asked[asker]
+        for name, service in census.asked[asker]
     )
 
 
@@ -73,9 +73,9 @@ def _forms(name: str, asker: Asker) -> list[str]:
     return [name, name.removeprefix(folder)] if name.startswith(folder) else [name]
 
 
-def _note(old: str, askers: list[Asker], met: Met) -> str:
+def _note(old: str, askers: list[Asker], census: Census) -> str:
     names = [
-        form for asker in askers for name, _ in met.asked[asker] for form in _forms(name, asker)
+        form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]
     near = nearest(old, dict.fromkeys(names))
     advice = f"; did you mean {near!r}?" if near else ""

@@ -24,7 +24,7 @@ from rsltrace.guard.callers import is_user_file
 from rsltrace.model.stamp import format_seconds
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.middleware.domain import Domain
 
 LOOK_EVERY_S = 2.0
 _LOOKS_BEFORE_NOTE = 5
@@ -33,15 +33,16 @@ _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this for ever.)"""
 
 _JOIN_S = 1.0
-_CORE = os.path.join("rsltrace", "ros", "core.py")
+_DISPATCHER = os.path.join("rsltrace", "middleware", "dispatcher.py")
 _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", "/debugpy/")
 
 
 class Watchdog:
     """Looks after one run, from a thread of its own between ``start`` and ``stop``."""
 
-    def __init__(self, core: Core) -> None:
-        self._core = core
+    def __init__(self, domain: Domain, thread: int) -> None:
+        self._domain = domain
+        self._thread = thread
         self._process = os.getpid()
         self.has_told = False
         """Whether what is under way now has been told of."""
@@ -79,7 +80,7 @@ class Watchdog:
         ready.release()  # type: ignore[attr-defined]
         del ready
         while not self._stopping.acquire(timeout=LOOK_EVERY_S):
-            loop = self._core.loop
+            loop = self._domain.loop
             if self._running and loop.events == seen[0] and loop.now_ns == seen[1]:
                 still = min(still + 1, _LOOKS_MAX)
             else:
@@ -95,19 +96,19 @@ class Watchdog:
 
     def _tell(self, for_s: int) -> bool:
         """Say where the run is; return whether there was anything to say."""
-        core = self._core
-        frames = list(_frames(sys._current_frames().get(core.thread)))
+        domain = self._domain
+        frames = list(_frames(sys._current_frames().get(self._thread)))
         if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
             return False  # somebody is looking at a standstill that they have made themselves
         in_event = any(_is_execute(frame) for frame in frames)
-        handle = core.current_handle if in_event else None
+        handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()
         place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
         place = place or next(iter(frames), None)
         where = f", {_place(place)}" if place is not None else ""
         _say(
             f"{who} has not come back for {for_s} s of real time; simulated time stands still at "
-            f"{format_seconds(core.loop.now_ns)} s{where}. Ctrl-C ends the run"
+            f"{format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
         )
         return True
 
@@ -127,7 +128,7 @@ def _frames(frame: FrameType | None) -> Iterator[FrameType]:
 
 def _is_execute(frame: FrameType) -> bool:
     code = frame.f_code
-    return code.co_name == "execute" and code.co_filename.endswith(_CORE)
+    return code.co_name == "execute" and code.co_filename.endswith(_DISPATCHER)
 
 
 def _place(frame: FrameType) -> str:

@@ -296,7 +296,7 @@ def test_a_module_that_keeps_sleep_sleeps_in_every_run(
 
 
 def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
-    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.doors.rclpy.stacks.stacks import Stacks
 
     class Waits(Ticker):
         def act(self) -> None:
@@ -304,7 +304,7 @@ def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
 
     def worlds() -> int:
         gc.collect()
-        return sum(isinstance(thing, Core) for thing in gc.get_objects())
+        return sum(isinstance(thing, Stacks) for thing in gc.get_objects())
 
     before = worlds()  # of other tests, held by what they keep
     simulate(Waits, duration=2)

@@ -66,8 +66,8 @@ def busy(monkeypatch: pytest.MonkeyPatch) -> Looks:
     looks = Looks()
     real = watchdog.Watchdog.__init__
 
-    def init(self: Any, core: Any) -> None:
-        real(self, core)
+    def init(self: Any, *given: Any) -> None:
+        real(self, *given)
         self._stopping = looks
 
     monkeypatch.setattr(watchdog.Watchdog, "__init__", init)

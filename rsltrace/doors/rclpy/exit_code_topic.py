@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Any, Protocol
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
+from rsltrace.doors.rclpy.wire.interfaces import class_of
 from rsltrace.errors import JobError
 from rsltrace.job.values.problem import nearest
+from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+from rsltrace.middleware.publisher import Publisher
+from rsltrace.middleware.transport import Watcher
 
 
 class _TopicStop(Protocol):
@@ -21,14 +21,15 @@ class _TopicStop(Protocol):
     def exit_code(self) -> str | None: ...
 
 
-def watch_exit_code(core: Core, spec: _TopicStop, *, where: str) -> Callable[[Any, bytes], None]:
+def watch_exit_code(loop: EventLoop, spec: _TopicStop, *, where: str) -> Watcher:
     """Return a watcher that ends the run after the time step of the first message.
 
     With ``spec.exit_code`` (a dotted field path; ``where`` it stands in the job) the message's
     field is the exit status.
     """
 
-    def watch(msg_type: Any, data: bytes) -> None:
+    def watch(publisher: Publisher, data: bytes) -> None:
+        msg_type: Any = class_of(publisher)
         code = 0
         if spec.exit_code is not None:
             value: Any = codec_for(msg_type).deserialize(data)
@@ -51,6 +52,6 @@ def watch_exit_code(core: Core, spec: _TopicStop, *, where: str) -> Callable[[An
                     where=where,
                 )
             code = int(value)
-        core.loop.stop_after_step(Stop(f"message on {spec.name}", code))
+        loop.stop_after_step(Stop(f"message on {spec.name}", code))
 
     return watch

@@ -21,7 +21,7 @@ _WHEELS = frozenset(
     visualization_msgs
     """.split()
 )
-"""Interface packages of which there are wheels: those of ROS's core and of common_interfaces."""
+"""Interface packages of which there are wheels: those of ROS's stacks and of common_interfaces."""
 
 _STANDS_STILL = (
     "\n  If that was a difference of two times: computing takes no simulated time, so a ROS clock "

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
 
 from rsltrace.chance.clock import ClockModel, WrongClock
 from rsltrace.chance.stream import Stream
-from rsltrace.middleware.links import note
+from rsltrace.middleware.domain import Domain
 from rsltrace.model.draw import encode_clock
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 
 class NodeClocks:
@@ -19,9 +15,15 @@ class NodeClocks:
     happened is an output of the event in which the clock is read next."""
 
     def __init__(
-        self, core: Core, rules: tuple[tuple[str, ClockModel], ...], *, start_ns: int
+        self,
+        domain: Domain,
+        rules: tuple[tuple[str, ClockModel], ...],
+        *,
+        seed: int,
+        start_ns: int,
     ) -> None:
-        self._core = core
+        self._domain = domain
+        self._seed = seed
         self._rules = rules
         self._start_ns = start_ns
         self._clocks: dict[str, WrongClock | None] = {}
@@ -34,16 +36,16 @@ class NodeClocks:
             model = next((model for glob, model in self._rules if fnmatchcase(node, glob)), None)
             self._clocks[node] = None
             if model is not None:
-                stream = Stream(self._core.seed, f"clock\0{node}")
+                stream = Stream(self._seed, f"clock\0{node}")
                 self._clocks[node] = WrongClock(model, stream, self._start_ns)
         clock = self._clocks[node]
         if clock is None:
             return now_ns
-        if self._core.current_handle is not None and (by_ns := clock.set_since(now_ns)):
+        if self._domain.event.handle is not None and (by_ns := clock.set_since(now_ns)):
             self._note(node, by_ns)
         return clock.shows(now_ns)
 
     def _note(self, node: str, by_ns: int) -> None:
-        for handle in self._core.graph.nodes:
+        for handle in self._domain.graph.nodes:
             if handle.fully_qualified_name == node:
-                note(self._core, handle.entity_id, encode_clock(by_ns))
+                self._domain.dispatcher.draw(handle.entity_id, encode_clock(by_ns))

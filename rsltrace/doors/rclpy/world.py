@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import gc
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,29 +14,32 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.chance.clock import ClockModel
 from rsltrace.chance.network import NetworkPlan
-from rsltrace.doors.rclpy.boundary.boundary import Boundary
-from rsltrace.doors.rclpy.core import Core
+from rsltrace.doors.rclpy.boundary.boundary import Boundary, Surroundings
+from rsltrace.doors.rclpy.boundary.installation import installed
+from rsltrace.doors.rclpy.callback_errors import UserCode
 from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.doors.rclpy.installation import installed
-from rsltrace.doors.rclpy.logs import Logs
+from rsltrace.doors.rclpy.executors.user_executors import own_executors
+from rsltrace.doors.rclpy.handles.logs import Logs
+from rsltrace.doors.rclpy.handles.node_state import NodeStates
 from rsltrace.doors.rclpy.node_clocks import NodeClocks
+from rsltrace.doors.rclpy.parameters import Parameters, parameters_of
 from rsltrace.doors.rclpy.stacks.asyncio_loops import simulated_event_loops
 from rsltrace.doors.rclpy.stacks.blocked_groups import held_back
 from rsltrace.doors.rclpy.stacks.blocking_calls import end_blocked
+from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.exit_handlers import own_exit_handlers
 from rsltrace.doors.rclpy.stacks.process_exit import own_process_ends
 from rsltrace.doors.rclpy.stacks.program import Program
-from rsltrace.doors.rclpy.stacks.program_end import end_programs
+from rsltrace.doors.rclpy.stacks.program_end import begin_program, end_programs
 from rsltrace.doors.rclpy.stacks.signals import own_signal_handlers
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_waiting
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.threads import cooperative_threads
-from rsltrace.doors.rclpy.stacks.user_executors import own_executors
-from rsltrace.doors.rclpy.stacks.wait_reasons import who_waits
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
-from rsltrace.middleware.census import parameters_of
-from rsltrace.middleware.graph import Graph
+from rsltrace.middleware.domain import Domain
+from rsltrace.middleware.event import OutsideEvent
 from rsltrace.middleware.links import Network
 from rsltrace.middleware.scheduling import Scheduling, SchedulingPlan
 from rsltrace.model.event import EventKind
@@ -45,6 +48,9 @@ from rsltrace.model.event import EventKind
 class World:
     """Nodes in a loop. Use as a context manager: within it, rclpy is simulated.
 
+    ``domain`` is what all participants share, ``stacks`` what belongs to the call stacks of user
+    code, ``states`` are the hashed ones of nodes, ``clocks`` is None where all of them are right.
+
     :param base_dir: the job's folder; source paths in logs are relative to it.
     :param echo: print log records on stderr.
     """
@@ -52,38 +58,46 @@ class World:
     def __init__(
         self, loop: EventLoop, *, base_dir: Path, seed: int = 0, echo: bool = True
     ) -> None:
-        self.core = Core(loop, base_dir=base_dir, seed=seed)
-        self.core.graph = Graph()
-        self.core.logs = Logs(self.core, echo=echo)
+        self.domain = Domain(loop)
+        self.stacks = Stacks(self.domain)
+        self.states = NodeStates()
+        self.clocks: NodeClocks | None = None
+        self.nodes: list[Any] = []
+        self.parameters: dict[str, Parameters] = {}
+        self._seed = seed
+        self._logs = Logs(self.domain, base_dir=base_dir, echo=echo)
+        self.domain.dispatcher.door = UserCode(self.stacks, self._logs)
+        self._surroundings = Surroundings(self.stacks, self._logs, self.states)
         self._boundary: Boundary
         self._stack = ExitStack()
-        self.nodes: list[Any] = []
         self._begun = 0
 
     def __enter__(self) -> World:
+        stacks = self.stacks
         with ExitStack() as stack:
             self._boundary = stack.enter_context(installed())
             stack.enter_context(_fresh_rclpy(self._boundary))
-            stack.callback(_leave_program, self.core)
-            self._boundary.enter(self.core)
+            stack.callback(stacks.programs.leave)
+            self._boundary.enter(self._surroundings)
             stack.callback(self._boundary.leave)
             import rclpy
 
-            from rsltrace.doors.rclpy.stacks.executor import SimExecutor
+            from rsltrace.doors.rclpy.executors.sim_executor import SimExecutor
 
-            stack.enter_context(simulated_waiting(self.core))
-            stack.enter_context(own_executors(self.core))
-            stack.enter_context(cooperative_threads(self.core))
-            stack.enter_context(simulated_event_loops(self.core))
-            stack.enter_context(own_exit_handlers(self.core))
-            stack.enter_context(own_process_ends(self.core))
-            stack.enter_context(own_signal_handlers(self.core))
+            stack.enter_context(simulated_waiting(stacks, self._seed))
+            stack.enter_context(own_executors(stacks))
+            stack.enter_context(cooperative_threads(stacks))
+            stack.enter_context(simulated_event_loops(stacks))
+            stack.enter_context(own_exit_handlers(stacks))
+            stack.enter_context(own_process_ends(stacks))
+            stack.enter_context(own_signal_handlers(stacks))
             rclpy.init(args=[])
-            self.core.main = getcurrent()
-            self.core.executor = SimExecutor(self.core, rclpy.get_default_context())
-            setattr(rclpy, "__executor", self.core.executor)  # what rclpy.spin* use
+            stacks.runners.main = getcurrent()
+            stacks.executor = SimExecutor(stacks, rclpy.get_default_context())
+            setattr(rclpy, "__executor", stacks.executor)  # what rclpy.spin* use
             stack.callback(self._close)
-            self.core.pending.clear()  # the executor's own guard conditions are no entities
+            # The executor's own guard conditions are no entities.
+            self.domain.entities.pending.clear()
             self._stack = stack.pop_all()
         return self
 
@@ -93,51 +107,53 @@ class World:
     def _close(self) -> None:
         import rclpy
 
-        self.core.main_context = None  # from here on a shutdown is ours
-        self.core.current_handle = None
-        self.core.end_runners()
-        self.core.executor.shutdown()
+        programs, error = self.stacks.programs, self.error
+        programs.main_context = None  # from here on a shutdown is ours
+        self.domain.event.handle = None
+        self.stacks.runners.close()
+        self.stacks.executor.shutdown()
         for node in self.nodes:  # has been destroyed, as far as it could be
             untrack = getattr(node.context, "untrack_node", None)
             if untrack is not None:  # from ROS 2 Kilted on, a shutdown destroys nodes once more
                 untrack(node)
         rclpy.try_shutdown()
         # What user code has left behind must meet its finalizers while rclpy is still simulated.
-        if self.core.error is not None and self.core.error.__cause__ is not None:
-            traceback.clear_frames(self.core.error.__cause__.__traceback__)
+        if error is not None and error.__cause__ is not None:
+            traceback.clear_frames(error.__cause__.__traceback__)
         self.nodes.clear()
-        for program in (self.core.host, *self.core.programs):
+        for program in (programs.host, *programs.all):
             program.forget()
         gc.collect()
 
     def use_network(self, plan: NetworkPlan) -> None:
         """Give what nodes send delays and losses. Before the first node is made."""
-        self.core.network = Network(self.core, plan)
+        self.domain.transport.network = Network(self.domain.dispatcher, plan)
 
     def plan(self, entries: Sequence[Entry]) -> None:
         """Say what will be constructed: a main that ends must know of those that begin later."""
-        self.core.programs = [
-            Program(self.core, entry) for entry in entries if entry.argv is not None
-        ]
+        programs = self.stacks.programs
+        programs.all = [Program(programs, entry) for entry in entries if entry.argv is not None]
 
     @contextmanager
     def importing(self) -> Iterator[None]:
         """Let what modules make when they are imported (a lock, a thread) belong to the run."""
-        self.core.importing = True
+        programs = self.stacks.programs
+        programs.importing = True
         try:
             yield
         finally:
-            self.core.importing = False
+            programs.importing = False
 
     def use_clocks(self, rules: tuple[tuple[str, ClockModel], ...], start_ns: int) -> None:
         """Let the clocks of some nodes (globs) be wrong. Before the first node is made."""
         if rules:
-            self.core.clocks = NodeClocks(self.core, rules, start_ns=start_ns)
+            self.clocks = NodeClocks(self.domain, rules, seed=self._seed, start_ns=start_ns)
+            self._surroundings.clocks = self.clocks
 
     def use_scheduling(self, loop: OrderedLoop, plan: SchedulingPlan) -> None:
         """Let a plan say what runs when, and how long it takes. Before the first node is made."""
-        Scheduling(self.core, loop, plan)
-        if plan.execution and self.core.network is None:
+        Scheduling(self.domain.dispatcher, loop, plan)
+        if plan.execution and self.domain.transport.network is None:
             # What a callback sends leaves when it is over: that takes links.
             self.use_network(NetworkPlan())
 
@@ -145,11 +161,11 @@ class World:
 
     def construct(self, entry: Entry) -> bool:
         """Construct one entry of the job as one event; return False if that ended the run."""
-        core = self.core
+        stacks = self.stacks
         if entry.argv is not None:
-            core.programs[self._begun].begin()
+            begin_program(stacks, stacks.programs.all[self._begun])
             self._begun += 1
-            return core.loop.stopped is None
+            return stacks.loop.stopped is None
 
         def build() -> None:
             made = entry.make()
@@ -157,17 +173,21 @@ class World:
                 self._adopt(node, entry.name)
 
         def construct() -> None:
-            name = f"constructing {entry.name}"
-            core.run_outside(lambda: name, EventKind.CONSTRUCT, 0, None, build, entry=entry)
+            event = Construction(lambda: f"constructing {entry.name}", entry)
+            stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build)
             # Whoever switched here goes on: this function, or the loop's runner after a wait.
-            getcurrent().parent = core.runners.pop()
+            stacks.runners.step_aside()
 
         # A constructor that blocks (on a service, say) is left waiting while others go on.
-        core.constructing = entry
-        core.runners.append(getcurrent())
+        stacks.programs.constructing = entry
+        stacks.runners.waiting.append(getcurrent())
         greenlet(construct).switch()
-        core.constructing = None
-        return core.loop.stopped is None
+        stacks.programs.constructing = None
+        return stacks.loop.stopped is None
+
+    def run_outside(self, name: str, kind: EventKind, body: Callable[[], object]) -> None:
+        """Run ``body`` as one event that is no entity's callback."""
+        self.domain.dispatcher.run_outside(OutsideEvent(lambda: name), kind, 0, None, body)
 
     def _adopt(self, node: Any, name: str) -> None:
         from rclpy.node import Node
@@ -178,11 +198,12 @@ class World:
                 "or a function that returns a node (or a list of nodes)"
             )
         self.nodes.append(node)
-        self.core.executor.add_node(node)
+        self.stacks.executor.add_node(node)
 
     def all_nodes(self) -> list[Any]:
-        """Return the nodes there are, in the order of their construction."""
-        return [handle.wrapper for handle in self.core.graph.nodes if handle.wrapper is not None]
+        """Return the rclpy nodes there are, in the order of their construction."""
+        wrappers = [getattr(handle, "wrapper", None) for handle in self.domain.graph.nodes]
+        return [wrapper for wrapper in wrappers if wrapper is not None]
 
     def keep(self, node: Any) -> None:
         """Destroy ``node`` with the others at the end, although it is not run."""
@@ -190,14 +211,13 @@ class World:
 
     def jump(self, time_ns: int) -> None:
         """Move from construct time to the start of the run, telling clocks of the jump."""
-        delta_ns = time_ns - self.core.loop.now_ns
-        self.core.loop.jump(time_ns)
+        loop = self.domain.loop
+        delta_ns = time_ns - loop.now_ns
+        loop.jump(time_ns)
         if delta_ns:
-            self.core.run_outside(
-                lambda: "the jump to the start",
+            self.run_outside(
+                "the jump to the start",
                 EventKind.CLOCK_JUMP,
-                0,
-                None,
                 lambda: self._boundary.jump_clocks(delta_ns),
             )
 
@@ -207,59 +227,60 @@ class World:
         The loop never runs on this stack, so that no callback can keep it from going on. A quiet
         end with somebody still waiting is a deadlock.
         """
-        core = self.core
-        core.next_runner().switch()
-        if core.loop.stopped is None and core.runner_error is None:
+        stacks, outcome = self.stacks, self.domain.outcome
+        runners, ending = stacks.runners, stacks.ending
+        runners.next().switch()
+        if stacks.loop.stopped is None and runners.error is None:
             return  # paused
-        core.note_end()
-        if core.error is None and not core.stuck:
-            core.notes += held_back(core)
-        core.parameters = parameters_of(core)
-        end_programs(core)
-        end_blocked(core)
-        if core.runner_error is not None:
-            raise core.runner_error
-        if core.stuck and core.error is None:
-            core.error = DeadlockError(_deadlock(core.stuck))
+        outcome.note_end(stacks.loop.events)
+        if outcome.error is None and not ending.stuck:
+            outcome.notes += held_back(stacks)
+        self.parameters = parameters_of(self.domain.graph)
+        end_programs(stacks)
+        end_blocked(stacks)
+        if runners.error is not None:
+            raise runners.error
+        if ending.stuck and outcome.error is None:
+            outcome.error = DeadlockError(_deadlock(ending.stuck))
 
     def waiting(self) -> str:
         """Say who waits for what, where nothing can happen any more."""
-        return _deadlock(who_waits(self.core))
+        return _deadlock(self.stacks.who_waits())
+
+    def blocked(self) -> list[str]:
+        """Say of each blocked call that may not wait for ever what it waits for."""
+        return [one.waits_for() for one in self.stacks.runners.blocked if not one.is_patient()]
 
     def destroy(self) -> None:
         """Destroy the nodes in creation order, each as one event."""
-        core = self.core
-        core.note_end()
-        end_programs(core)
-        end_blocked(core)  # constructors that still wait, if the run never began
+        stacks, outcome = self.stacks, self.domain.outcome
+        outcome.note_end(stacks.loop.events)
+        end_programs(stacks)
+        end_blocked(stacks)  # constructors that still wait, if the run never began
         for node in self.nodes:
-            core.shutdown_ns = 0
+            stacks.ending.shutdown_ns = 0
             handle = node.handle
-            if handle.destroyed or core.error is not None:
+            if handle.destroyed or outcome.error is not None:
                 continue
-            core.run_outside(
-                handle.describe, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node
+            event = OutsideEvent(handle.describe)
+            stacks.dispatcher.run_outside(
+                event, EventKind.SHUTDOWN, handle.entity_id, handle, node.destroy_node
             )
 
     @property
     def exit_code(self) -> int:
         """The first exit status other than 0 with which a main ended."""
-        return next((p.exit_code for p in self.core.programs if p.exit_code), 0)
+        return next((p.exit_code for p in self.stacks.programs.all if p.exit_code), 0)
 
     @property
     def error(self) -> RunError | None:
         """What went wrong, if anything did."""
-        return self.core.error
+        return self.domain.outcome.error
 
 
 def _deadlock(waits: list[str]) -> str:
     lines = "\n".join(f"  {text}" for text in waits[:20])
     return f"nothing can happen any more, but somebody waits:\n{lines}"
-
-
-def _leave_program(core: Core) -> None:
-    if core.program is not core.host:
-        core.host.enter()
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from fnmatch import fnmatchcase
 from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.errors import BagError
+from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
 from rsltrace.loop.stop import Stop
+from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
 from rsltrace.run.plans.stopping import end_ns_of, has_stop
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from rsltrace.bag.playback import Playback
     from rsltrace.bag.storage import StoredTopic
     from rsltrace.bag.topic import BagTopic
+    from rsltrace.doors.rclpy.handles.node import NodeHandle
     from rsltrace.doors.rclpy.world import World
 
 PLAYER = "rosbag2_player"
@@ -101,14 +103,10 @@ def _check_names(job: Job, index: int, bag: Bag) -> None:
 
 
 def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
-    from rsltrace.doors.player import begins_with_header, check_type
-
     return frozenset(
         index
         for index, topic in enumerate(bag.topics)
-        if begins_with_header(
-            check_type(bag=spec.path, topic=topic.name, type_name=topic.type_name)
-        )
+        if _begins_with_header(check_type(spec.path, topic))
     )
 
 
@@ -169,11 +167,31 @@ def start_ns_of(job: Job, bags: list[BagInput]) -> int:
 
 def check_bag_types(bags: list[BagInput]) -> None:
     """Raise BagError if a recorded topic has a type that is not installed."""
-    from rsltrace.doors.player import check_type
-
     for entry in bags:
         for topic in entry.bag.topics:
-            check_type(bag=entry.spec.path, topic=topic.name, type_name=topic.type_name)
+            check_type(entry.spec.path, topic)
+
+
+def check_type(bag: str, topic: BagTopic) -> type:
+    """Return the message class of a recorded topic.
+
+    :raises BagError: if its type is not installed.
+    """
+    from rsltrace.doors.rclpy.wire.interfaces import get_message_class
+
+    try:
+        return get_message_class(topic.type_name)
+    except SetupError as error:
+        raise BagError(
+            f"{bag}: topic {topic.name} has type {topic.type_name}, which is not installed here. "
+            f"Install its package, or leave the topic out (exclude: [{topic.name}])\n  {error}"
+        ) from error
+
+
+def _begins_with_header(message_class: Any) -> bool:
+    """Return whether the first field of a message is a ``std_msgs/Header``."""
+    fields = message_class.get_fields_and_field_types()
+    return next(iter(fields.values()), "") == "std_msgs/Header"
 
 
 def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
@@ -182,12 +200,18 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
         return
     from rclpy.node import Node
 
-    from rsltrace.doors.player import Player, make_publisher, progress_publisher
-    from rsltrace.model.event import EventKind
+    from rsltrace.doors.player import Player, make_publisher
+    from rsltrace.doors.rclpy.wire.codec import codec_for
+    from rsltrace.doors.rclpy.wire.interfaces import get_message_class, message_type
 
-    core = world.core
+    domain = world.domain
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
     told: list[Any] = []
+
+    def publisher(node: NodeHandle, topic: str, cls: type, qos: dict[str, Any]) -> Any:
+        name = node.resolve(topic, service=False)
+        canonical = codec_for(cls).canonical
+        return make_publisher(domain, node, name, message_type(cls), canonical, qos)
 
     def build() -> None:
         player = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
@@ -197,35 +221,34 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
             for topic in entry.bag.topics:
                 key = (entry.name_of(topic), topic.type_name)
                 if key not in publishers:
-                    publishers[key] = make_publisher(
-                        core,
+                    publishers[key] = publisher(
                         player.handle,
-                        bag=entry.spec.path,
-                        topic=key[0],
-                        type_name=topic.type_name,
-                        qos={**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)},
+                        key[0],
+                        check_type(entry.spec.path, topic),
+                        {**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)},
                     )
                 ends.append(publishers[key])
             streams.append(_messages(entry.playback, ends))
         if job.progress is not None:
-            told.append(progress_publisher(core, player.handle, job.progress))
+            progress = get_message_class("std_msgs/msg/Float32")
+            told.append(publisher(player.handle, job.progress, progress, {}))
         world.keep(player)
 
-    core.run_outside(lambda: "the bag player", EventKind.CONSTRUCT, 0, None, build)
-    if core.loop.stopped is not None:
+    world.run_outside("the bag player", EventKind.CONSTRUCT, build)
+    if domain.loop.stopped is not None:
         return
     ends_run = not has_stop(job)
 
     def on_end() -> None:
         if ends_run:
-            core.loop.stop_after_step(Stop("end of the bag"))
+            domain.loop.stop_after_step(Stop("end of the bag"))
 
     merged = streams[0]
     if len(streams) > 1:
         merged = heapq.merge(*streams, key=lambda message: message[0])
     if told:
         merged = _with_progress(merged, told[0], _span_ns(bags))
-    Player(core, merged, on_end).start()
+    Player(domain, merged, on_end).start()
 
 
 def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:

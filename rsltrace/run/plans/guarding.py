@@ -28,7 +28,7 @@ from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+    from rsltrace.doors.rclpy.world import World
 
 
 class Guarding:
@@ -38,26 +38,28 @@ class Guarding:
         self._job = job
         self._stack = stack
         self.guard: Guard | None = None
-        self._core: Core | None = None
+        self._world: World | None = None
         self._early: list[Finding] = []
 
-    def begin(self, core: Core, replay: Path | None = None) -> None:
+    def begin(self, world: World, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
         from rsltrace.doors.rclpy.guard_context import GuardContext
 
+        loop, dispatcher = world.domain.loop, world.domain.dispatcher
+
         def on_finding(finding: Finding) -> None:
-            if core.recorder is not None:
-                core.recorder.finding(finding, core.loop.now_ns)
-            elif not core.loop.events:
+            if dispatcher.recorder is not None:
+                dispatcher.recorder.finding(finding, loop.now_ns)
+            elif not loop.events:
                 self._early.append(finding)  # of an import, before there is a trace
 
-        self._core = core
+        self._world = world
         if replay is not None and not self._job.guard.enabled:
             raise JobError("'guard: false' in the job: nothing from outside can be given again")
         job = self._job
         if job.guard.enabled:
             self.guard = Guard(
-                GuardContext(core),
+                GuardContext(world.stacks, world.clocks),
                 policy=policy_of(job.guard),
                 seed=job.seed,
                 packages=_packages(job.nodes),
@@ -68,9 +70,9 @@ class Guarding:
                 with Trace.open(replay) as trace:
                     kept = [one for found in trace.findings.values() for one in found]
                 self.guard.answers.replay(kept, str(replay))
-        core.default_policy = policy_of(job.guard)
+        world.states.policy = policy_of(job.guard)
         if self.guard is not None and self.guard.is_virtual(Source.CLOCK):
-            self._begin_log_time(core.loop.now_ns)
+            self._begin_log_time(loop.now_ns)
         if "torch" in sys.modules:
             self.torch_loaded()
 
@@ -83,8 +85,8 @@ class Guarding:
 
     def torch_loaded(self) -> None:
         """Give each node a state of torch's generator from now on."""
-        core, guard = self._core, self.guard
-        if core is None or guard is None or core.on_node is not None:
+        world, guard = self._world, self.guard
+        if world is None or guard is None or world.domain.dispatcher.on_node is not None:
             return
         streams = torch_streams(self._stack, guard)
         name_of = guard.context.node
@@ -92,7 +94,7 @@ class Guarding:
         def on_node(node: object, *, is_made: bool = False) -> None:
             (streams.rename if is_made else streams.enter)(name_of())
 
-        core.on_node = on_node
+        world.domain.dispatcher.on_node = on_node
         streams.enter(name_of())
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
@@ -112,7 +114,7 @@ class Guarding:
         summary = {}
         if self.counts:
             summary["calls"] = counts_text(self.counts)
-        states = self._core.states if self._core is not None else {}
+        states = self._world.states.by_node if self._world is not None else {}
         left_out = {name: state.left_out for name, state in states.items() if state.left_out}
         if left_out:
             summary["left_out"] = json.dumps(left_out, sort_keys=True, ensure_ascii=False)

@@ -21,29 +21,29 @@ from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.middleware.recorded_run import Following
+    from rsltrace.middleware.domain import Domain
+    from rsltrace.middleware.recorded_run import RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
 
 
-def following(job: Job, core: Core, stack: ExitStack) -> Following | None:
+def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | None:
     """Have a run follow the order of a recording, if the job says so; it stays open as long as
     ``stack``.
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
-    from rsltrace.middleware.recorded_run import Following
+    from rsltrace.middleware.recorded_run import RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
         return None
     trace = _opened(job, job.policy.recorded, stack)
-    met = core.met
-    assert met is not None, "a job with a policy has rules"
+    census = domain.entities.census
+    assert census is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
-    order = Recorded(file, _Events(trace).event, _chosen(trace), met.describe_all())
-    return Following(core, order, is_whole=trace.complete)
+    order = Recorded(file, _Events(trace).event, _chosen(trace), census.describe_all())
+    return RecordedRun(domain.dispatcher, order, is_whole=trace.complete)
 
 
 def _opened(job: Job, path: str, stack: ExitStack) -> Trace:

@@ -6,9 +6,9 @@ import difflib
 import importlib
 from typing import Any
 
-from rsltrace.doors.rclpy.error_text import text_of
 from rsltrace.doors.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError, RsltraceError
+from rsltrace.middleware.failure import text_of
 
 
 def load_target(target: str, *, where: str) -> Any:

@@ -1,1 +1,1 @@
-"""The object that stands where rclpy keeps its C extension, and the handles it gives out."""
+"""The object that stands where rclpy keeps its C extension, and how it gets there."""

@@ -7,31 +7,34 @@ name validation, QoS structures, time points, log levels.
 from __future__ import annotations
 
 import weakref
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
+from rsltrace.doors.rclpy.actions.client import ActionClientHandle
+from rsltrace.doors.rclpy.actions.goal_handle import GoalHandle
+from rsltrace.doors.rclpy.actions.server import ActionServerHandle
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
-from rsltrace.doors.rclpy.boundary.action_client import ActionClientHandle
-from rsltrace.doors.rclpy.boundary.action_server import ActionServerHandle
-from rsltrace.doors.rclpy.boundary.clock import ClockEventHandle, ClockHandle
-from rsltrace.doors.rclpy.boundary.context import ContextHandle
-from rsltrace.doors.rclpy.boundary.destroyable import Destroyable, set_invalid_handle
-from rsltrace.doors.rclpy.boundary.goal_handle import GoalHandle
-from rsltrace.doors.rclpy.boundary.guard_condition import GuardConditionHandle
-from rsltrace.doors.rclpy.boundary.lifecycle import StateMachineHandle
-from rsltrace.doors.rclpy.boundary.node import NodeHandle
-from rsltrace.doors.rclpy.boundary.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.doors.rclpy.boundary.qos_events import EventHandle
-from rsltrace.doors.rclpy.boundary.services import (
+from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
+from rsltrace.doors.rclpy.handles.context import ContextHandle
+from rsltrace.doors.rclpy.handles.destroyable import Destroyable, set_invalid_handle
+from rsltrace.doors.rclpy.handles.guard_condition import GuardConditionHandle
+from rsltrace.doors.rclpy.handles.lifecycle import StateMachineHandle
+from rsltrace.doors.rclpy.handles.logs import Logs
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.doors.rclpy.handles.node_state import NodeStates
+from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.doors.rclpy.handles.qos_events import EventHandle
+from rsltrace.doors.rclpy.handles.qos_profiles import profile_of
+from rsltrace.doors.rclpy.handles.services import (
     ClientHandle,
-    RequestId,
     ServiceHandle,
-    ServiceInfo,
     TypeDescriptionServiceHandle,
 )
-from rsltrace.doors.rclpy.boundary.timers import TimerHandle
-from rsltrace.doors.rclpy.boundary.wait_set import WaitSetHandle
+from rsltrace.doors.rclpy.handles.timers import TimerHandle
+from rsltrace.doors.rclpy.handles.wait_set import WaitSetHandle
+from rsltrace.doors.rclpy.node_clocks import NodeClocks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.doors.rclpy.wire.interfaces import type_hash
 from rsltrace.errors import UnsupportedError
 from rsltrace.middleware.endpoint_status import (
     CountStatus,
@@ -39,10 +42,10 @@ from rsltrace.middleware.endpoint_status import (
     LivelinessChangedStatus,
     MatchedStatus,
 )
-from rsltrace.middleware.graph import names_and_types
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+from rsltrace.middleware.graph import Graph, names_and_types
+from rsltrace.middleware.publisher import Publisher
+from rsltrace.middleware.services import RequestId, ServiceInfo
+from rsltrace.middleware.subscription import Subscription
 
 _PASSED_THROUGH = (
     # enums and structures
@@ -69,12 +72,22 @@ _PASSED_THROUGH = (
 ).split()
 
 
+@dataclass(slots=True)
+class Surroundings:
+    """What the boundary needs of a world; ``clocks`` is None where all of them are right."""
+
+    stacks: Stacks
+    logs: Logs
+    states: NodeStates
+    clocks: NodeClocks | None = None
+
+
 class Boundary:
-    """Stands in for the module ``rclpy._rclpy_pybind11``; ``core`` is the world of the moment."""
+    """Stands in for the module ``rclpy._rclpy_pybind11``; ``world`` is that of the moment."""
 
     def __init__(self, real: Any) -> None:
         self.real = real
-        self._core: Core | None = None
+        self._world: Surroundings | None = None
         self._last_now_ns = 0
         self._signals = real.SignalHandlerOptions.NO
         self.ros_clocks: list[weakref.ref[ClockHandle]] = []
@@ -97,46 +110,55 @@ class Boundary:
     # -- the world of the moment ---------------------------------------------------------------
 
     @property
-    def core(self) -> Core:
+    def world(self) -> Surroundings:
         """The world that new entities join.
 
         :raises UnsupportedError: between runs.
         """
-        if self._core is None:
+        if self._world is None:
             raise UnsupportedError("no simulation is running in this process")
-        return self._core
+        return self._world
+
+    @property
+    def stacks(self) -> Stacks:
+        """The stacks of the world of the moment."""
+        return self.world.stacks
+
+    @property
+    def _graph(self) -> Graph:
+        return self.world.stacks.domain.graph
 
     @property
     def is_free(self) -> bool:
         """Whether no simulation is under way in this process."""
-        return self._core is None
+        return self._world is None
 
     def now_ns(self) -> int:
         """Return simulated time, or the last one between runs."""
-        return self._last_now_ns if self._core is None else self._core.loop.now_ns
+        return self._last_now_ns if self._world is None else self._world.stacks.loop.now_ns
 
     def shown_ns(self, owner: str | None) -> int:
         """Return what the clock of a node shows; without an owner, that of the present node."""
-        core = self._core
-        if core is None or core.clocks is None:
+        world = self._world
+        if world is None or world.clocks is None:
             return self.now_ns()
-        return core.clocks.shows(owner or self.current_node_name(), core.loop.now_ns)
+        return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
 
     def current_node_name(self) -> str | None:
         """Return the name of the node whose callback or constructor runs, if any does."""
-        node = self._core.current_node if self._core is not None else None
-        return None if node is None else node.fully_qualified_name
+        node = self._world.stacks.event.node if self._world is not None else None
+        return None if node is None else str(node.fully_qualified_name)
 
-    def enter(self, core: Core) -> None:
-        """Make ``core`` the world that new entities join."""
-        if self._core is not None:
+    def enter(self, world: Surroundings) -> None:
+        """Make ``world`` the one that new entities join."""
+        if self._world is not None:
             raise UnsupportedError("another simulation is running in this process")
-        self._core = core
+        self._world = world
 
     def leave(self) -> None:
         """End the world of the moment."""
         self._last_now_ns = self.now_ns()
-        self._core = None
+        self._world = None
 
     def jump_clocks(self, delta_ns: int) -> None:
         """Tell ROS clocks with jump callbacks that time has jumped."""
@@ -151,13 +173,14 @@ class Boundary:
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         try:
-            context = ContextHandle(self.core, arguments, domain_id)
+            context = ContextHandle(self.stacks, arguments, domain_id)
         except UnknownArgumentsError as error:
             raise self.real.UnknownROSArgsError(str(error)) from error
         except InvalidArgumentsError as error:
             raise self.real.RCLInvalidROSArgsError(str(error)) from error
-        if self.core.main_context is None:
-            self.core.main_context = context
+        programs = self.stacks.programs
+        if programs.main_context is None:
+            programs.main_context = context
         return context
 
     def Node(  # noqa: N802
@@ -170,49 +193,60 @@ class Boundary:
         rosout: bool,
         rosout_qos: Any = None,  # from ROS 2 Kilted on
     ) -> NodeHandle:
+        world = self.world
         return NodeHandle(
-            self, self.core, name, namespace, context, cli_args, use_global, rosout, rosout_qos
+            self.real,
+            world.stacks,
+            world.logs,
+            world.states,
+            name,
+            namespace,
+            context,
+            cli_args,
+            use_global,
+            rosout,
+            rosout_qos,
         )
 
     def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
-        return PublisherHandle(node.core, node, *arguments)
+        return PublisherHandle(node, *arguments)
 
     def Subscription(self, node: NodeHandle, *arguments: Any) -> SubscriptionHandle:  # noqa: N802
-        return SubscriptionHandle(node.core, node, *arguments)
+        return SubscriptionHandle(node, *arguments)
 
     def Client(self, node: NodeHandle, *arguments: Any) -> ClientHandle:  # noqa: N802
-        return ClientHandle(node.core, node, *arguments)
+        return ClientHandle(node, *arguments)
 
     def Service(self, node: NodeHandle, *arguments: Any) -> ServiceHandle:  # noqa: N802
-        return ServiceHandle(node.core, node, *arguments)
+        return ServiceHandle(node, *arguments)
 
     def TypeDescriptionService(self, node: NodeHandle) -> TypeDescriptionServiceHandle:  # noqa: N802
-        return TypeDescriptionServiceHandle(node.core, node)
+        return TypeDescriptionServiceHandle(node)
 
     def Timer(  # noqa: N802
         self, clock: Any, context: ContextHandle, period_ns: int, autostart: bool = True
     ) -> TimerHandle:
-        return TimerHandle(self, context.core, clock, period_ns, autostart)
+        return TimerHandle(self.real, context.stacks, period_ns, autostart)
 
     def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
-        return GuardConditionHandle(context.core)
+        return GuardConditionHandle(context.stacks)
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
-        return EventHandle(parent.core, parent, event_type)
+        return EventHandle(parent, event_type)
 
     def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
-        return ActionServerHandle(self, node.core, node, *arguments)
+        return ActionServerHandle(node, *arguments)
 
     def ActionGoalHandle(self, server: ActionServerHandle, info: Any) -> GoalHandle:  # noqa: N802
-        return GoalHandle(server, info)
+        return GoalHandle(self.real, server.goals, info)
 
     def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
-        return ActionClientHandle(node.core, node, *arguments)
+        return ActionClientHandle(node, *arguments)
 
     def LifecycleStateMachine(  # noqa: N802
         self, node: NodeHandle, communicate: bool
     ) -> StateMachineHandle:
-        return StateMachineHandle(self, node.core, node, communicate)
+        return StateMachineHandle(node, communicate)
 
     def WaitSet(self, *arguments: Any) -> Any:  # noqa: N802
         return WaitSetHandle(*arguments)
@@ -236,54 +270,47 @@ class Boundary:
     def rclpy_remap_topic_name(self, node: NodeHandle, topic: str) -> str:
         return node.resolve(topic, service=False)
 
-    def _node_named(self, name: str, namespace: str) -> NodeHandle:
-        full = (namespace if namespace.endswith("/") else namespace + "/") + name
-        node = self.core.graph.node_named(full)
-        if node is None:
-            raise self.real.NodeNameNonExistentError(f"cannot find node {full}")
-        return node
-
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self.core.graph.publishers_of(self._node_named(name, namespace))
+        found = self._graph.publishers_of(node.node_named(name, namespace))
         return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self.core.graph.subscriptions_of(self._node_named(name, namespace))
+        found = self._graph.subscriptions_of(node.node_named(name, namespace))
         return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self.core.graph.services_of(self._node_named(name, namespace))
+        found = self._graph.services_of(node.node_named(name, namespace))
         return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self.core.graph.clients_of(self._node_named(name, namespace))
+        found = self._graph.clients_of(node.node_named(name, namespace))
         return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
     ) -> list[tuple[str, list[str]]]:
-        return self.core.graph.topic_names_and_types()
+        return self._graph.topic_names_and_types()
 
     def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return self.core.graph.service_names_and_types()
+        return self._graph.service_names_and_types()
 
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, _PUBLISHER) for p in self.core.graph.publishers(topic)]
+        return [_endpoint_info(p, _PUBLISHER) for p in self._graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, _SUBSCRIPTION) for s in self.core.graph.subscriptions(topic)]
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in self._graph.subscriptions(topic)]
 
     # -- messages ----------------------------------------------------------------------------------
 
@@ -308,7 +335,7 @@ class Boundary:
         pass
 
     def rclpy_logging_rosout_add_sublogger(self, name: str, child: str) -> bool:
-        return self._core is not None and self._core.logs.add_sublogger(name, child)
+        return self._world is not None and self._world.logs.add_sublogger(name, child)
 
     def rclpy_logging_rosout_remove_sublogger(self, name: str, child: str) -> None:
         pass
@@ -316,8 +343,8 @@ class Boundary:
     def rclpy_logging_rcutils_log(
         self, severity: int, name: str, message: str, function: str, file: str, line: int
     ) -> None:
-        if self._core is not None:
-            self._core.logs.log(severity, name, message, function, file, line)
+        if self._world is not None:
+            self._world.logs.log(severity, name, message, function, file, line)
 
     # -- signals: rsltrace's own handlers end a run properly ---------------------------------------
 
@@ -340,11 +367,8 @@ class Boundary:
 _PUBLISHER, _SUBSCRIPTION = 1, 2  # rmw_endpoint_type_t
 
 
-def _endpoint_info(
-    endpoint: PublisherHandle | SubscriptionHandle, endpoint_type: int
-) -> dict[str, Any]:
-    assert endpoint.node is not None
-    text = type_hash(endpoint.msg_type) or ""
+def _endpoint_info(endpoint: Publisher | Subscription, endpoint_type: int) -> dict[str, Any]:
+    _, text = endpoint.type.describe()
     value = bytes.fromhex(text.removeprefix("RIHS01_")) if text.startswith("RIHS01_") else b""
     return {
         "node_name": endpoint.node.name,
@@ -353,5 +377,5 @@ def _endpoint_info(
         "topic_type_hash": {"version": 1 if value else 0, "value": value or bytes(32)},
         "endpoint_type": endpoint_type,
         "endpoint_gid": list(endpoint.entity_id.to_bytes(16, "big")),
-        "qos_profile": endpoint.qos.to_dict(),
+        "qos_profile": profile_of(endpoint.qos),
     }

@@ -7,14 +7,13 @@ import asyncio.selector_events
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rsltrace.doors.rclpy.stacks.blocking_calls import POLL_NS, Wait, wait
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.doors.rclpy.stacks.blocking_calls import POLL_NS, wait
+from rsltrace.doors.rclpy.stacks.runners import Wait
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.recorded.polls import RecordedPoll
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _NS_PER_S = 1_000_000_000
 
@@ -31,8 +30,8 @@ class SimSelector:
     outside of the run and what comes is recorded.
     """
 
-    def __init__(self, core: Core, real: Any) -> None:
-        self._core = core
+    def __init__(self, stacks: Stacks, real: Any) -> None:
+        self._stacks = stacks
         self._real = real
         self._blocked: Wait | None = None
         self._rounds = 0
@@ -47,8 +46,8 @@ class SimSelector:
         self._rounds = self._rounds + 1 if polls else 0
         if found or (polls and not self._costs_time()):
             return found
-        core = simulated_core()
-        if core is not self._core:
+        stacks = simulated_stacks()
+        if stacks is not self._stacks:
             return self._real.select(timeout)
         poller = getattr(self._real, "_selector", None)
         if not polls and isinstance(poller, RecordedPoll) and poller.leads_out():
@@ -64,10 +63,10 @@ class SimSelector:
 
     def _step(self, for_ns: int | None) -> bool:
         """Wait in simulated time; return whether something woke the loop."""
-        stack_is_thread = self._core.is_thread
+        stack_is_thread = self._stacks.threads.runs_on
         try:
             return wait(
-                self._core,
+                self._stacks,
                 "something to do in its asyncio loop",
                 until=self._keep,
                 for_ns=for_ns,
@@ -91,7 +90,7 @@ class SimSelector:
 
 
 @contextmanager
-def simulated_event_loops(core: Core) -> Iterator[None]:
+def simulated_event_loops(stacks: Stacks) -> Iterator[None]:
     """Have asyncio loops that are made within the ``with`` block keep simulated time."""
     base: Any = asyncio.BaseEventLoop
     selecting: Any = asyncio.selector_events.BaseSelectorEventLoop
@@ -99,17 +98,17 @@ def simulated_event_loops(core: Core) -> Iterator[None]:
     real_write = selecting._write_to_self
 
     def time(self: Any) -> float:
-        if isinstance(getattr(self, "_selector", None), SimSelector) and simulated_core():
-            return core.loop.now_ns / _NS_PER_S
+        if isinstance(getattr(self, "_selector", None), SimSelector) and simulated_stacks():
+            return stacks.loop.now_ns / _NS_PER_S
         return float(real_time(self))
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real_init(self, *args, **kwargs)
-        if simulated_core() is core:
-            self._selector = SimSelector(core, self._selector)
+        if simulated_stacks() is stacks:
+            self._selector = SimSelector(stacks, self._selector)
             # In seconds since 1970 a float cannot tell 100 ns apart; a timer that is due by less
             # than asyncio can see would never run, and time would never go on.
-            now_s = core.loop.now_ns / _NS_PER_S
+            now_s = stacks.loop.now_ns / _NS_PER_S
             self._clock_resolution = max(self._clock_resolution, 2 * math.ulp(now_s))
 
     def _write_to_self(self: Any) -> None:

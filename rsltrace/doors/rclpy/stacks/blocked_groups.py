@@ -7,14 +7,10 @@ timers go on, the run ends as it should, and half of a node was dead all the tim
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
+from rsltrace.doors.rclpy.stacks.runners import Wait
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.model.stamp import format_duration, format_seconds
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.doors.rclpy.stacks.blocking_calls import Wait
-    from rsltrace.doors.rclpy.stacks.tasks import TaskRun
 
 _LONG_NS = 1_000_000_000
 """A shorter wait may well be over soon after the end, and is not told."""
@@ -22,13 +18,13 @@ _LONG_NS = 1_000_000_000
 _NAMED_MAX = 4
 
 
-def held_back(core: Core) -> list[str]:
+def held_back(stacks: Stacks) -> list[str]:
     """Say of every callback group that has been busy for long who waits for it, and why."""
     notes = []
-    for group, waiting in core.parked.items():
+    for group, waiting in stacks.groups.parked.items():
         since_ns = min(since for _, since, _ in waiting)
-        holder = _holder(core, group)
-        if holder is None or core.loop.now_ns - since_ns < _LONG_NS:
+        holder = _holder(stacks, group)
+        if holder is None or stacks.loop.now_ns - since_ns < _LONG_NS:
             continue
         first: dict[str, int] = {}
         for handle, since, _ in waiting:
@@ -38,17 +34,19 @@ def held_back(core: Core) -> list[str]:
         more = len(named) - _NAMED_MAX
         who = ", ".join(named[:_NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
         notes.append(
-            f"held back for {format_duration(core.loop.now_ns - since_ns)} until the end, by a "
+            f"held back for {format_duration(stacks.loop.now_ns - since_ns)} until the end, by a "
             f"callback of the same mutually exclusive group: {who}\n  {holder.waits_for()}"
         )
     return notes
 
 
-def _holder(core: Core, group: object) -> Wait | TaskRun | None:
+def _holder(stacks: Stacks, group: object) -> Wait | TaskRun | None:
     """Return the callback that keeps a group busy, unless it only waits for time to pass."""
-    for blocked in core.blocked:
+    for blocked in stacks.runners.blocked:
         if blocked.group is group:
             return blocked if blocked.deadline_ns is None else None
     active = getattr(group, "_active_entity", None)
     number = getattr(getattr(active, "handle", None), "entity_id", None)
-    return next((run for run in core.suspended if number and run.entity == number), None)
+    return next(
+        (run for run in stacks.coroutines.suspended if number and run.entity == number), None
+    )

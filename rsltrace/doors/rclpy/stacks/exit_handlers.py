@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.doors.rclpy.stacks.program import Program
-
-Handler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
+from rsltrace.doors.rclpy.stacks.program import Handler, Program
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 
 
 @contextmanager
-def own_exit_handlers(core: Core) -> Iterator[None]:
+def own_exit_handlers(stacks: Stacks) -> Iterator[None]:
     """Keep the exit handlers of mains apart from the process's within the ``with`` block."""
     real_register, real_unregister = atexit.register, atexit.unregister
 
     def of_main() -> list[Handler] | None:
-        if simulated_core() is core and core.program is not core.host:
-            return core.program.exit_handlers
+        if simulated_stacks() is stacks and not stacks.programs.is_hosted:
+            return stacks.programs.present.exit_handlers
         return None
 
     def register(function: Any, /, *args: Any, **kwargs: Any) -> Any:

@@ -13,16 +13,15 @@ import sys
 import threading
 import weakref
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.doors.rclpy.stacks.blocking_calls import Wait, wait
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core, world_exists
+from rsltrace.doors.rclpy.stacks.blocking_calls import wait
+from rsltrace.doors.rclpy.stacks.runners import Wait
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import UnsupportedError
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _NS_PER_S = 1_000_000_000
 _real_rlock = _thread.RLock
@@ -34,7 +33,7 @@ class SimLock:
     __slots__ = ("__weakref__", "_owner", "_taken", "_waits")
 
     def __new__(cls) -> Any:
-        return _thread.allocate_lock() if simulated_core() is None else object.__new__(cls)
+        return _thread.allocate_lock() if simulated_stacks() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._taken = False
@@ -56,15 +55,15 @@ class SimLock:
         return self._wait(timeout)
 
     def _wait(self, timeout: float) -> bool:
-        core = simulated_core()
-        if core is None:
+        stacks = simulated_stacks()
+        if stacks is None:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
             )
         for_ns = None if timeout == -1 else int(timeout * _NS_PER_S)
         in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
-        what: Any = _Holder(core, self._owner, for_work=in_condition)
-        if wait(core, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
+        what: Any = _Holder(stacks, self._owner, for_work=in_condition)
+        if wait(stacks, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
             self._owner = getcurrent()  # whoever released it has left it taken, for us
             return True
         self._waits = deque(blocked for blocked in self._waits if blocked.waiting)
@@ -102,7 +101,7 @@ class SimRLock:
     __slots__ = ("__weakref__", "_count", "_lock", "_owner")
 
     def __new__(cls) -> Any:
-        return _real_rlock() if simulated_core() is None else object.__new__(cls)
+        return _real_rlock() if simulated_stacks() is None else object.__new__(cls)
 
     def __init__(self) -> None:
         self._lock = SimLock()
@@ -212,8 +211,8 @@ os.register_at_fork(after_in_child=_become_real)
 class _Holder:
     """Says who has a lock, when somebody asks: for the report of a deadlock."""
 
-    def __init__(self, core: Core, owner: greenlet | None, *, for_work: bool) -> None:
-        self._core = core
+    def __init__(self, stacks: Stacks, owner: greenlet | None, *, for_work: bool) -> None:
+        self._stacks = stacks
         self._owner = owner
         self._me = getcurrent()
         self._for_work = for_work
@@ -223,13 +222,13 @@ class _Holder:
 
         So does a main that leaves the work to threads which spin.
         """
-        core = self._core
-        if not self._for_work or core.is_thread(self._me):
+        stacks = self._stacks
+        if not self._for_work or stacks.threads.runs_on(self._me):
             return self._for_work
-        program = core.program_of(self._me)
+        program = stacks.programs.on_stack(self._me)
         return program is not None and any(
             blocked.quiet and blocked.program is program and blocked.stack is not self._me
-            for blocked in core.blocked
+            for blocked in stacks.runners.blocked
         )
 
     def __str__(self) -> str:
@@ -237,7 +236,7 @@ class _Holder:
             return "somebody to wake it (an event, a condition, a queue, a future)"
         if self._owner is self._me:
             return "a lock that it holds itself"
-        for blocked in self._core.blocked:
+        for blocked in self._stacks.runners.blocked:
             if blocked.stack is self._owner:
                 return f"a lock that is held by {blocked.describe()}"
         return "a lock that nobody will release"

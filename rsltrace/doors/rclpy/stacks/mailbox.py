@@ -8,24 +8,32 @@ hands what is ready over to the node's mailbox, and the executor takes it from t
 from __future__ import annotations
 
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.doors.rclpy.stacks.executor_pump import Pump
-    from rsltrace.loop.loop import Dispatchable
+from rsltrace.loop.loop import Dispatchable, EventLoop
+
+
+class Spinner(Protocol):
+    """The executor that empties a mailbox while it spins."""
+
+    executor: Any
+
+    def wake(self) -> None:
+        """Look again: something has come."""
 
 
 class Mailbox:
     """What is ready and has not run yet, each with its place in the order of all arrivals."""
 
-    def __init__(self, core: Core) -> None:
-        self.core = core
-        self.pump: Pump | None = None
+    def __init__(self, loop: EventLoop) -> None:
+        self._next_place = loop.next_place
+        self.pump: Spinner | None = None
         """The executor that has the node now."""
         self.closed = False
         """Whether the process the node lived in has ended: nothing of it runs any more."""
         self.entries: deque[tuple[int, Dispatchable]] = deque()
+        self.raised: BaseException | None = None
+        """What has come out of the callback that the executor runs, which raises it."""
         self._admitted: Dispatchable | None = None
 
     def keeps(self, item: Dispatchable) -> bool:
@@ -34,8 +42,7 @@ class Mailbox:
             self._admitted = None
             return False
         if not self.closed:
-            self.core.arrivals += 1
-            self.entries.append((self.core.arrivals, item))
+            self.entries.append((self._next_place(), item))
             if self.pump is not None:
                 self.pump.wake()
         return True
@@ -53,9 +60,9 @@ class Mailbox:
         self.entries.clear()
 
 
-def executor_of(core: Core, handle: Any) -> Any:
-    """Return the executor that runs a handle's node: the user's own, or the run's."""
-    mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
-    if mailbox is not None and mailbox.pump is not None:
-        return mailbox.pump.executor
-    return core.executor
+def mailbox_of(handle: Any) -> Mailbox | None:
+    """Return the mailbox that an event's handle is run from, None if the loop itself runs it."""
+    mailbox: Mailbox | None = getattr(handle, "mailbox", None)
+    if mailbox is None and getattr(handle, "node", None) is not None:
+        mailbox = getattr(handle.node, "mailbox", None)
+    return mailbox

@@ -14,20 +14,19 @@ import sys
 from asyncio import _get_running_loop, _set_running_loop
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import Any, NoReturn
 
 from greenlet import getcurrent
 
-from rsltrace.doors.rclpy.stacks.blocking_calls import RunEnded, abandon, getpid
+from rsltrace.doors.rclpy.stacks.blocking_calls import abandon, getpid
 from rsltrace.doors.rclpy.stacks.program_end import end_program
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.doors.rclpy.stacks.runners import RunEnded
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import UnsupportedError
 from rsltrace.guard.redirect import Redirected
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _DEADLY = (signal.SIGKILL, signal.SIGABRT)
 _real: dict[str, Callable[..., Any]] = {}
@@ -35,7 +34,7 @@ _real: dict[str, Callable[..., Any]] = {}
 
 
 @contextmanager
-def own_process_ends(core: Core) -> Iterator[None]:
+def own_process_ends(stacks: Stacks) -> Iterator[None]:
     """Let nodes end their process, and not ours, within the ``with`` block."""
     targets: list[tuple[Any, Callable[..., Any]]] = [
         (os._exit, _exit),
@@ -57,38 +56,38 @@ def own_process_ends(core: Core) -> Iterator[None]:
 
 
 def _exit(status: int) -> None:
-    core = _core()
-    if core is None:
+    stacks = _calling()
+    if stacks is None:
         _real["_exit"](status)
     else:
-        _leave(core, f"os._exit({status})", status & 0xFF)
+        _leave(stacks, f"os._exit({status})", status & 0xFF)
 
 
 def _abort() -> None:
-    core = _core()
-    if core is None:
+    stacks = _calling()
+    if stacks is None:
         _real["abort"]()
     else:
-        _leave(core, "os.abort()", 128 + signal.SIGABRT)
+        _leave(stacks, "os.abort()", 128 + signal.SIGABRT)
 
 
 def _kill(pid: int, number: int, /) -> None:
-    core = _core()
-    if core is None or pid != getpid() or not _signalled(core, number, "os.kill"):
+    stacks = _calling()
+    if stacks is None or pid != getpid() or not _signalled(stacks, number, "os.kill"):
         _real["kill"](pid, number)
 
 
 def _raise_signal(signalnum: int) -> None:
-    core = _core()
-    if core is None or not _signalled(core, signalnum, "signal.raise_signal"):
+    stacks = _calling()
+    if stacks is None or not _signalled(stacks, signalnum, "signal.raise_signal"):
         _real["raise_signal"](signalnum)
 
 
-def _signalled(core: Core, number: int, call: str) -> bool:
+def _signalled(stacks: Stacks, number: int, call: str) -> bool:
     """Do what a signal does to the process that sends it to itself; False: nothing of ours."""
-    handler = core.program.signal_handlers.get(number)
+    handler = stacks.programs.present.signal_handlers.get(number)
     if number in _DEADLY or handler == signal.SIG_DFL:
-        _leave(core, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
+        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     if handler is None:
         return False
     if callable(handler):
@@ -107,44 +106,43 @@ def _execve(path: Any, argv: Any, env: Any) -> None:
 
 
 def _refuse(call: str) -> None:
-    if _core() is not None:
+    if _calling() is not None:
         raise UnsupportedError(
             f"{call} would put another program in the place of this process, in which all nodes of "
             "the run are: end the node instead (sys.exit), or start the program with subprocess"
         )
 
 
-def _core() -> Core | None:
+def _calling() -> Stacks | None:
     """Return the world whose node calls, or None if the process is to do what it is told."""
-    core = simulated_core()
-    return core if core is not None and core.current_handle is not None else None
+    stacks = simulated_stacks()
+    return stacks if stacks is not None and stacks.event.handle is not None else None
 
 
-def _leave(core: Core, call: str, status: int) -> NoReturn:
+def _leave(stacks: Stacks, call: str, status: int) -> NoReturn:
     """End the process of the calling code: the program, or the run."""
-    handle = core.current_handle
+    handle = stacks.event.handle
     assert handle is not None
-    if core.ending or core.closing or getcurrent() is core.main:
+    if stacks.ending.unwinding or stacks.ending.closing or getcurrent() is stacks.runners.main:
         raise RunEnded  # it is ending anyway, and somebody needs this stack
-    program = core.program
-    if program is core.host:
-        core.note(OutputKind.SHUTDOWN, 0, 1, status)
-        core.loop.stop(Stop(f"{handle.describe()} called {call}", status))
+    program = stacks.programs.present
+    if program is stacks.programs.host:
+        stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, status)
+        stacks.loop.stop(Stop(f"{handle.describe()} called {call}", status))
     else:
-        core.notes.append(f"{handle.describe()} called {call}")
-        for blocked in [one for one in core.blocked if one.program is program]:
-            del core.blocked[blocked]
+        stacks.domain.outcome.notes.append(f"{handle.describe()} called {call}")
+        for blocked in [one for one in stacks.runners.blocked if one.program is program]:
+            del stacks.runners.blocked[blocked]
             abandon(blocked.stack)
             blocked.stop_waiting()
-        for thread in [one for one in core.threads if one.program is program]:
+        for thread in [one for one in stacks.threads.alive if one.program is program]:
             thread.end()
-        end_program(program, SystemExit(status))
-    core.on_end = None
-    core.end_event()
-    if core.program is not core.host:
-        core.host.enter()
+        end_program(stacks, program, SystemExit(status))
+    stacks.event.on_end = None
+    stacks.dispatcher.end_event()
+    stacks.programs.leave()
     if _get_running_loop() is not None:
         _set_running_loop(None)
     abandon(getcurrent())
-    core.next_runner().switch()
+    stacks.runners.next().switch()
     raise AssertionError("nobody goes back to a stack that was left")

@@ -9,35 +9,68 @@ from __future__ import annotations
 
 import sys
 from collections import deque
+from collections.abc import Callable
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
-from greenlet import getcurrent, greenlet
+from greenlet import greenlet
 
+from rsltrace.doors.rclpy.entry import Entry
+from rsltrace.middleware.failure import Raised
 from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import EventKind
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.context import ContextHandle
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.doors.rclpy.entry import Entry
-    from rsltrace.doors.rclpy.error_text import Raised
-    from rsltrace.doors.rclpy.stacks.blocking_calls import Wait
-    from rsltrace.doors.rclpy.stacks.exit_handlers import Handler
 
 _FAILURES_MAX = 16
 """A main may go on after each of a million exceptions; what ends it is one of the last."""
+
+Handler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
+"""What ``atexit.register`` was given."""
+
+
+class Context(Protocol):
+    """A context that a program has initialized."""
+
+    def end(self) -> None:
+        """Shut down from outside, as a signal does."""
+
+
+class Programs:
+    """The processes in the simulation. ``present`` is the one whose code runs, ``host`` that of the
+    nodes which the job constructs, ``all`` are those with a main.
+
+    ``constructing`` is the entry under construction; while modules are ``importing``, what they
+    make belongs to the run, too. The shutdown of ``main_context`` ends the run. ``fed`` says that
+    messages come from outside (bags).
+    """
+
+    def __init__(self) -> None:
+        self.host = Program(self)
+        self.present = self.host
+        self.all: list[Program] = []
+        self.constructing: Entry | None = None
+        self.importing = False
+        self.main_context: Context | None = None
+        self.fed = False
+
+    def on_stack(self, stack: greenlet) -> Program | None:
+        """Return the program whose main runs on a stack, if it is one's."""
+        return next((program for program in self.all if program.stack is stack), None)
+
+    @property
+    def is_hosted(self) -> bool:
+        """Whether the code that runs is that of nodes which the job constructs."""
+        return self.present is self.host
+
+    def leave(self) -> None:
+        """Go back to the host."""
+        if self.present is not self.host:
+            self.host.enter()
 
 
 class Program:
     """A process in the simulation: one main, or the host of the nodes a job constructs."""
 
-    def __init__(
-        self,
-        core: Core,
-        entry: Entry | None = None,
-    ) -> None:
-        self.core = core
+    def __init__(self, programs: Programs, entry: Entry | None = None) -> None:
+        self._programs = programs
         self.entry = entry
         self.name = "the run" if entry is None else entry.name
         arguments = [] if entry is None else entry.arguments
@@ -46,33 +79,30 @@ class Program:
         self.parameters = arguments[1:]
         """The job's own parameters, which come after those of all files."""
         self.entity_id = 0
+        self.begun_ns: int | None = None
         self.announced = True
-        self.contexts: list[ContextHandle] = []
+        self.contexts: list[Context] = []
         self.failures: deque[Raised] = deque(maxlen=_FAILURES_MAX)
         """What callbacks have raised out of a spin of this program, most recent last."""
         self.exit_handlers: list[Handler] = []
         self.signal_handlers: dict[int, object] = {}
         self.stack: greenlet | None = None
-        self.begun = False
         self.spun = False
         """Whether an executor of this program has looked for work."""
         self.ended = False
         self.exit_code = 0
-        self._main = None if entry is None else entry.make
-        self._argv = None if entry is None else entry.argv
         self._kept: list[object] | None = None
 
     # -- what a process has of its own -----------------------------------------------------------
 
     def enter(self) -> None:
         """Make this the program that runs: whoever ran before puts its things away."""
-        core = self.core
-        before, core.program = core.program, self
+        before, self._programs.present = self._programs.present, self
         places = _places()
         before._kept = [names[name] for names, name, _ in places]
         if self._kept is None:
             self._kept = [first for _, _, first in places]
-            self._kept[0] = self._argv
+            self._kept[0] = None if self.entry is None else self.entry.argv
         for (names, name, _), value in zip(places, self._kept, strict=True):
             names[name] = value
 
@@ -82,58 +112,20 @@ class Program:
         """Name the program for people."""
         return self.name
 
-    def begin(self) -> None:
-        """Run main until it ends or blocks for the first time, as one event."""
-        core = self.core
-        self.begun = True
-        self.entity_id = core.new_entity_id()
-        core.pending.append(self)
-
-        def body() -> None:
-            self.enter()
-            kind, entity = EventKind.CONSTRUCT, self.entity_id
-            core.run_outside(self.describe, kind, entity, None, self._run, entry=self.entry)
-            core.host.enter()
-            getcurrent().parent = core.runners.pop()
-
-        core.runners.append(getcurrent())
-        self.stack = greenlet(body)
-        self.stack.switch()
-
-    def _run(self) -> None:
-        from rsltrace.doors.rclpy.stacks.program_end import end_program, finish_process
-
-        assert self._main is not None
-        error: BaseException | None = None
-        try:
-            self._main()
-        except BaseException as raised:
-            error = raised
-        try:
-            finish_process(self, error)
-        except BaseException as raised:
-            error = raised
-        end_program(self, error)
-
     def settle(self) -> bool:
         """Return whether the owner is known: a main has none."""
         return True
 
     def entity(self) -> Entity:
         """Return the main as the trace describes it."""
-        now_ns = self.core.loop.now_ns
-        return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", now_ns, {})
+        return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, {})
 
     def forget(self) -> None:
         """Let go of everything user code made, so that its finalizers run."""
-        self._kept = self._main = self.entry = self.stack = None
+        self._kept = self.entry = self.stack = None
         self.signal_handlers.clear()
         self.contexts.clear()
         self.failures.clear()
-
-    def blocked(self) -> Wait | None:
-        """Return the call in which main is blocked, if it is."""
-        return next((w for w in self.core.blocked if w.stack is self.stack), None)
 
 
 @lru_cache(maxsize=1)

@@ -11,28 +11,26 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from greenlet import getcurrent
 
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.redirect import Redirected
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _ENDING = frozenset((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT))
 
 
 @contextmanager
-def own_signal_handlers(core: Core) -> Iterator[None]:
+def own_signal_handlers(stacks: Stacks) -> Iterator[None]:
     """Keep the signal handlers of nodes apart from the process's within the ``with`` block."""
     before: dict[int, Any] = {}
 
     def set_handler(number: Any, handler: Any, /) -> Any:
-        if simulated_core() is not core:
+        if simulated_stacks() is not stacks:
             return real_set(number, handler)
-        if getcurrent() in core.thread_stacks:
+        if getcurrent() in stacks.threads.by_stack:
             raise ValueError("signal only works in main thread of the main interpreter")
         if number not in _ENDING:
             replaced = real_set(number, handler)
@@ -43,17 +41,17 @@ def own_signal_handlers(core: Core) -> Iterator[None]:
                 "signal handler must be signal.SIG_IGN, signal.SIG_DFL, or a callable object"
             )
         replaced = get_handler(number)
-        core.program.signal_handlers[int(number)] = handler
+        stacks.programs.present.signal_handlers[int(number)] = handler
         return replaced
 
     def get_handler(number: Any, /) -> Any:
-        if simulated_core() is core and number in core.program.signal_handlers:
-            return core.program.signal_handlers[int(number)]
+        if simulated_stacks() is stacks and number in stacks.programs.present.signal_handlers:
+            return stacks.programs.present.signal_handlers[int(number)]
         return real_get(number)
 
     def set_wakeup(fd: int, /, **options: Any) -> Any:
         """Asyncio wants a byte of every signal for its loop; those that end a run are not its."""
-        return -1 if simulated_core() is core else real_wakeup(fd, **options)
+        return -1 if simulated_stacks() is stacks else real_wakeup(fd, **options)
 
     with ExitStack() as stack:
         stack.callback(_put_back, before)

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from rsltrace.doors.rclpy.stacks.blocking_calls import Wait, wait
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+from rsltrace.doors.rclpy.stacks.blocking_calls import wait
+from rsltrace.doors.rclpy.stacks.runners import Wait
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 
 
 class SimEvent:
     """Stands in for ``threading.Event`` where rclpy waits for what a callback will set."""
 
-    def __init__(self, core: Core, what: str = "an event to be set") -> None:
-        self._core = core
+    def __init__(self, stacks: Stacks, what: str = "an event to be set") -> None:
+        self._stacks = stacks
         self._what = what
         self._set = False
         self._waits: list[Wait] = []
@@ -41,7 +40,7 @@ class SimEvent:
     def wait_ns(self, timeout_ns: int | None) -> bool:
         """Do ``wait`` with a timeout in nanoseconds."""
         if not self._set:
-            wait(self._core, self._what, until=self._waits.append, for_ns=timeout_ns)
+            wait(self._stacks, self._what, until=self._waits.append, for_ns=timeout_ns)
             self._waits = [blocked for blocked in self._waits if blocked.waiting]
         return self._set
 

@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
+import random
 import sys
 import threading
 import time
+import uuid
 from _thread import get_ident
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 from rsltrace.doors.rclpy.stacks.blocking_calls import getpid, wait
 from rsltrace.doors.rclpy.stacks.sim_event import SimEvent
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
+from rsltrace.middleware.event import Event
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
 _real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
-_world: list[Core] = []
+_world: list[Stacks] = []
 
 
-def simulated_core() -> Core | None:
+def simulated_stacks() -> Stacks | None:
     """Return the world in which the calling code runs: a node's, not that of who drives it."""
-    core = _world[-1] if _world else None
-    if core is None or get_ident() != core.thread or getpid() != core.process:
+    stacks = _world[-1] if _world else None
+    if stacks is None or get_ident() != stacks.runners.thread or getpid() != stacks.runners.process:
         return None
-    return core if core.current_handle is not None or core.importing else None
+    return stacks if stacks.event.handle is not None or stacks.programs.importing else None
 
 
 def world_exists() -> bool:
@@ -41,8 +41,8 @@ def world_exists() -> bool:
 
 def _sleep(seconds: float) -> None:
     """Stand in for ``time.sleep`` while a run lasts."""
-    core = simulated_core()
-    if core is None or core.current_handle is None:
+    stacks = simulated_stacks()
+    if stacks is None or stacks.event.handle is None:
         _real_sleep(seconds)
         return
     if seconds < 0:
@@ -52,16 +52,16 @@ def _sleep(seconds: float) -> None:
         sleep_for_process(seconds, _real_sleep, frame)
         return
     for_ns = int(seconds * 1_000_000_000)
-    if core.ending and core.shutdown_ns < _SHUTDOWN_NS:
+    if stacks.ending.unwinding and stacks.ending.shutdown_ns < _SHUTDOWN_NS:
         # Time stands still, but destroy_node and ``finally`` shall have their say: as much as
         # ros2 launch leaves a node between SIGINT and SIGKILL.
-        core.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
+        stacks.ending.shutdown_ns += max(for_ns, _SHORTEST_SLEEP_NS)
         return
-    wait(core, f"{seconds} s to pass", for_ns=for_ns)
+    wait(stacks, f"{seconds} s to pass", for_ns=for_ns)
 
 
 @contextmanager
-def simulated_waiting(core: Core) -> Iterator[None]:
+def simulated_waiting(stacks: Stacks, seed: int) -> Iterator[None]:
     """Make the calls that block simulated ones: ``time.sleep``, and what rclpy waits with."""
     import rclpy.action.client
     import rclpy.client
@@ -70,32 +70,44 @@ def simulated_waiting(core: Core) -> Iterator[None]:
     import rclpy.timer
 
     def now() -> float:
-        return core.loop.now_ns / 1_000_000_000
+        return stacks.loop.now_ns / 1_000_000_000
 
     replaced = [
         (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
-        (rclpy.client, "threading", _threading(core, "the response to a service call")),
-        (rclpy.timer, "threading", _threading(core, "the next period of a Rate")),
-        (rclpy.action.client, "threading", _threading(core, "an answer of an action server")),
+        (rclpy.client, "threading", _threading(stacks, "the response to a service call")),
+        (rclpy.timer, "threading", _threading(stacks, "the next period of a Rate")),
+        (rclpy.action.client, "threading", _threading(stacks, "an answer of an action server")),
         (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
-        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=core.random_uuid)),
+        (rclpy.action.client, "uuid", SimpleNamespace(uuid4=_goal_ids(stacks.event, seed))),
     ]
     saved = [(module, name, getattr(module, name)) for module, name, _ in replaced]
     for module, name, value in replaced:
         setattr(module, name, value)
     turned = Redirected(time.sleep, _sleep)  # type: ignore[arg-type]
-    _world.append(core)
+    _world.append(stacks)
     try:
         yield
     finally:
-        _world.remove(core)
+        _world.remove(stacks)
         turned.restore()
         for module, name, value in saved:
             setattr(module, name, value)
 
 
-def _threading(core: Core, what: str) -> SimpleNamespace:
+def _goal_ids(event: Event, seed: int) -> Callable[[], uuid.UUID]:
+    """Return what makes random UUIDs from a stream of the present node: goals need ids."""
+    streams: dict[str, random.Random] = {}
+
+    def uuid4() -> uuid.UUID:
+        name = event.node.fully_qualified_name if event.node is not None else ""
+        stream = streams.setdefault(name, random.Random(f"goal ids {seed} {name}"))
+        return uuid.UUID(int=stream.getrandbits(128), version=4)
+
+    return uuid4
+
+
+def _threading(stacks: Stacks, what: str) -> SimpleNamespace:
     return SimpleNamespace(
-        Event=partial(SimEvent, core, what), Lock=threading.Lock, RLock=threading.RLock
+        Event=partial(SimEvent, stacks, what), Lock=threading.Lock, RLock=threading.RLock
     )

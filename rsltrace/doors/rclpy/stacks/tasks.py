@@ -1,34 +1,19 @@
-"""Tasks and coroutines with rclpy's semantics: create_task, await of futures, done callbacks.
-
-rclpy's executors poll suspended coroutines. Here a coroutine is resumed when the future it awaits
-is done; only one that awaits something else than an rclpy Future is polled, once after everything
-else at that time has run.
-"""
+"""Tasks with rclpy's semantics: ``create_task``, and callbacks that are ``async def``."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from functools import partial
 from types import FunctionType, MethodType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import WeakKeyDictionary
 
-from rsltrace.doors.rclpy.boundary import callback_groups as groups
-from rsltrace.doors.rclpy.stacks.mailbox import executor_of
-from rsltrace.doors.rclpy.stacks.wait_reasons import awaited
-from rsltrace.model.event import EventFlag, EventKind, OutputKind
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.boundary.entity_handle import EntityHandle
-    from rsltrace.doors.rclpy.boundary.node import NodeHandle
-    from rsltrace.doors.rclpy.core import Core
-    from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
+from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
+from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.model.event import EventKind, OutputKind
 
 _TASK = int(EventKind.TASK)
-_RESUME = int(EventKind.RESUME)
-_SUSPENDED = int(EventFlag.SUSPENDED)
-
 
 _is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
 
@@ -46,114 +31,17 @@ def is_coroutine_function(callback: object) -> bool:
     return known
 
 
-class TaskRun:
-    """One rclpy Task under way: started once, resumed as often as it awaits.
-
-    ``cause_event``, ``cause_output`` and ``input_hash`` belong to the next dispatch.
-    """
-
-    def __init__(
-        self,
-        core: Core,
-        task: Any,
-        *,
-        entity: int,
-        node: NodeHandle | None,
-        kind: int,
-        label: Callable[[], str],
-        on_end: Callable[[], None] | None = None,
-        mailbox: Mailbox | None = None,
-    ) -> None:
-        self.core = core
-        self.mailbox = mailbox
-        self.task = task
-        self.entity = entity
-        self.node = node
-        self.kind = kind
-        self.label = label
-        self.cause_event = core.loop.events
-        self.cause_output = 0
-        self.input_hash = 0
-        self._on_end = on_end
-        self._awaited: Any = None
-
-    def dispatch(self) -> None:
-        """Run the task's next stretch."""
-        if self.mailbox is not None and self.mailbox.keeps(self):
-            return
-        if self.task.done() or self.task.cancelled():
-            self._end()
-            return
-        kind, self.kind = self.kind, _RESUME
-        self.core.execute(
-            self,
-            self.entity,
-            self.node,
-            kind,
-            self._step,
-            (),
-            self.cause_event,
-            self.cause_output,
-            self.input_hash,
-        )
-
-    def describe(self) -> str:
-        """Name the task and where it came from."""
-        return self.label()
-
-    def waits_for(self) -> str:
-        """Say what a suspended task waits for, and where in the code."""
-        frame = getattr(self.task._handler, "cr_frame", None)
-        where = f" at {frame.f_code.co_filename}:{frame.f_lineno}" if frame is not None else ""
-        return f"{self.label()} waits{where} for {awaited(self.core, self._awaited)}"
-
-    def _step(self) -> None:
-        core = self.core
-        core.suspended.pop(self, None)
-        self._awaited = None
-        task = self.task
-        task()
-        if task.done() or task.cancelled():
-            self._end()
-            error = task.exception()
-            if error is not None:
-                raise error
-            return
-        core.flags |= _SUSPENDED
-        core.suspended[self] = None
-        self._awaited = awaited_future(task._handler)
-        if self._awaited is None:
-            core.polled.append(self)
-            if not core.polling:
-                core.polling = True
-                core.loop.idle.append(partial(poll, core))
-        else:
-            self._awaited.add_done_callback(Resume(self))
-
-    def _end(self) -> None:
-        self.core.suspended.pop(self, None)
-        if self._on_end is not None:
-            on_end, self._on_end = self._on_end, None
-            on_end()
-
-
-class Resume:
-    """The done callback that puts a suspended task back among the tasks."""
-
-    def __init__(self, run: TaskRun) -> None:
-        self._run = run
-
-    def __call__(self, future: Any) -> None:
-        run, core = self._run, self._run.core
-        run.cause_event = core.loop.events
-        run.cause_output = core.note(OutputKind.TASK, run.entity, 1)
-        run.input_hash = core.input_hash
-        core.loop.tasks.append(run)
+def executor_of(stacks: Stacks, handle: Any) -> Any:
+    """Return the executor that runs a handle's node: the user's own, or the run's."""
+    mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
+    if mailbox is not None and mailbox.pump is not None:
+        return mailbox.pump.executor
+    return stacks.executor
 
 
 def start_coroutine(
-    core: Core,
-    handle: EntityHandle,
+    stacks: Stacks,
+    handle: Any,
     kind: int,
     callback: Callable[..., Any],
     args: tuple[Any, ...],
@@ -166,13 +54,13 @@ def start_coroutine(
 
     wrapper = handle.wrapper
     run = TaskRun(
-        core,
-        Task(callback, args, None, executor=executor_of(core, handle)),
+        stacks.coroutines,
+        Task(callback, args, None, executor=executor_of(stacks, handle)),
         entity=handle.entity_id,
         node=handle.node,
         kind=kind,
         label=handle.describe,
-        on_end=lambda: groups.end(core, wrapper.callback_group, wrapper),
+        on_end=lambda: stacks.groups.end(wrapper.callback_group, wrapper),
         mailbox=handle.node.mailbox if handle.node is not None else None,
     )
     run.cause_event, run.cause_output, run.input_hash = cause_event, cause_output, input_hash
@@ -183,7 +71,7 @@ def start_coroutine(
 
 
 def create_task(
-    core: Core,
+    stacks: Stacks,
     callback: Any,
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
@@ -197,55 +85,20 @@ def create_task(
     """
     from rclpy.task import Task
 
-    task = Task(callback, args, kwargs, executor=executor or core.executor)
-    entity, node = core.current_entity, core.current_node
+    task = Task(callback, args, kwargs, executor=executor or stacks.executor)
+    event = stacks.event
     name = getattr(callback, "__qualname__", type(callback).__qualname__)
-    owner = node.fully_qualified_name if node is not None else "the run"
+    owner = event.node.fully_qualified_name if event.node is not None else "the run"
     run = TaskRun(
-        core,
+        stacks.coroutines,
         task,
-        entity=entity,
-        node=node,
+        entity=event.entity,
+        node=event.node,
         kind=_TASK,
         label=lambda: f"{owner}: task {name}",
         mailbox=mailbox,
     )
-    run.cause_output = core.note(OutputKind.TASK, entity)
-    run.input_hash = core.input_hash
-    core.loop.tasks.append(run)
+    run.cause_output = stacks.dispatcher.note(OutputKind.TASK, event.entity)
+    run.input_hash = event.input_hash
+    stacks.loop.tasks.append(run)
     return task
-
-
-def awaited_future(coroutine: Any) -> Any:
-    """Return the rclpy Future at the end of a suspended coroutine's chain of awaits, or None."""
-    from rclpy.task import Future
-
-    code = Future.__await__.__code__
-    while coroutine is not None:
-        if getattr(coroutine, "gi_code", None) is code:
-            frame = coroutine.gi_frame
-            return frame.f_locals.get("self") if frame is not None else None
-        for attribute in ("cr_await", "gi_yieldfrom", "ag_await"):
-            if hasattr(coroutine, attribute):
-                coroutine = getattr(coroutine, attribute)
-                break
-        else:
-            return None
-    return None
-
-
-def poll(core: Core) -> bool:
-    """Give coroutines that await something else one more try; True if there were any.
-
-    Once per stretch of other work: those that yield again wait until something else has happened.
-    """
-    stage = (core.loop.now_ns, core.loop.events - core.polls)
-    if not core.polled or stage == core.poll_stage:
-        return False
-    core.poll_stage = stage
-    runs, core.polled = core.polled, []
-    core.polls += len(runs)
-    for run in runs:
-        run.cause_event, run.cause_output = 2**64 - 1, 0
-        core.loop.tasks.append(run)
-    return True

@@ -21,19 +21,20 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.doors.rclpy.stacks.blocking_calls import RunEnded, Wait, wait
+from rsltrace.doors.rclpy.stacks.blocking_calls import wait
+from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.locks import SimLock, SimRLock
-from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_core
+from rsltrace.doors.rclpy.stacks.runners import RunEnded, Wait
+from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.callers import is_user_file
+from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
-
-if TYPE_CHECKING:
-    from rsltrace.doors.rclpy.core import Core
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001
@@ -51,33 +52,35 @@ class SimThread:
 
     def __init__(
         self,
-        core: Core,
+        stacks: Stacks,
         body: Callable[[], object],
         name: str,
         *,
         daemon: bool,
         thread: threading.Thread | None = None,
     ) -> None:
-        self.core = core
+        self.stacks = stacks
         self.thread = thread
         self.name = name
         self.daemon = daemon
-        self.program = core.program
-        self.ident = _FIRST_IDENT + core.thread_count
-        core.thread_count += 1
+        self.program = stacks.programs.present
+        self.ident = _FIRST_IDENT + stacks.threads.count
+        stacks.threads.count += 1
         self.stack: greenlet | None = None
         self.ended = False
         self.announced = True
-        self.mailbox = None
-        self.node = core.current_node
-        self.entity_id = core.new_entity_id()
-        core.pending.append(self)
+        self.node = stacks.event.node
+        self.entity_id = stacks.domain.entities.new_id()
+        stacks.domain.entities.pending.append(self)
         self._body: Callable[[], object] | None = body
         self._joining: list[Wait] = []
-        self._cause = (core.loop.events, core.note(OutputKind.TASK, self.entity_id, 3))
-        self._input_hash = core.input_hash
-        core.threads[self] = None
-        core.loop.tasks.append(self)
+        self._cause = (
+            stacks.loop.events,
+            stacks.dispatcher.note(OutputKind.TASK, self.entity_id, 3),
+        )
+        self._input_hash = stacks.event.input_hash
+        stacks.threads.alive[self] = None
+        stacks.loop.tasks.append(self)
 
     # -- the loop's view -------------------------------------------------------------------------
 
@@ -86,19 +89,19 @@ class SimThread:
         if self.ended or self.program.ended:
             self.end()
             return
-        core = self.core
-        core.runners.append(getcurrent())
+        stacks = self.stacks
+        stacks.runners.waiting.append(getcurrent())
         self.stack = greenlet(self._run)
-        core.thread_stacks[self.stack] = self
+        stacks.threads.by_stack[self.stack] = self
         self.stack.switch()
 
     def _run(self) -> None:
-        core = self.core
-        if self.program is not core.program:
+        stacks = self.stacks
+        if self.program is not stacks.programs.present:
             self.program.enter()
         cause_event, cause_output = self._cause
-        core.execute(
-            core.outside(self.describe, self.program.entry),
+        stacks.dispatcher.execute(
+            Construction(self.describe, self.program.entry),
             self.entity_id,
             self.node,
             int(EventKind.TASK),
@@ -108,9 +111,8 @@ class SimThread:
             cause_output,
             self._input_hash,
         )
-        if core.program is not core.host:
-            core.host.enter()
-        getcurrent().parent = core.runners.pop()
+        stacks.programs.leave()
+        stacks.runners.step_aside()
 
     def _call(self) -> None:
         from rclpy.executors import ExternalShutdownException
@@ -122,7 +124,7 @@ class SimThread:
         except (RunEnded, SystemExit, ExternalShutdownException):
             pass
         except KeyboardInterrupt:
-            if not self.core.closing:
+            if not self.stacks.ending.closing:
                 raise
         finally:
             self.end()
@@ -131,9 +133,9 @@ class SimThread:
         """Take note that the thread has ended: whoever joins it goes on."""
         self.ended = True
         self._body = None
-        self.core.threads.pop(self, None)
+        self.stacks.threads.alive.pop(self, None)
         if self.stack is not None:
-            self.core.thread_stacks.pop(self.stack, None)
+            self.stacks.threads.by_stack.pop(self.stack, None)
         for blocked in self._joining:
             blocked.wake()
 
@@ -155,7 +157,7 @@ class SimThread:
             for_ns = None if timeout is None else max(int(timeout * _NS_PER_S), 0)
             what = f"thread {self.name} to end"
             wait(
-                self.core,
+                self.stacks,
                 what,
                 until=self._joining.append,
                 for_ns=for_ns,
@@ -165,8 +167,12 @@ class SimThread:
 
     def is_patient(self) -> bool:
         """Return whether the thread waits for what may never come, so that a join may, too."""
-        own = [blocked for blocked in self.core.blocked if blocked.stack is self.stack]
+        own = [blocked for blocked in self.stacks.runners.blocked if blocked.stack is self.stack]
         return any(blocked.is_patient() for blocked in own)
+
+    def runnable(self) -> Runnable:
+        """Describe it to a policy: it is on no executor."""
+        return on_no_executor(self.node, self.describe())
 
     # -- the trace -------------------------------------------------------------------------------
 
@@ -177,7 +183,7 @@ class SimThread:
     def entity(self) -> Entity:
         """Return the thread as the trace describes it."""
         node = self.node.entity_id if self.node is not None else 0
-        now_ns = self.core.loop.now_ns
+        now_ns = self.stacks.loop.now_ns
         return Entity(self.entity_id, node, EntityKind.THREAD, self.name, "", now_ns, {})
 
 
@@ -185,8 +191,8 @@ class SimThread:
 
 
 def _start(self: Any) -> None:
-    core = simulated_core()
-    if core is None or not getattr(self, "_initialized", False):
+    stacks = simulated_stacks()
+    if stacks is None or not getattr(self, "_initialized", False):
         _real["start"](self)
         return
     if self._started.is_set() or "_rsltrace" in self.__dict__:
@@ -205,7 +211,7 @@ def _start(self: Any) -> None:
         finally:
             _mark_stopped(self)
 
-    thread = SimThread(core, body, self.name, daemon=self.daemon, thread=self)
+    thread = SimThread(stacks, body, self.name, daemon=self.daemon, thread=self)
     self._rsltrace = thread
     self._ident = self._native_id = thread.ident
     threading._active[thread.ident] = self  # type: ignore[attr-defined]
@@ -232,7 +238,7 @@ def _mark_stopped(thread: Any) -> None:
 
 def _join(self: Any, timeout: float | None = None) -> None:
     thread: SimThread | None = self.__dict__.get("_rsltrace")
-    if thread is None or simulated_core() is not thread.core:
+    if thread is None or simulated_stacks() is not thread.stacks:
         if thread is None:
             _real["join"](self, timeout)
         return
@@ -247,9 +253,9 @@ def _is_alive(self: Any) -> bool:
 
 
 def _get_ident() -> int:
-    core = simulated_core()
-    if core is not None and core.thread_stacks:
-        thread = core.thread_stacks.get(getcurrent())
+    stacks = simulated_stacks()
+    if stacks is not None and stacks.threads.by_stack:
+        thread = stacks.threads.by_stack.get(getcurrent())
         if thread is not None:
             return thread.ident
     return _real_get_ident()
@@ -258,20 +264,20 @@ def _get_ident() -> int:
 def _start_new_thread(
     function: Callable[..., object], args: tuple[Any, ...], kwargs: dict[str, Any] | None = None
 ) -> int:
-    core = simulated_core()
-    if core is None:
+    stacks = simulated_stacks()
+    if stacks is None:
         return _real_start_new_thread(function, args, kwargs or {})
     name = getattr(function, "__qualname__", "function")
-    thread = SimThread(core, lambda: function(*args, **(kwargs or {})), name, daemon=True)
+    thread = SimThread(stacks, lambda: function(*args, **(kwargs or {})), name, daemon=True)
     return thread.ident
 
 
 @contextmanager
-def cooperative_threads(core: Core) -> Iterator[None]:
+def cooperative_threads(stacks: Stacks) -> Iterator[None]:
     """Make the threads that user code starts cooperative ones within the ``with`` block."""
 
     def now() -> float:
-        return core.loop.now_ns / _NS_PER_S
+        return stacks.loop.now_ns / _NS_PER_S
 
     replaced: list[tuple[Any, str, Any]] = [
         (_Thread, "start", _start),
@@ -305,7 +311,7 @@ def cooperative_threads(core: Core) -> Iterator[None]:
         try:
             yield
         finally:
-            for thread in core.threads:
+            for thread in stacks.threads.alive:
                 if thread.thread is not None:
                     _mark_stopped(thread.thread)
 
@@ -325,7 +331,7 @@ def _number(stack: ExitStack, cls: Any) -> None:
     real_init = cls.__init__
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
-        if simulated_core() is not None:
+        if simulated_stacks() is not None:
             self._rsltrace_number = next(numbers)
         real_init(self, *args, **kwargs)
 

@@ -57,6 +57,11 @@ def type_name(interface: type) -> str:
     return f"{parts[0]}/{parts[1]}/{interface.__name__}"
 
 
+def class_of(publisher: Any) -> type:
+    """Return the message class of a publisher, which may have only the name of its type."""
+    return getattr(publisher, "msg_type", None) or get_message_class(publisher.type_name)
+
+
 def nested_class(namespaces: list[str], name: str) -> type:
     """Return the message class that a field of rosidl's ``NamespacedType(namespaces, name)`` holds.
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from functools import cache
+from typing import Any
 
 from rsltrace.doors.rclpy.wire.interface_classes import type_name
 from rsltrace.doors.rclpy.wire.interface_files import installed_definition, installed_type_hash
@@ -20,6 +21,7 @@ from rsltrace.doors.rclpy.wire.message_spec import (
     Text,
     message_spec,
 )
+from rsltrace.middleware.interface import MessageType, ServiceType
 
 _RULE = "=" * 80
 _FIELD = re.compile(r"\s*(?P<type>[^\s#]+)\s+(?P<name>[a-zA-Z]\w*)\s*(?P<constant>=)?", re.ASCII)
@@ -49,6 +51,19 @@ def type_hash(cls: type) -> str | None:
     None if its type description is not installed. Raises TypeError if rosidl did not generate it.
     """
     return installed_type_hash(type_name(cls))
+
+
+@cache
+def message_type(cls: type) -> MessageType:
+    """Return a message class as the middleware knows it: by name."""
+    return MessageType(type_name(cls), lambda: (schema_text(cls), type_hash(cls) or ""))
+
+
+@cache
+def service_type(cls: Any) -> ServiceType:
+    """Return a service class as the middleware knows it: by name."""
+    request, response = message_type(cls.Request), message_type(cls.Response)
+    return ServiceType(request.name.removesuffix("_Request"), request, response)
 
 
 def _definition(spec: Message) -> str:

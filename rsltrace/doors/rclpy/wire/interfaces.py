@@ -4,10 +4,25 @@ Nothing of ROS is imported before it is asked for.
 """
 
 from rsltrace.doors.rclpy.wire.interface_classes import (
+    class_of,
     get_message_class,
     get_service_class,
     type_name,
 )
-from rsltrace.doors.rclpy.wire.interface_schema import schema_text, type_hash
+from rsltrace.doors.rclpy.wire.interface_schema import (
+    message_type,
+    schema_text,
+    service_type,
+    type_hash,
+)
 
-__all__ = ["get_message_class", "get_service_class", "schema_text", "type_hash", "type_name"]
+__all__ = [
+    "class_of",
+    "get_message_class",
+    "get_service_class",
+    "message_type",
+    "schema_text",
+    "service_type",
+    "type_hash",
+    "type_name",
+]

@@ -1,0 +1,1 @@
+"""Actions: clients, servers and goals, made of services and topics."""

@@ -1,0 +1,139 @@
+"""What action servers and action clients have in common: an action is made of other entities.
+
+An action is three services and two topics under ``<name>/_action/``; each is an entity of its own
+here, so that the trace shows every request, response, feedback and status as it is. What arrives
+for any of them goes to rclpy's waitable, one at a time and in the order of arrival.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+from rsltrace.doors.rclpy.handles.destroyable import Handle
+from rsltrace.doors.rclpy.handles.entity_handle import ReceiverHandle
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.doors.rclpy.handles.services import ClientHandle, ServiceHandle
+from rsltrace.doors.rclpy.stacks.callback_groups import begin
+from rsltrace.doors.rclpy.stacks.tasks import executor_of, start_coroutine
+from rsltrace.doors.rclpy.wire.interfaces import type_name
+from rsltrace.model.event import EventKind
+
+ACTION = int(EventKind.ACTION)
+
+PartT = TypeVar("PartT", bound="Part")
+
+
+class Part(ReceiverHandle):
+    """One of an action's endpoints: its arrivals are handed to the action's waitable."""
+
+    owner: ActionHandle
+
+    def find_wrapper(self) -> Any:
+        """Return the action's waitable once its node is being run."""
+        if self.wrapper is None:
+            waitable = self.owner.find_waitable()
+            if waitable is not None:
+                self.begin(waitable, self.node)
+        return self.wrapper
+
+    def dispatch(self) -> None:
+        """Let rclpy take the oldest arrival and execute it, as one event."""
+        if not self.may_run():
+            return
+        begin(self.wrapper.callback_group, self.wrapper)
+        origin = self.queue[0][self.origin]
+        start_coroutine(self.stacks, self, ACTION, self.owner.execute, (self,), *origin)
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"action": self.owner.name}
+
+
+class GoalService(Part, ServiceHandle):
+    """A server's end of one of the three services."""
+
+
+class GoalClient(Part, ClientHandle):
+    """A client's end of one of the three services."""
+
+
+class GoalSubscription(Part, SubscriptionHandle):
+    """A client's feedback or status subscription."""
+
+
+class ActionHandle(Handle):
+    """What servers and clients have in common: their parts, and the one that is ready."""
+
+    waitable_attribute: str
+    is_client: bool
+
+    def __init__(self, node: NodeHandle, action_type: Any, name: str) -> None:
+        super().__init__()
+        self.stacks = node.stacks
+        self.node = node
+        self.name = node.resolve(name, service=False)
+        self.parts: list[Part] = []
+        self.publishers: list[PublisherHandle] = []
+        self.action_type = action_type
+        node.actions.append(self)
+        self._ready: Part | None = None
+
+    @property
+    def type_name(self) -> str:
+        """The name of the action's type."""
+        return type_name(self.action_type)
+
+    def own(self, kind: type[PartT], interface: Any, name: str, qos: Any) -> PartT:
+        """Make a part at ``<name>/_action/``; it has its owner before its constructor runs."""
+        part = kind.__new__(kind)
+        part.owner = self
+        part.__init__(self.node, interface, self.path(name), qos)  # type: ignore[misc]
+        self.parts.append(part)
+        return part
+
+    def path(self, name: str) -> str:
+        """Return the full name of a part."""
+        return f"{self.name}/_action/{name}"
+
+    def configure_introspection(self, clock: Any, qos: Any, state: Any) -> None:
+        """Publish service events of its three services (ROS 2 Kilted and later)."""
+        for part in self.parts:
+            if isinstance(part, GoalService | GoalClient):
+                part.configure_introspection(clock, qos, state)
+
+    def find_waitable(self) -> Any:
+        """Return the rclpy object around this handle, or None if its node is not being run."""
+        if self.node.wrapper is not None:
+            for waitable in self.node.wrapper.waitables:
+                if getattr(waitable, self.waitable_attribute, None) is self:
+                    return waitable
+        return None
+
+    def waits_for(self, future: Any) -> str:
+        """Say what would complete a future, if it is a client's own."""
+        waitable = self.find_waitable()
+        for what in ("goal", "result", "cancel"):
+            pending = getattr(waitable, f"_pending_{what}_requests", {})
+            if future in pending.values():
+                servers = len(self.stacks.domain.graph.services(self.path("send_goal")))
+                answer = "the result of a goal" if what == "result" else f"the answer to a {what}"
+                return f"{answer}, of action {self.name} ({servers} servers)"
+        return ""
+
+    async def execute(self, part: Part) -> None:
+        """Do what rclpy's executors do for a waitable of which ``part`` is ready."""
+        waitable = part.wrapper
+        self._ready = part
+        try:
+            waitable.is_ready(None)
+            data = waitable.take_data()
+        finally:
+            self._ready = None
+        for future in waitable._futures:
+            future._set_executor(executor_of(self.stacks, part))
+        await waitable.execute(data)
+
+    def _destroy(self) -> None:
+        self.node.actions.remove(self)
+        for handle in [*self.parts, *self.publishers]:
+            handle.destroy_when_not_in_use()

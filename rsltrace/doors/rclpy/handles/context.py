@@ -1,0 +1,74 @@
+"""The handle of ``rclpy.Context``: init arguments, and a shutdown.
+
+That of a node which the job constructs ends the run; a main shuts down only itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.doors.rclpy.handles.destroyable import Handle
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.loop.stop import Stop
+from rsltrace.model.event import OutputKind
+
+DEFAULT_DOMAIN = 2**64 - 1
+
+
+class ContextHandle(Handle):
+    """Stands in for ``_rclpy.Context``."""
+
+    def __init__(self, stacks: Stacks, arguments: Sequence[str], domain_id: int) -> None:
+        super().__init__()
+        self.stacks = stacks
+        for argument in arguments:
+            argument.encode()  # raises what rclpy raises for what is not text
+        self.program = stacks.programs.present
+        self.program.contexts.append(self)
+        self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
+        self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
+        self._ok = True
+
+    def ok(self) -> bool:
+        """Return whether the context has not been shut down."""
+        return self._ok
+
+    def get_domain_id(self) -> int:
+        """Return the domain id; nothing in a simulation depends on it."""
+        return self._domain_id
+
+    def shutdown(self) -> None:
+        """Shut down. Within an event this ends the run once the event is over."""
+        if not self._ok:
+            raise RuntimeError("context has already been shut down")
+        self._ok = False
+        stacks = self.stacks
+        if self.program is not stacks.programs.host:
+            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
+            return
+        if stacks.event.node is not None and self is stacks.programs.main_context:
+            stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
+            name = stacks.event.node.fully_qualified_name
+            stacks.loop.stop(Stop(f"{name} called rclpy.shutdown()"))
+
+    def end(self) -> None:
+        """Shut down from outside, as a signal does."""
+        self._ok = False
+
+
+def _only_ros(arguments: Sequence[str]) -> list[str]:
+    """Keep what stands between ``--ros-args`` and ``--`` (the program's own flags are not ours)."""
+    kept: list[str] = []
+    inside = False
+    for argument in arguments:
+        if argument == "--ros-args":
+            inside = True
+        if inside:
+            kept.append(argument)
+        if argument == "--":
+            inside = False
+    return kept
+
+
+__all__ = ["ContextHandle", "InvalidArgumentsError"]

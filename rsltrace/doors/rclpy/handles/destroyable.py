@@ -1,0 +1,64 @@
+"""The life of a handle, as rclpy's ``Destroyable`` has it.
+
+rclpy puts a ``with handle:`` around every use so that C memory is not freed under it. Here there is
+no C memory: a destroyed handle is destroyed at once, and using it afterwards raises what rclpy
+expects. Entering and leaving happens on every publication, so it does no more than that.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_invalid_handle: type[Exception] = RuntimeError
+
+
+def set_invalid_handle(error: type[Exception]) -> None:
+    """Tell which exception rclpy expects from a destroyed handle (its own ``InvalidHandle``)."""
+    global _invalid_handle
+    _invalid_handle = error
+
+
+class Destroyable:
+    """A handle that can be used in ``with`` until it is destroyed."""
+
+    destroyed: bool
+    """Whether it may be used no more; nothing but ``destroy`` sets it."""
+
+    def destroy(self) -> None:
+        """Destroy the handle, unless that has been done."""
+        raise NotImplementedError
+
+    def __enter__(self) -> Self:
+        if self.destroyed:
+            raise _invalid_handle("cannot use Destroyable because destruction was requested")
+        return self
+
+    def __exit__(self, exc_type: object, exc: object, tb: object) -> None:
+        pass
+
+    def destroy_when_not_in_use(self) -> None:
+        """Destroy the handle, unless that has been done."""
+        self.destroy()
+
+    @property
+    def pointer(self) -> int:
+        """A number that is unique among living handles (rclpy's wait sets compare these)."""
+        return id(self)
+
+
+class Handle(Destroyable):
+    """A handle of what is no entity of the middleware: a clock, a context, a goal."""
+
+    def __init__(self) -> None:
+        self.destroyed = False
+
+    def destroy(self) -> None:
+        if not self.destroyed:
+            self.destroyed = True
+            self._destroy()
+
+    def _destroy(self) -> None:
+        """Give back what the handle holds; called once."""

@@ -1,0 +1,136 @@
+"""What the handles of publishers, subscriptions, timers, clients and the like have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.doors.rclpy.handles.destroyable import Destroyable
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.doors.rclpy.stacks.callback_groups import exclusive
+from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.middleware.entity import DomainEntity, Runnable, callback_name
+from rsltrace.middleware.receiver import Receiver
+
+_LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
+
+
+class EntityHandle(Destroyable, DomainEntity):
+    """An entity of the middleware that has, once rclpy has made it, a wrapper object.
+
+    rclpy creates the handle first and wraps it afterwards, so the wrapper (which holds callback
+    and callback group) is looked up in the node's lists when it is first needed. Timers and guard
+    conditions are made without a node; until one lists them they do not run.
+    """
+
+    dispatch: Callable[[], None]
+    lists: str
+    """Name of the rclpy Node attribute that lists the wrappers."""
+    begins_active = False
+    stacks: Stacks
+    wrapper: Any = None
+
+    destroy = DomainEntity.destroy
+
+    def get_logger_name(self) -> str:
+        """Return the node's logger name."""
+        assert self.node is not None
+        return str(self.node.logger_name())
+
+    def settle(self) -> bool:
+        """Find owner and wrapper; return whether the owner is known."""
+        self.find_wrapper()
+        return self.node is not None
+
+    def find_wrapper(self) -> Any:
+        """Return the rclpy object around this handle, or None if its node is not being run."""
+        if self.wrapper is None:
+            for node in self._candidates():
+                for wrapper in getattr(node.wrapper, self.lists):
+                    if wrapper.handle is self:
+                        self.begin(wrapper, node)
+                        return wrapper
+        return self.wrapper
+
+    def begin(self, wrapper: Any, node: Any) -> None:
+        """Start to run: owner and callback are known now."""
+        self.wrapper = wrapper
+        self.node = node
+        self.active = True
+        self.activate()
+
+    def activate(self) -> None:
+        """Let the loop hear of what has come so far."""
+
+    def deactivate(self) -> None:
+        """Stop running: the node was taken from its executor."""
+        self.wrapper = None
+        self.active = False
+
+    def _candidates(self) -> list[Any]:
+        if self.node is not None:
+            return [self.node] if self.node.wrapper is not None else []
+        nodes = self.stacks.domain.graph.nodes
+        hint = self.stacks.event.node
+        ordered = [n for n in nodes if n is hint] + [n for n in nodes if n is not hint]
+        return [n for n in ordered if isinstance(n, NodeHandle) and n.wrapper is not None]
+
+    def mailbox_keeps(self) -> bool:
+        """Leave it to the node's executor, if that is one of the user's own, to run the callback
+        when it spins; False if it is to run now."""
+        mailbox: Mailbox | None = self.node.mailbox if self.node is not None else None
+        return mailbox is not None and mailbox.keeps(self)
+
+    def trace_name(self) -> str:
+        return callback_name(getattr(self.wrapper, "callback", None))
+
+    def runnable(self) -> Runnable:
+        node = self.node
+        group = getattr(self.wrapper, "callback_group", None)
+        return Runnable(
+            self.kind.label.replace(" ", "_"),
+            self.trace_name(),
+            self.entity_id,
+            node,
+            exclusive(group),
+            () if node is None or group is None else _names_in_group(node, group),
+            self.period(),
+            executor=node is None or node.mailbox is None,
+        )
+
+
+def _names_in_group(node: Any, group: Any) -> tuple[str, ...]:
+    names = []
+    for attribute in _LISTS:
+        for wrapper in getattr(node.wrapper, attribute, ()):
+            handle = getattr(wrapper, "handle", None)
+            if getattr(wrapper, "callback_group", None) is group and handle is not None:
+                names.append(handle.trace_name())
+    return tuple(names)
+
+
+class ReceiverHandle(EntityHandle, Receiver):
+    """A handle with a queue of what has arrived for its callback."""
+
+    def awaken(self) -> None:
+        self.find_wrapper()
+
+    activate = Receiver.activate
+
+    def may_run(self) -> bool:
+        """Return whether to take an arrival now; if the callback group is busy, try again later."""
+        mailbox = self.node.mailbox
+        if mailbox is not None and mailbox.keeps(self):
+            return False
+        wrapper = self.wrapper
+        if not self.queue or wrapper is None or self.destroyed:
+            return False
+        group = wrapper.callback_group
+        if getattr(group, "_active_entity", group) is None:  # nearly always
+            return True
+        return not self.stacks.groups.must_wait(self, wrapper)
+
+    def settle(self) -> bool:
+        self.find_wrapper()
+        return True

@@ -1,0 +1,71 @@
+"""The handle of ``rclpy.GuardCondition``."""
+
+from __future__ import annotations
+
+from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.stacks.callback_groups import begin
+from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
+
+_GUARD = int(EventKind.GUARD_CONDITION)
+
+
+class GuardConditionHandle(EntityHandle):
+    """Stands in for ``_rclpy.GuardCondition``.
+
+    A trigger that comes before the last one was handled is merged with it. Executors make guard
+    conditions, too, to wake themselves; no node lists those and nothing comes of their triggers.
+    """
+
+    kind = EntityKind.GUARD_CONDITION
+    lists = "guards"
+
+    def __init__(self, stacks: Stacks) -> None:
+        self.stacks = stacks
+        super().__init__(stacks.dispatcher, None)
+        self._triggered = False
+        self._cause = (0, 0)
+
+    def trigger_guard_condition(self) -> None:
+        """Make the callback ready."""
+        if self._triggered:
+            return
+        self._triggered = True
+        if self.active:
+            loop, dispatcher = self.dispatcher.loop, self.dispatcher
+            self._cause = (loop.events, dispatcher.note(OutputKind.GUARD, self.entity_id))
+            loop.ready.append(self)
+
+    def is_triggered(self) -> bool:
+        """Return whether a trigger has not been handled yet."""
+        return self._triggered
+
+    def take_trigger(self) -> None:
+        """Handle the triggers until now, as a wait set does that has found them."""
+        self._triggered = False
+
+    def activate(self) -> None:
+        if self._triggered:
+            self._cause = (self.dispatcher.loop.events, 0)
+            self.dispatcher.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Run the callback once for all triggers until now."""
+        if self.mailbox_keeps():
+            return
+        wrapper = self.wrapper
+        if not self._triggered or wrapper is None or self.destroyed:
+            return
+        if self.stacks.groups.must_wait(self, wrapper):
+            return
+        self._triggered = False
+        callback = wrapper.callback
+        if is_coroutine_function(callback):
+            begin(wrapper.callback_group, wrapper)
+            start_coroutine(self.stacks, self, _GUARD, callback, (), *self._cause, 0)
+        else:
+            self.dispatcher.execute(
+                self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0
+            )

@@ -1,0 +1,112 @@
+"""Logging: every record is stamped with simulated time, printed, and published on /rosout."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
+from rsltrace.guard.addresses import text_with_address
+from rsltrace.middleware.domain import Domain
+from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
+from rsltrace.model.event import OutputKind
+from rsltrace.model.stamp import NS_PER_S, format_seconds
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.format import TOPIC_ROSOUT
+
+_SEVERITY = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
+_TEN_SECONDS_NS = 10 * NS_PER_S
+
+QOS_ROSOUT = Qos(
+    history=History.KEEP_LAST,
+    depth=1000,
+    reliability=Reliability.RELIABLE,
+    durability=Durability.TRANSIENT_LOCAL,
+    deadline_ns=0,
+    lifespan_ns=_TEN_SECONDS_NS,
+    liveliness=Liveliness.AUTOMATIC,
+    lease_ns=0,
+)
+"""``rmw_qos_profile_rosout_default``."""
+
+
+class RosoutHandle(PublisherHandle):
+    """A node's own publisher of /rosout."""
+
+    output_kind = int(OutputKind.LOG)
+
+
+class Logs:
+    """Where log records go: the terminal, and the node's /rosout publisher."""
+
+    def __init__(self, domain: Domain, *, base_dir: Path, echo: bool) -> None:
+        self._domain = domain
+        self._base_dir = base_dir
+        self._echo = echo
+        self._nodes: dict[str, NodeHandle] = {}
+
+    def attach(self, node: NodeHandle, qos: Any = None) -> None:
+        """Give a node its /rosout publisher, with the usual QoS profile unless it says another."""
+        from rcl_interfaces.msg import Log
+
+        node.rosout = RosoutHandle(node, Log, TOPIC_ROSOUT, QOS_ROSOUT if qos is None else qos)
+        self._nodes[node.logger_name()] = node
+
+    def detach(self, node: NodeHandle) -> None:
+        """Forget a node."""
+        self._nodes.pop(node.logger_name(), None)
+
+    def add_sublogger(self, name: str, child: str) -> bool:
+        """Let a child logger publish through its node; False if the node has no /rosout."""
+        node = self._nodes.get(name)
+        if node is not None:
+            self._nodes[f"{name}.{child}"] = node
+        return node is not None
+
+    def log(
+        self, severity: int, name: str, message: str, function: str, file: str, line: int
+    ) -> None:
+        """Take one record. Severity, name and message are hashed: line numbers are not news."""
+        from builtin_interfaces.msg import Time
+        from rcl_interfaces.msg import Log
+
+        if " at 0x" in message:
+            text_with_address(message)
+        now_ns = self._domain.loop.now_ns
+        severity = int(severity)
+        if self._echo:
+            self._print(severity, now_ns, name, message)
+        node = self._nodes.get(name) or self._domain.event.node
+        rosout = getattr(node, "rosout", None)
+        if rosout is None or rosout.destroyed:
+            return
+        sec, nanosec = divmod(now_ns, NS_PER_S)
+        record: Any = Log(
+            stamp=Time(sec=sec, nanosec=nanosec),
+            level=severity,
+            name=name,
+            msg=message,
+            file=self._portable(file),
+            function=function,
+            line=line,
+        )
+        content = f"{severity}\0{name}\0{message}".encode(errors="surrogateescape")
+        rosout.send(rosout._serialize(record), hash64(content))
+
+    def _print(self, severity: int, now_ns: int, name: str, message: str) -> None:
+        """Show a record; who cannot be told any more (``2>&1 | head``) changes nothing in a run."""
+        label = _SEVERITY.get(severity, str(severity))
+        try:
+            sys.stderr.write(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}\n")
+        except (OSError, ValueError, AttributeError):  # gone, closed, or never there
+            self._echo = False
+
+    def _portable(self, file: str) -> str:
+        """Return a source path that is the same wherever the job's folder lies."""
+        path = Path(file)
+        for base in (self._base_dir, Path(sys.prefix)):
+            if path.is_relative_to(base):
+                return str(path.relative_to(base))
+        return path.name

@@ -1,0 +1,121 @@
+"""The handles of QoS events: callbacks that run when a status of an endpoint has news."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
+from rsltrace.doors.rclpy.stacks.callback_groups import begin
+from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.middleware.endpoint_status import (
+    DEADLINE_MISSED,
+    INCOMPATIBLE,
+    LIVELINESS_CHANGED,
+    LIVELINESS_LOST,
+    MATCHED,
+    MESSAGE_LOST,
+    EndpointEvents,
+)
+from rsltrace.middleware.entity import callback_name
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_EVENT, EventKind
+
+_QOS_EVENT = int(EventKind.QOS_EVENT)
+
+
+_NAMES = {
+    "MATCHED": MATCHED,
+    "INCOMPATIBLE_QOS": INCOMPATIBLE,
+    "DEADLINE_MISSED": DEADLINE_MISSED,
+    "LIVELINESS_CHANGED": LIVELINESS_CHANGED,
+    "LIVELINESS_LOST": LIVELINESS_LOST,
+    "MESSAGE_LOST": MESSAGE_LOST,
+}
+
+
+def _event_name(event_type: Any) -> str:
+    name: str = event_type.name
+    for ending, ours in _NAMES.items():
+        if name.endswith(ending):
+            return ours
+    return name.lower()
+
+
+class EventHandle(EntityHandle):
+    """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable."""
+
+    kind = EntityKind.QOS_EVENT
+    lists = "waitables"
+
+    def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
+        self.stacks = parent.stacks
+        super().__init__(parent.dispatcher, parent.node)
+        # rclpy makes a handle or two for every endpoint; only those that fire are worth a record.
+        self.announced = False
+        self._events: EndpointEvents = parent.events
+        self._parent = parent
+        self._name = _event_name(event_type)
+        self._queued = False
+        self._cause = (NO_EVENT, 0)
+        parent.events.listeners[self._name] = self
+
+    def find_wrapper(self) -> Any:
+        if self.wrapper is None and self.node is not None and self.node.wrapper is not None:
+            for waitable in self.node.wrapper.waitables:
+                if getattr(waitable, "_EventHandler__event", None) is self:
+                    self.begin(waitable, self.node)
+        return self.wrapper
+
+    def activate(self) -> None:
+        self.trigger()
+
+    def trigger(self) -> None:
+        """Make the callback ready."""
+        if not self._queued and self.active and self._events.news(self._name):
+            self._queued = True
+            if not self.announced:
+                self.announced = True
+                self.dispatcher.entities.pending.append(self)
+            self._cause = (self.dispatcher.loop.events, 0)
+            self.dispatcher.loop.ready.append(self)
+
+    def has_news(self) -> bool:
+        """Return whether there is a status to take."""
+        return self._events.news(self._name)
+
+    def take_event(self) -> Any:
+        """Return the status; its changes are those since the last time."""
+        return self._events.take(self._name)
+
+    def dispatch(self) -> None:
+        """Run the callback with the status."""
+        if self.mailbox_keeps():
+            return
+        wrapper = self.wrapper
+        if wrapper is None or self.destroyed:
+            return
+        if self.stacks.groups.must_wait(self, wrapper):
+            return
+        self._queued = False
+        if not self.has_news():
+            return
+        status = self.take_event()
+        callback = wrapper.callback
+        if is_coroutine_function(callback):
+            begin(wrapper.callback_group, wrapper)
+            start_coroutine(self.stacks, self, _QOS_EVENT, callback, (status,), *self._cause, 0)
+        else:
+            self.dispatcher.execute(
+                self, self.entity_id, self.node, _QOS_EVENT, callback, (status,), *self._cause, 0
+            )
+
+    def settle(self) -> bool:
+        self.find_wrapper()
+        return True
+
+    def trace_name(self) -> str:
+        return f"{self._parent.topic} {self._name}"
+
+    def trace_detail(self) -> dict[str, object]:
+        return {"callback": callback_name(getattr(self.wrapper, "callback", None))}

@@ -1,0 +1,35 @@
+"""The parameters of the nodes of a run: those they have declared, and those they were given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rsltrace.middleware.graph import Graph
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """The parameters of a node: those it has declared, and those it was given besides.
+
+    ``entry_key`` is the key of the job's entry that made the node, empty if none did.
+    """
+
+    entry_key: str
+    declared: tuple[str, ...]
+    unused: tuple[str, ...]
+
+
+def parameters_of(graph: Graph) -> dict[str, Parameters]:
+    """Return the parameters of the nodes there are now. Who allows undeclared ones uses all."""
+    found = {}
+    for handle in graph.nodes:
+        if not isinstance(handle, NodeHandle):
+            continue
+        node = handle.wrapper
+        if node is None or node._allow_undeclared_parameters:
+            continue
+        declared = tuple(node._parameters)
+        unused = tuple(name for name in node._parameter_overrides if name not in node._parameters)
+        found[handle.fully_qualified_name] = Parameters(handle.entry_key, declared, unused)
+    return found

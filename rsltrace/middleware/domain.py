@@ -1,0 +1,102 @@
+"""The domain of a run: all that its participants share, and how plain ones get their endpoints.
+
+A participant needs no client library: it is given bytes and gives bytes. A door that has one makes
+endpoints of its own, derived from these, and has them join the graph.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from rsltrace.loop.loop import EventLoop
+from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.event import Door
+from rsltrace.middleware.failure import FailuresEndTheRun
+from rsltrace.middleware.graph import Graph
+from rsltrace.middleware.interface import MessageType, ServiceType
+from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.publisher import Publisher
+from rsltrace.middleware.qos import DEFAULT_QOS, Qos
+from rsltrace.middleware.services import Client, Service
+from rsltrace.middleware.subscription import Subscription
+from rsltrace.middleware.timer import Timer
+from rsltrace.middleware.transport import Transport, Watcher
+
+
+class Domain:
+    """Who is there (``graph``), how they reach each other (``transport``), and how their callbacks
+    are run and recorded (``dispatcher``)."""
+
+    def __init__(self, loop: EventLoop) -> None:
+        self.loop = loop
+        self.dispatcher = Dispatcher(loop)
+        self.event = self.dispatcher.event
+        self.entities = self.dispatcher.entities
+        self.outcome = self.dispatcher.outcome
+        self.transport = Transport(self.dispatcher)
+        self.graph = Graph()
+        self._door = FailuresEndTheRun(self.dispatcher)
+        self.dispatcher.door = self._door
+
+    def watch(self, topic: str, watcher: Watcher) -> None:
+        """Call ``watcher(publisher, canonical bytes)`` for every message on a topic."""
+        whole = self.transport.watch(topic, watcher)
+        for publisher in self.graph.publishers(topic):
+            publisher.watcher = whole
+
+    # -- participants without a client library ---------------------------------------------------
+
+    def join(self, name: str, namespace: str = "/", door: Door | None = None) -> Participant:
+        """Make a participant; without a door of its own, what it raises ends the run."""
+        participant = Participant(self.dispatcher, name, namespace, door or self._door)
+        self.graph.add_node(participant)
+        return participant
+
+    def publisher(
+        self, node: Participant, topic: str, type: MessageType, qos: Qos = DEFAULT_QOS
+    ) -> Publisher:
+        """Make a publisher of a fully qualified topic; ``send`` publishes."""
+        publisher = Publisher(self.transport, node, topic, type, qos)
+        self.graph.add_publisher(publisher)
+        return publisher
+
+    def subscription(
+        self,
+        node: Participant,
+        topic: str,
+        type: MessageType,
+        callback: Callable[[bytes], object],
+        qos: Qos = DEFAULT_QOS,
+    ) -> Subscription:
+        """Make a subscription; ``callback`` gets canonical CDR."""
+        settled = self.graph.settled_request(topic, qos)
+        subscription = Subscription(self.dispatcher, node, topic, type, settled, callback)
+        self.graph.add_subscription(subscription)
+        return subscription
+
+    def service(
+        self,
+        node: Participant,
+        service: str,
+        type: ServiceType,
+        callback: Callable[[bytes], bytes],
+        qos: Qos = DEFAULT_QOS,
+    ) -> Service:
+        """Make a server; ``callback`` gets a request and returns the response."""
+        server = Service(self.transport, node, service, type, qos, callback)
+        self.graph.add_service(server)
+        return server
+
+    def client(
+        self, node: Participant, service: str, type: ServiceType, qos: Qos = DEFAULT_QOS
+    ) -> Client:
+        """Make a client; ``call`` sends a request."""
+        client = Client(self.transport, node, service, type, qos)
+        self.graph.add_client(client)
+        return client
+
+    def timer(self, node: Participant, period_ns: int, callback: Callable[[], object]) -> Timer:
+        """Make a timer, which runs from now on."""
+        timer = Timer(self.dispatcher, node, period_ns, callback)
+        node.timers.append(timer)
+        return timer

@@ -1,0 +1,57 @@
+"""What endpoints send through: the trace's channels, links with a model, and who listens in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.interface import MessageType
+from rsltrace.middleware.links import Network
+
+Watcher = Callable[[Any, bytes], None]
+"""Is called with the publisher and the canonical bytes of each message on a topic."""
+
+
+class Transport:
+    """How what is sent gets to others. ``network`` is None in a run without models of links."""
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        self.dispatcher = dispatcher
+        self.network: Network | None = None
+        self.watchers: dict[str, Watcher] = {}
+        self._channels: dict[tuple[str, str], int] = {}
+
+    def watch(self, topic: str, watcher: Watcher) -> Watcher:
+        """Add a watcher of a topic; return what is to be called for all of its watchers."""
+        first = self.watchers.get(topic)
+        self.watchers[topic] = watcher if first is None else _both(first, watcher)
+        return self.watchers[topic]
+
+    def channel(
+        self, topic: str, type: MessageType, qos_yaml: str = "", *, with_hash: bool = False
+    ) -> int:
+        """Return the trace's channel for a topic, or -1 if its payloads are not kept."""
+        recorder = self.dispatcher.recorder
+        if recorder is None or not recorder.keep_payload(topic):
+            return -1
+        channel = self._channels.get((topic, type.name))
+        if channel is None:
+            text, type_hash = type.describe()
+            channel = recorder.writer.add_channel(
+                topic,
+                type.name,
+                text,
+                qos_yaml=qos_yaml,
+                type_hash=type_hash if with_hash else "",
+            )
+            self._channels[topic, type.name] = channel
+        return channel
+
+
+def _both(first: Watcher, second: Watcher) -> Watcher:
+    def watch(publisher: Any, data: bytes) -> None:
+        first(publisher, data)
+        second(publisher, data)
+
+    return watch
