@@ -6,8 +6,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
-from rsltrace.errors import JobError
-from rsltrace.job.values.problem import nearest
+from rsltrace.errors import JobError, nearest
 from rsltrace.loop.stop import Stop
 
 if TYPE_CHECKING:
