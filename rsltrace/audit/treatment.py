@@ -1,4 +1,4 @@
-"""What the guard does about a place in the sources: the job's, or that of the node that gets there.
+"""What the guard does about a place in the sources: the job's, or that of the node that runs it.
 
 A node may have a ``guard:`` of its own. Code at the top of a module runs under the job's, since no
 node is there yet; what stands in a node's class runs under the node's; any other function under

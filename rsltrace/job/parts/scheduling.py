@@ -87,7 +87,7 @@ class PolicySpec(Part):
 
 
 class ExecutorSpec(Part):
-    """A simulated executor: so many workers for some nodes."""
+    """A simulated executor: a number of workers for some nodes."""
 
     nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
         default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]
