@@ -20,6 +20,8 @@ An interrupted run (Ctrl-C, SIGTERM) exits with 130 or 143, as shells expect.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 EXIT_USAGE = 2
 EXIT_RUN = 3
 
@@ -105,3 +107,24 @@ class UnsupportedError(RunError):
 
 class GuardError(RunError):
     """A node made a call whose answer can differ from run to run, and its job forbids that."""
+
+
+def nearest(word: str, names: Iterable[str]) -> str | None:
+    """Return the name that ``word`` was most probably meant to be: one of the same letters, or
+    the most similar one; None if none is near."""
+    import difflib  # only for whoever made a mistake
+
+    close = difflib.get_close_matches(word, list(dict.fromkeys(names)), n=3)
+    swapped = [name for name in close if sorted(name) == sorted(word)]
+    return next(iter([*swapped, *close]), None)
+
+
+def did_you_mean(word: str, names: Iterable[str], otherwise: str = "") -> str:
+    """Return the question to end a message with, or ``otherwise`` if no name is near.
+
+    Without an alternative, a semicolon leads to the question.
+    """
+    near = nearest(word, names)
+    if near is None:
+        return otherwise
+    return f"did you mean {near!r}?" if otherwise else f"; did you mean {near!r}?"

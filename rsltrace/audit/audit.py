@@ -6,11 +6,11 @@ import ast
 from collections.abc import Callable
 from pathlib import Path
 
+from rsltrace.audit.calls import Place, find_calls
 from rsltrace.audit.files import Collection, SourceFile, collect_modules, collect_path
-from rsltrace.audit.look import Place, look
 from rsltrace.audit.model import Audit, Found
 from rsltrace.audit.names import Names
-from rsltrace.audit.treating import Treating, module_of
+from rsltrace.audit.treatment import GuardTreatment, module_of
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.model.finding import Policy
@@ -29,7 +29,7 @@ def audit_path(path: Path) -> Audit:
     found = collect_path(path)
     if not found.files and not found.troubles:
         raise JobError(f"{path}: there is no Python file in this folder")
-    return _audit(found, Treating(Policy()))
+    return _audit(found, GuardTreatment(Policy()))
 
 
 def audit_job(job: Job, executable: Executables) -> Audit:
@@ -60,16 +60,16 @@ def audit_job(job: Job, executable: Executables) -> Audit:
             f"there is no module {name!r}: search_path has {', '.join(map(str, job.search_path))}",
             where=names[name],
         )
-    return _audit(collection, Treating.of_job(job, targets, folders))
+    return _audit(collection, GuardTreatment.of_job(job, targets, folders))
 
 
-def _audit(collection: Collection, treating: Treating) -> Audit:
+def _audit(collection: Collection, guard: GuardTreatment) -> Audit:
     sources = list(collection.files.values())
     names = Names({source.module.name: source.module for source in sources})
     called: set[ast.AST] = set()
     places: list[tuple[SourceFile, Place]] = []
     for source in sources:
-        for place in look(source.module, names, as_script=source.as_script):
+        for place in find_calls(source.module, names, as_script=source.as_script):
             if place.alias is None:
                 called |= names.passed
             places.append((source, place))
@@ -81,7 +81,7 @@ def _audit(collection: Collection, treating: Treating) -> Audit:
         if _is_silenced(source, place):
             silenced += 1
             continue
-        found.add(_found(source, place, treating))
+        found.add(_found(source, place, guard))
     return Audit(
         tuple(sorted(found)),
         len(sources),
@@ -101,8 +101,8 @@ def _is_silenced(source: SourceFile, place: Place) -> bool:
     return False
 
 
-def _found(source: SourceFile, place: Place, treating: Treating) -> Found:
-    treatment, does = treating.done(source, place)
+def _found(source: SourceFile, place: Place, guard: GuardTreatment) -> Found:
+    treatment, does = guard.of(source, place)
     node = place.node
     return Found(
         source.path,

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
-from rsltrace.audit.scopes import Module, take_apart
+from rsltrace.audit.scopes import Module, parse_scopes
 
 _INSTALLED = {"site-packages", "dist-packages"}
 _NOT_SOURCES = {"build", "install", "log", "node_modules", "__pycache__"}
@@ -38,7 +38,7 @@ def read_source(path: Path, name: str, *, as_script: bool = False) -> SourceFile
     with tokenize.open(path) as file:
         text = file.read()
     tree = ast.parse(text, str(path))
-    module = take_apart(tree, name, is_package=path.name == "__init__.py")
+    module = parse_scopes(tree, name, is_package=path.name == "__init__.py")
     return SourceFile(path, module, as_script, _allowed(text))
 
 

@@ -25,7 +25,7 @@ class Names:
         self.passed: set[ast.AST] = set()
         self._asked: set[tuple[Scope, str]] = set()
         """Names that are being resolved. What ``line = line.strip()`` says of ``line`` is nothing;
-        without this, a dozen such lines would take for ever."""
+        without this, a dozen such lines would take forever."""
 
     def of(self, node: ast.expr, scope: Scope, depth: int = 0) -> str | None:
         """Return the full name of what ``node`` stands for, or None if that is not known."""

@@ -96,7 +96,7 @@ _COMPREHENSIONS = (ast.ListComp, ast.SetComp, ast.DictComp, ast.GeneratorExp)
 _FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
-def take_apart(tree: ast.Module, name: str, *, is_package: bool = False) -> Module:
+def parse_scopes(tree: ast.Module, name: str, *, is_package: bool = False) -> Module:
     """Return a module with its scopes filled in."""
     module = Module(name, is_package, tree)
     for parent in ast.walk(tree):
@@ -239,4 +239,4 @@ def _source(module: Module, node: ast.ImportFrom) -> str:
     return ".".join([*parts, *([node.module] if node.module else [])])
 
 
-__all__ = ["Annotated", "Binding", "Imported", "Module", "Scope", "take_apart"]
+__all__ = ["Annotated", "Binding", "Imported", "Module", "Scope", "parse_scopes"]

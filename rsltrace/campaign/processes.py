@@ -38,7 +38,7 @@ class Processes:
         env: Mapping[str, str],
         timeout_s: float | None = None,
     ) -> Done:
-        """Run a command to its end; after ``kill``, nothing is started any more."""
+        """Run a command to its end; after ``kill``, nothing more is started."""
         with self._started(command, cwd, env) as process:
             if process is None:
                 return Done(-signal.SIGKILL, "", "not started")

@@ -18,7 +18,7 @@ LOST_BURST = -2
 LOST_OUTAGE = -3
 
 _ATTEMPTS_MAX = 1000
-"""After so many losses in a row of one message, a reliable link gives it up."""
+"""A reliable link gives a message up after losing it this many times in a row."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,7 +40,7 @@ class Stream:
         return int(self.uniform() * count)
 
     def whole_numbers(self, low: int, count: int) -> Iterator[int]:
-        """Return ``low + below(count)`` for ever, from the stream's beginning, in half the time."""
+        """Return ``low + below(count)`` forever, from the stream's beginning, in half the time."""
         return chain.from_iterable(self._whole_numbers(low, float(count)))
 
     def _uniforms(self) -> Iterator[list[float]]:

@@ -73,7 +73,7 @@ class DescriptorTable:
             self._far_ends[fd] = (_identity(fd), far)
 
     def far_end(self, fd: int) -> int | None:
-        """Return the other end of a pipe or pair that was made in the run, if it is one's."""
+        """Return the other end, if this is one end of a pipe or pair that the run has made."""
         found = self._far_ends.get(fd)
         if found is None or _identity(fd) != found[0]:
             return None

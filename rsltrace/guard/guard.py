@@ -187,7 +187,7 @@ class Guard:
         mode = self.mode(source, frame)
         if mode is Mode.ALLOW:
             return
-        # What cannot be made virtual or be recorded is told all the same.
+        # What can be neither made virtual nor recorded is at least reported.
         told = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
         self.found(source, told, call, value, frame)
 

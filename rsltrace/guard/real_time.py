@@ -20,7 +20,7 @@ class RealTimePace:
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         self.in_a_row = 0
-        """How often somebody found at once what he would have waited for."""
+        """How many waits in a row ended at once, because the answer was there already."""
 
     def is_greedy(self) -> bool:
         """Count one more such answer; return whether it is time to let others go on."""

@@ -92,14 +92,14 @@ class RecordedAnswers:
         if kept:
             return kept.popleft()
         raise GuardError(
-            f"{self._trace} has no answer to {call} of {node or 'the run'} any more: this run "
-            "asks more than the recorded one did, so its code, job or data is another; compare "
+            f"{self._trace} has no further answer to {call} of {node or 'the run'}: this run asks "
+            "more often than the recorded one did, so its code, job or data have changed; compare "
             "the two with rsltrace diff"
         )
 
 
 def encoded_answer(real: Callable[[], Any]) -> str:
-    """Return what a real call answers as text, be it an error of the operating system."""
+    """Return what a real call answers as text; an error of the operating system is an answer."""
     try:
         return encoded(real())
     except OSError as error:

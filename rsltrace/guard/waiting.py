@@ -1,7 +1,7 @@
 """Waiting for what is outside of the run, in threads and event loops: others go on meanwhile.
 
 Simulated time then passes as fast as real time does, in steps of a millisecond. The trace keeps how
-many steps it were, and a re-run takes as many without waiting for anything.
+many steps it took, and a re-run takes as many without waiting for anything.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""
 
 Attempt = Callable[[float], Any]
-"""Waits for real, at most so many seconds, and returns the answer or ``NOT_YET``."""
+"""Waits in real time, at most the given seconds, and returns the answer or ``NOT_YET``."""
 
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
 _sleep = copy_of(time.sleep)  # type: ignore[arg-type]
@@ -85,9 +85,9 @@ def wait_unrecorded(
     timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
-    """Wait likewise for what is not recorded; return it, or None if it does not come in time.
+    """Wait in the same way for what is not recorded; return it, or None if it comes too late.
 
-    A thread that blocked for real would keep everybody from going on, be it those it waits for.
+    A thread that blocked for real would keep all others from going on, even those it waits for.
     """
     context, steps = guard.context, 0
     step = step or context.step

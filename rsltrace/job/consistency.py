@@ -26,9 +26,9 @@ def _bags_progress(job: JobFields) -> Iterator[Problem]:
     if job.progress is None:
         return
     if not job.bags:
-        yield Problem("there are no bags (bags:) whose progress could be told", ("progress",))
+        yield Problem("there are no bags (bags:) whose progress could be published", ("progress",))
     elif any(bag.loop is True for bag in job.bags):
-        yield Problem("a bag that plays for ever makes no progress", ("progress",))
+        yield Problem("a bag that plays forever makes no progress", ("progress",))
 
 
 def _bags_end(job: JobFields) -> Iterator[Problem]:
@@ -37,7 +37,7 @@ def _bags_end(job: JobFields) -> Iterator[Problem]:
     for index, bag in enumerate(job.bags):
         if bag.loop is True:
             yield Problem(
-                "plays for ever, and nothing ends the run: give a 'stop:', or how often it plays",
+                "plays forever, and nothing ends the run: give a 'stop:', or a number of times",
                 ("bags", index, "loop"),
             )
 

@@ -164,7 +164,7 @@ class JobFields(Part):
     min_time_step_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="min_time_step",
-        description="Simulated time moves on by this much at least; what is due in between runs "
+        description="Simulated time moves on by at least this much; what is due in between runs "
         "late.",
         examples=["1ms"],
     )
@@ -177,8 +177,8 @@ class JobFields(Part):
     )
     execution: Annotated[ExecutionSpec | None, given] = Field(
         default=None,
-        description="How long callbacks take: their executor is busy for so long, and what they "
-        "send leaves when they are over.",
+        description="How long callbacks take: their executor is busy for that long, and what "
+        "they send leaves when they end.",
         examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
     )
     clocks: Annotated[tuple[ClockSpec, ...], parts()] = Field(

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job.reading.yaml_source import Place
 
 Scalar = str | int | float | bool
@@ -60,10 +59,8 @@ class Element:
 
 
 def _unknown(what: str, name: str, tag: str, known: list[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1)
     there = f"there are {', '.join(known)}" if known else "it has none"
-    hint = f"did you mean {near[0]!r}?" if near else there
-    return f"unknown {what} {name!r} in <{tag}>; {hint}"
+    return f"unknown {what} {name!r} in <{tag}>; {did_you_mean(name, known, there)}"
 
 
 def not_a_launch_file(name: str, why: str) -> JobError:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
 from rsltrace.launch import ros_launch
 from rsltrace.launch.model import Argument, Launched
@@ -60,13 +59,13 @@ def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
     for name in spec.arguments:
         if name in known:
             continue
-        near = difflib.get_close_matches(name, known, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
         listed = "".join(f"\n  {argument}" for argument in known.values()) or " none"
         loc = ("launch", index, "arguments", name)
         where = locate(job, loc)
         in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
         of = f" of {spec.file}" if in_file else ""
-        wrong = f"unknown launch argument {name!r}{of}{hint}\nthere are:{listed}"
+        wrong = (
+            f"unknown launch argument {name!r}{of}{did_you_mean(name, known)}\nthere are:{listed}"
+        )
         with showing_line(job, loc):
             raise JobError(wrong, where=where if in_file else spec.file)

@@ -5,12 +5,11 @@ The actions, their attributes and their order of effect are those of launch and 
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, nearest
 from rsltrace.job.reading.yaml_source import Place
 from rsltrace.launch.element import Element
 from rsltrace.launch.evaluation import Evaluation
@@ -165,8 +164,8 @@ class ActionReader(Evaluation):
 
     def _misspelt(self, name: str) -> str:
         given = [n for n in self.scope.configurations if n not in self.launched.arguments]
-        near = difflib.get_close_matches(name, given, n=1)
-        return f" (there is a {near[0]!r})" if near else ""
+        near = nearest(name, given)
+        return f" (there is a {near!r})" if near else ""
 
     def _let(self, element: Element) -> None:
         element.check(["name", "value"])
@@ -275,6 +274,6 @@ def _at(place: Place | None, path: Path, message: str) -> JobError:
 
 
 def _unknown_action(tag: str, known: Mapping[str, object]) -> str:
-    near = difflib.get_close_matches(tag, known, n=1)
-    hint = f"did you mean <{near[0]}>?" if near else f"there are {', '.join(known)}"
+    near = nearest(tag, known)
+    hint = f"did you mean <{near}>?" if near else f"there are {', '.join(known)}"
     return f"unknown action <{tag}>; {hint}"

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+from rsltrace.errors import did_you_mean, nearest
 from rsltrace.job.reading.substitute import package_prefix
 from rsltrace.launch.expression import evaluate
 from rsltrace.launch.scope import Scope
@@ -80,9 +80,9 @@ class Substitutions:
         if call.name in _REFUSED:
             raise ValueError(f"{call.written}: {_REFUSED[call.name]}; give the value itself")
         if call.name not in self._known:
-            near = difflib.get_close_matches(call.name, self._known, n=1)
+            near = nearest(call.name, self._known)
             there = f"there are {', '.join(self._known)}"
-            hint = f"did you mean $({near[0]} …)?" if near else there
+            hint = f"did you mean $({near} …)?" if near else there
             raise ValueError(f"{call.written} is no substitution; {hint}")
         least, most, function = self._known[call.name]
         if not least <= len(call.arguments) <= most:
@@ -102,9 +102,8 @@ class Substitutions:
         value = self.scope.configurations.get(name, default)
         if value is None:
             names = sorted(self.scope.configurations)
-            near = difflib.get_close_matches(name, names, n=1)
             there = f"there are {', '.join(names)}" if names else "none is declared"
-            hint = f"did you mean {near[0]!r}?" if near else there
+            hint = did_you_mean(name, names, there)
             raise ValueError(f"there is no launch argument {name!r}; {hint}")
         return value
 

@@ -43,7 +43,7 @@ def encode_draw(kind: int, value_ns: int = 0) -> int:
 
 
 def encode_clock(by_ns: int) -> int:
-    """Return the number for a clock that has been set by so much."""
+    """Return the number for a clock that has been set by this much."""
     return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
 
 

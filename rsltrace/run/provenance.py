@@ -16,7 +16,7 @@ from rsltrace._version import __version__
 from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
-from rsltrace.run.numerics import numerics
+from rsltrace.run.numerical_libraries import numerical_libraries
 from rsltrace.run.process import is_of_pytest, user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.writer import TraceWriter
@@ -100,7 +100,7 @@ def environment(job: Job | None = None) -> dict[str, str]:
         "hash_seed": os.environ.get(HASH_SEED, "random"),
     }
     values.update(_versions())
-    kernels = "" if job is None else numerics(job)
+    kernels = "" if job is None else numerical_libraries(job)
     if kernels:
         values["numerics"] = kernels
     return values

@@ -35,14 +35,14 @@ from rsltrace.run.plans.bags import (
 from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.executables import why_not
-from rsltrace.run.plans.guarding import Guarding, guarding
+from rsltrace.run.plans.guard import RunGuard, install_guard
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
-from rsltrace.run.unused import (
+from rsltrace.run.unused_rules import (
     has_rules,
     unused_parameters,
     unused_ros_parameters,
@@ -122,7 +122,7 @@ class Session:
         self._writer: TraceWriter | None = None
         self._bags: list[BagInput]
         self._notes: tuple[str, ...]
-        self._guarded: Guarding
+        self._guarded: RunGuard
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
         self._recorded: RecordedRun | None
@@ -153,7 +153,7 @@ class Session:
         self.job = expanded.job
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
-        self._guarded = guarding(stack, self.job)
+        self._guarded = install_guard(stack, self.job)
         self._make_world(stack)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from rsltrace.errors import DeadlockError, RunError
+from rsltrace.errors import DeadlockError, RunError, did_you_mean
 from rsltrace.job import Job, load_job
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time
@@ -171,8 +170,8 @@ class Simulation:
             return names[found[0]]
         if found:
             raise RunError(f"several nodes are named {name}: {', '.join(found)}; give one of these")
-        near = difflib.get_close_matches(f"/{name.lstrip('/')}", names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(names) or 'none'}"
+        there = f"there are: {', '.join(names) or 'none'}"
+        hint = did_you_mean(f"/{name.lstrip('/')}", names, there)
         raise RunError(f"there is no node named {name}; {hint}")
 
     # -- going on ----------------------------------------------------------------------------------

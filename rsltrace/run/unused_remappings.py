@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 
 from rsltrace.doors.rclpy.arguments import RosArguments
+from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
-from rsltrace.job.values.problem import Loc, nearest
+from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.census import Asker, Census
-from rsltrace.run.plans.guarding import entry_key
+from rsltrace.run.plans.entries import entry_key
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""
@@ -77,8 +78,7 @@ def _note(old: str, askers: list[Asker], census: Census) -> str:
     names = [
         form for asker in askers for name, _ in census.asked[asker] for form in _forms(name, asker)
     ]
-    near = nearest(old, dict.fromkeys(names))
-    advice = f"; did you mean {near!r}?" if near else ""
+    advice = did_you_mean(old, names)
     who = ", ".join(f"{asker.namespace.rstrip('/')}/{asker.name}" for asker in askers[:3])
     who += ", …" if len(askers) > 3 else ""
     return f"nothing of {who or 'any node'} is called {old!r}, so nothing is remapped{advice}"

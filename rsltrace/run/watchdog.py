@@ -1,6 +1,6 @@
 """A word about a callback that does not come back: which one, and at which line it is.
 
-Simulated time stands still while a callback runs, so one that loops for ever would hang a run in
+Simulated time stands still while a callback runs, so one that loops forever would hang a run in
 silence. A thread looks every two seconds of real time whether anything has happened.
 
 It must leave no mark. So it takes no part in the run, touches nothing but numbers as long as all
@@ -30,7 +30,7 @@ LOOK_EVERY_S = 2.0
 _LOOKS_BEFORE_NOTE = 5
 _LOOKS_BETWEEN_NOTES = 30
 _LOOKS_MAX = 250
-"""Longer is not counted. (Python keeps one object of each number up to this for ever.)"""
+"""Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
 _JOIN_S = 1.0
 _DISPATCHER = os.path.join("rsltrace", "middleware", "dispatcher.py")

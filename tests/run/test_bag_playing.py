@@ -119,7 +119,7 @@ def test_a_bag_plays_several_times_or_for_ever(play: Any, tmp_path: Path) -> Non
 
 def test_a_bag_that_plays_for_ever_needs_an_end(play: Any, tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(3))
-    with pytest.raises(JobError, match=r"job\.yaml:1:29: bags\[0\]\.loop: plays for ever"):
+    with pytest.raises(JobError, match=r"job\.yaml:1:29: bags\[0\]\.loop: plays forever"):
         play("bags: [{path: a.mcap, loop: true}]")
 
 

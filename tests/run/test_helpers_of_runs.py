@@ -147,7 +147,7 @@ def test_a_node_may_watch_the_progress(bag: Path, tmp_path: Path) -> None:
 def test_progress_that_cannot_be(bag: Path) -> None:
     with pytest.raises(JobError, match="there are no bags"):
         Job(nodes=[NodeSpec(node="a:b")], progress="/p")
-    with pytest.raises(JobError, match="for ever makes no progress"):
+    with pytest.raises(JobError, match="plays forever makes no progress"):
         Job(bags=[BagSpec(path=bag, loop=True)], progress="/p", stop=StopSpec(duration="1s"))
     with open_bag(bag) as opened:
         assert opened.end_ns == 140 * 10**9

@@ -442,7 +442,7 @@ def test_clear_errors(simulate: Any, tmp_path: Path) -> None:
     with pytest.raises(RunError, match="when its block has been left"):
         _ = sim.result
     with sim:
-        with pytest.raises(RunError, match="no node named lisener; did you mean /listener"):
+        with pytest.raises(RunError, match="no node named lisener; did you mean '/listener'"):
             sim.node("lisener")
         with pytest.raises(RunError, match="/numbers carries std_msgs/msg/UInt64, not std_msgs"):
             sim.publish("/numbers", String(data="x"))

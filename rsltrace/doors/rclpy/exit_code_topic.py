@@ -6,8 +6,7 @@ from typing import Any, Protocol
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import class_of
-from rsltrace.errors import JobError
-from rsltrace.job.values.problem import nearest
+from rsltrace.errors import JobError, nearest
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.middleware.publisher import Publisher

@@ -113,13 +113,13 @@ class BagSpec(Part):
     start_offset_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="start_offset",
-        description="Leave out so much of the beginning, from the bag's first message on.",
+        description="Skip this much of the beginning, counted from the bag's first message.",
         examples=["5s"],
     )
     duration_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="duration",
-        description="Play only so much of the bag, in recorded time, from there on.",
+        description="Play only this much of the bag from there on, in recorded time.",
         examples=["30s"],
     )
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -136,8 +136,8 @@ class BagSpec(Part):
     )
     loop: Annotated[bool | int, check(_check_loop)] = Field(
         default=False,
-        description="How often it plays; `true` is for ever, which needs a `stop`. Each pass "
-        "begins when the last message of the one before plays.",
+        description="How many times it plays; `true` means forever, which needs a `stop`. Each "
+        "pass begins when the last message of the pass before it plays.",
         examples=[True, 3],
     )
     by: Annotated[

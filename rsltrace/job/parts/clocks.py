@@ -63,7 +63,7 @@ attach(parse_ppm, schema={"anyOf": [{"type": "number"}, {"type": "string", "patt
 
 
 class JumpSpec(Part):
-    """A clock is set: by so much, at some time."""
+    """A clock is set: when, and by how much."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "by": "by_ns"}
     LISTED: ClassVar[tuple[str, ...]] = ("at", "by")

@@ -113,10 +113,10 @@ class OutageSpec(Part):
         default=None, description="Node that is cut off, a glob.", examples=["/lidar"]
     )
     from_ns: Annotated[int, check(parse_time)] = Field(
-        alias="from", description="Begin, since the start of the run.", examples=["10s"]
+        alias="from", description="When it begins, since the start of the run.", examples=["10s"]
     )
     to_ns: Annotated[int, check(parse_time)] = Field(
-        alias="to", description="End, since the start of the run.", examples=["12s"]
+        alias="to", description="When it ends, since the start of the run.", examples=["12s"]
     )
 
     @model_validator(mode="after")

@@ -21,7 +21,7 @@ def _module_glob(value: str) -> None:
 
 
 class SourceSpec(Part):
-    """What is done about one source, and the modules (globs) that may use it all the same."""
+    """What is done about one source, and the modules (globs) that may use it nevertheless."""
 
     mode: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
@@ -31,7 +31,7 @@ class SourceSpec(Part):
     )
     allow: Annotated[tuple[str, ...], check(items(text(_module_glob)))] = Field(
         default=(),
-        description="Modules, globs, that may use the source all the same.",
+        description="Modules that may use the source nevertheless, globs.",
         examples=[["my_robot.logging", "rerun.*"]],
     )
 

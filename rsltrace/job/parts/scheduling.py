@@ -7,12 +7,13 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
+from rsltrace.errors import nearest
 from rsltrace.job.parts.distribution import DistributionSpec
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import check, items, named_parts, one_of, part, parts, text, whole
 from rsltrace.job.values.names import check_node_glob
 from rsltrace.job.values.paths import check_path
-from rsltrace.job.values.problem import Problem, describe, meant_by, nearest
+from rsltrace.job.values.problem import Problem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
 
 ORDERS = ("fifo", "rate_monotonic", "permutation")
@@ -86,7 +87,7 @@ class PolicySpec(Part):
 
 
 class ExecutorSpec(Part):
-    """A simulated executor: so many workers for some nodes."""
+    """A simulated executor: a number of workers for some nodes."""
 
     nodes: Annotated[tuple[str, ...], check(items(text(check_node_glob)))] = Field(
         default=("*",), description="Its nodes, globs.", examples=[["/camera", "/detector"]]

@@ -42,7 +42,7 @@ class StopSpec(Part):
     duration_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="duration",
-        description="After so much simulated time, what is due then included.",
+        description="After this much simulated time, including what is due then.",
         examples=["60s"],
     )
     time_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -51,11 +51,11 @@ class StopSpec(Part):
     timeout_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="timeout",
-        description="After so much simulated time, as a failure: with exit status 1.",
+        description="After this much simulated time, as a failure: with exit status 1.",
         examples=["120s"],
     )
     events: Annotated[int | None, check(whole(1), optional=True)] = Field(
-        default=None, description="After so many events.", examples=[100000]
+        default=None, description="After this many events.", examples=[100000]
     )
     topic: Annotated[TopicStop | None, part("name")] = Field(
         default=None,
@@ -71,14 +71,14 @@ class StopSpec(Part):
     quiescence_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="quiescence",
-        description="When nothing has been published for so long.",
+        description="When nothing has been published for this long.",
         examples=["2s"],
     )
 
     size: Annotated[int | None, check(parse_size, optional=True)] = Field(
         default=None,
-        description="When the trace's file has become so large (checked between time steps; what "
-        "is still in memory comes on top).",
+        description="When the file of the trace has reached this size (checked between time steps; "
+        "what is still in memory is not counted).",
         examples=["500MiB"],
     )
 

@@ -6,6 +6,7 @@ import re
 
 from pydantic import BaseModel, ValidationError
 
+from rsltrace.errors import nearest
 from rsltrace.job.parts.keys import field_at, file_fields, models_in
 from rsltrace.job.values.problem import (
     Loc,
@@ -15,7 +16,6 @@ from rsltrace.job.values.problem import (
     describe,
     format_loc,
     meant_by,
-    nearest,
     unknown_key,
 )
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, nearest
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import file_fields, keys_with
 from rsltrace.job.parts.validation import worded_problems
@@ -18,7 +18,7 @@ from rsltrace.job.reading.compose import Composition, compose
 from rsltrace.job.reading.tree import place_at, plain
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
 from rsltrace.job.values.checks import FROM_FILE
-from rsltrace.job.values.problem import Problem, format_loc, nearest, unknown_key
+from rsltrace.job.values.problem import Problem, format_loc, unknown_key
 
 Overrides = Sequence["str | tuple[str, str]"]
 

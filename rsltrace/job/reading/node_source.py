@@ -6,7 +6,6 @@ Nothing is imported: modules are looked up as Python would, and their text is re
 from __future__ import annotations
 
 import ast
-import difflib
 import os
 import sys
 from dataclasses import dataclass
@@ -14,7 +13,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job.values.names import check_node_name, check_target
 
 _DECLARE_ONE = "declare_parameter"
@@ -54,9 +53,7 @@ def look_up(target: str, folders: list[Path]) -> Found:
     if body is None:
         names = sorted(_top_names(tree))
         if name not in names:
-            close = difflib.get_close_matches(name, names, n=1)
-            hint = f"; did you mean {close[0]!r}?" if close else ""
-            raise JobError(f"{target}: {file} has no {name!r}{hint}")
+            raise JobError(f"{target}: {file} has no {name!r}{did_you_mean(name, names)}")
     if body is None:
         return Found(target, folder, {})
     return Found(target, folder, _parameters(body), _node_name(body), _is_main(body))

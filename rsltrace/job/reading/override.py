@@ -5,11 +5,11 @@ An override is YAML with its path written in front, so its mistakes are shown in
 
 from __future__ import annotations
 
-import difflib
 import re
 from dataclasses import dataclass, replace
 from typing import Any
 
+from rsltrace.errors import did_you_mean
 from rsltrace.job.job import Job
 from rsltrace.job.parts.keys import is_list_at, shorthand_at, without_alternatives
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
@@ -147,10 +147,8 @@ def _index(items: list[Item], step: _Step, name: str) -> int:
             f"{step.text!r} is more than one of {name}: give a number, {numbers}"
         )
     names = [key for key, _ in named]
-    close = difflib.get_close_matches(step.text, names, n=1)
-    hint = f"did you mean {close[0]!r}?" if close else "give a number, counted from 0"
-    if not close and names:
-        hint += f", or one of {', '.join(dict.fromkeys(names))}"
+    or_name = f", or one of {', '.join(dict.fromkeys(names))}" if names else ""
+    hint = did_you_mean(step.text, names, f"give a number, counted from 0{or_name}")
     raise step.place.error(f"{name} has no entry {step.text!r}: {hint}")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, did_you_mean, nearest
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, bare_value
 
 SUBSTITUTIONS = {
@@ -121,14 +121,8 @@ class Substitution:
         found = self._variables.get(name)
         if found is None:
             names = sorted(str(key) for key in self._variables)
-            close = difflib.get_close_matches(name, names, n=1)
-            hint = (
-                f"did you mean {close[0]!r}?"
-                if close
-                else f"there are {', '.join(names)}"
-                if names
-                else f"write it below 'vars:', or give --set vars.{name}=..."
-            )
+            there = f"write it below 'vars:', or give --set vars.{name}=..."
+            hint = did_you_mean(name, names, f"there are {', '.join(names)}" if names else there)
             raise _error(item, written, f"there is no variable {name!r}: {hint}")
         if name in self._open:
             cycle = " -> ".join([*self._open[self._open.index(name) :], name])
@@ -161,9 +155,9 @@ def _closing(text: str, start: int) -> int | None:
 def _unknown(written: str, name: str) -> str:
     if name in _NOT_HERE:
         return f"{written}: {_NOT_HERE[name]}"
-    close = difflib.get_close_matches(name, SUBSTITUTIONS, n=1)
+    near = nearest(name, SUBSTITUTIONS)
     known = ", ".join(f"$({form})" for form in SUBSTITUTIONS.values())
-    hint = f"did you mean $({SUBSTITUTIONS[close[0]]})?" if close else f"there are {known}"
+    hint = f"did you mean $({SUBSTITUTIONS[near]})?" if near else f"there are {known}"
     return f"{written} is no substitution; {hint} (for plain text write \\$( )"
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Callable, Iterable
 from decimal import Decimal, InvalidOperation
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ValidationInfo
 
+from rsltrace.errors import nearest
 from rsltrace.job.values.names import check_glob
 from rsltrace.job.values.problem import Collected, Problem, as_flag, describe
 from rsltrace.job.values.times import TIME_SCHEMA, parse_time
@@ -155,8 +155,8 @@ def one_of(*choices: str) -> Callable[[Any], str]:
 
     def function(value: object) -> str:
         if not isinstance(value, str) or value not in choices:
-            close = difflib.get_close_matches(str(value).lower(), choices, n=1)
-            hint = f"; did you mean {close[0]}?" if close and len(choices) > 2 else ""
+            near = nearest(str(value).lower(), choices) if len(choices) > 2 else None
+            hint = f"; did you mean {near}?" if near else ""
             raise Problem(f"expected {' or '.join(choices)}, got {describe(value)}{hint}")
         return str(value)
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 from pathlib import Path
 
+from rsltrace.errors import nearest
 from rsltrace.job.values.checks import attach, text
 from rsltrace.job.values.problem import Problem
 
@@ -52,5 +52,5 @@ def near_path(full: Path, path: str, *, but: str = "") -> str:
     if not full.parent.is_dir():
         return f" (there is no folder {folder!r} either)"
     names = sorted(entry.name for entry in full.parent.iterdir() if entry.name != but)
-    close = difflib.get_close_matches(full.name, names, n=1)
-    return f"; did you mean {os.path.join(folder, close[0])!r}?" if close else ""
+    near = nearest(full.name, names)
+    return f"; did you mean {os.path.join(folder, near)!r}?" if near else ""

@@ -5,9 +5,10 @@ Checks raise ``Problem`` (a ``ValueError``, so pydantic collects it with its own
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+
+from rsltrace.errors import nearest
 
 Loc = tuple["str | int", ...]
 """A place in a job as keys and list indices: ``("nodes", 0, "name")``."""
@@ -74,14 +75,6 @@ def describe(value: object) -> str:
     if isinstance(value, (list, tuple)):
         return "a list"
     return f"an object of {type(value).__name__}"
-
-
-def nearest(word: str, names: Iterable[str]) -> str | None:
-    """Return the name that ``word`` was most probably meant to be: one of the same letters, or
-    the most similar one; None if none is near."""
-    close = difflib.get_close_matches(word, list(names), n=3)
-    swapped = [name for name in close if sorted(name) == sorted(word)]
-    return next(iter([*swapped, *close]), None)
 
 
 _BY_NAME = ("topics", "nodes")

@@ -31,7 +31,7 @@ PLAYER = "rosbag2_player"
 _ACTION = "/_action/"
 _SERVICE_EVENT = "/_service_event"
 _LONG_GAP_NS = 3600 * NS_PER_S
-"""No robot is silent for so long in the middle of a run: the bags are from different days."""
+"""No robot is silent for that long in the middle of a run: the bags are from different days."""
 
 
 @dataclass(frozen=True)
@@ -259,7 +259,7 @@ def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, 
 def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
     """Return when the first bag begins to play, and when the last one ends."""
     ends = [entry.playback.end_ns for entry in bags]
-    assert all(end is not None for end in ends), "a job with a bag for ever has no progress"
+    assert all(end is not None for end in ends), "a bag that plays forever has no progress"
     return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from inspect import Parameter
 from typing import Any
@@ -11,12 +11,11 @@ from typing import Any
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.doors.rclpy.entry import Entry, ros_arguments
 from rsltrace.doors.rclpy.hints import parameter_in
-from rsltrace.errors import JobError, RunError
-from rsltrace.job import Job, locate, policy_of, showing_line
-from rsltrace.job.values.problem import Loc, nearest
+from rsltrace.errors import JobError, RunError, did_you_mean
+from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
+from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import Mains
-from rsltrace.run.plans.guarding import entry_key
 from rsltrace.run.plans.target import load_target
 
 _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
@@ -91,9 +90,8 @@ def _check_arguments(job: Job, index: int, target: Any) -> None:
     takes_any = any(one.kind is one.VAR_KEYWORD for one in signature.parameters.values())
     for name in spec.arguments:
         if name not in names and not takes_any:
-            near = nearest(name, names)
             takes = f"it takes {', '.join(names)}" if names else "it takes none"
-            hint = f"did you mean {near!r}?" if near else takes
+            hint = did_you_mean(name, names, takes)
             wrong = f"{spec.target} takes no argument {name!r}: {hint}"
             raise _shown(job, ("nodes", index, "arguments", name), wrong)
     try:
@@ -109,6 +107,17 @@ def _shown(job: Job, loc: Loc, message: str) -> JobError:
             raise JobError(message, where=locate(job, loc))
     except JobError as error:
         return error
+
+
+def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
+    """Return a name for an entry that other entries (of other classes) do not change."""
+
+    def own(other: NodeSpec) -> tuple[str, str | None, str | None]:
+        return other.target, other.namespace, other.name
+
+    same = sum(1 for other in before if own(other) == own(spec))
+    name = " ".join(part for part in own(spec) if part)
+    return f"{name} #{same + 1}" if same else name
 
 
 def say_where(job: Job, entry: Entry, error: RunError | None) -> None:

@@ -7,7 +7,6 @@ are, in this process.
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 import sys
@@ -18,7 +17,7 @@ from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, nearest
 from rsltrace.job import NodeSpec
 from rsltrace.run.plans.target import load_target
 
@@ -182,8 +181,8 @@ def _packages() -> set[str]:
 
 
 def _near(name: str, names: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, sorted(names), n=1)
-    return f"; did you mean {close[0]!r}?" if close and close[0] != name else ""
+    near = nearest(name, sorted(names))
+    return f"; did you mean {near!r}?" if near not in (None, name) else ""
 
 
 def _python_script(path: Path, target: str, where: str) -> str:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from typing import Any
 
 from rsltrace.doors.rclpy.hints import cannot_import, import_raised
-from rsltrace.errors import JobError, RsltraceError
+from rsltrace.errors import JobError, RsltraceError, did_you_mean
 from rsltrace.middleware.failure import text_of
 
 
@@ -35,9 +34,7 @@ def load_target(target: str, *, where: str) -> Any:
         try:
             value = getattr(value, part)
         except AttributeError as error:
-            near = [name for name in dir(value) if not name.startswith("_")]
-            guess = difflib.get_close_matches(part, near, n=1)
-            hint = f"; did you mean {guess[0]!r}?" if guess else ""
+            hint = did_you_mean(part, (n for n in dir(value) if not n.startswith("_")))
             raise JobError(
                 f"module {module_name!r} has no {attribute!r}{hint}", where=where
             ) from error

@@ -43,7 +43,7 @@ class Place:
     alias: ast.expr | None = None
 
 
-def look(module: Module, names: Names, *, as_script: bool = False) -> Iterator[Place]:
+def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iterator[Place]:
     """Yield what is found in a module; ``as_script``: its ``if __name__ == "__main__"`` runs."""
     skipped = set() if as_script else set(_never_run(module))
     seeded = _seeded(module, names)

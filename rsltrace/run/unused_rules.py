@@ -6,19 +6,19 @@ nodes create later than a run lasts are not seen, so these are notes, no errors.
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 
 from rsltrace.chance.network import QUIET_TOPICS, NetworkPlan
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.doors.rclpy.parameters import Parameters
+from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.census import Census
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
-from rsltrace.run.plans.guarding import entry_key
+from rsltrace.run.plans.entries import entry_key
 from rsltrace.run.unused_remappings import has_remappings, unused_remappings
 
 
@@ -94,7 +94,7 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
                 continue
             declared = [other for found in given.values() for other in found.declared]
             where = spec.origin or locate(job, ("nodes", index, "parameters", name))
-            near = _near(name, declared)
+            near = did_you_mean(name, declared)
             who = ", ".join(given)
             yield (
                 f"{where}: {who} has not declared the parameter {name!r}, so it has no effect{near}"
@@ -118,7 +118,7 @@ def unused_ros_parameters(job: Job, census: Census, nodes: dict[str, Parameters]
         who_gets = [node for node, found in given.items() if found]
         if any(node not in nodes or name in nodes[node].declared for node in who_gets):
             continue
-        near = _near(name, [other for node in who_gets for other in nodes[node].declared])
+        near = did_you_mean(name, [other for node in who_gets for other in nodes[node].declared])
         who = ", ".join(who_gets[:3]) + (", …" if len(who_gets) > 3 else "")
         yield f"{place}: {who} has not declared the parameter {name!r}, so it has no effect{near}"
 
@@ -171,7 +171,7 @@ def _links(job: Job, census: Census) -> Iterator[str]:
         ):
             there = [node for node, topic in ends if fnmatchcase(topic, link.topic)]
             if not _fits(glob, there):
-                near = _near(glob, there) or _there(there)
+                near = did_you_mean(glob, there) or _there(there)
                 yield (
                     f"{locate(job, (*place, key))}: no node that fits {glob!r} {what} "
                     f"{link.topic!r}{near}"
@@ -194,7 +194,7 @@ def _entities(job: Job, census: Census) -> Iterator[str]:
         elif entity is not None:
             names = [name for owner, name in census.entities if fnmatchcase(owner, node)]
             if not _fits(entity, names):
-                near = _near(entity, names) or _there(names)
+                near = did_you_mean(entity, names) or _there(names)
                 yield (
                     f"{locate(job, (*place, key))}: no topic, service or timer's callback of "
                     f"{node!r} fits {entity!r}{near}"
@@ -223,12 +223,7 @@ def _note(job: Job, place: Loc, what: str, glob: str, names: list[str]) -> str:
 
 
 def _instead(name: str, names: list[str]) -> str:
-    return _near(name, names) or _there(names)
-
-
-def _near(name: str, names: Iterable[str]) -> str:
-    close = difflib.get_close_matches(name, list(dict.fromkeys(names)), n=1)
-    return f"; did you mean {close[0]!r}?" if close else ""
+    return did_you_mean(name, names) or _there(names)
 
 
 def _there(names: Iterable[str]) -> str:

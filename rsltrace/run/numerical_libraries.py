@@ -20,7 +20,7 @@ _LIBRARIES = frozenset(
 )
 
 
-def numerics(job: Job) -> str:
+def numerical_libraries(job: Job) -> str:
     """Return the libraries with version and kernel, or an empty text if the job uses none.
 
     The nodes' modules are imported already. What a function imports later is not seen.

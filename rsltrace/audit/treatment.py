@@ -1,4 +1,4 @@
-"""What the guard does about a place in the sources: the job's, or that of the node that gets there.
+"""What the guard does about a place in the sources: the job's, or that of the node that runs it.
 
 A node may have a ``guard:`` of its own. Code at the top of a module runs under the job's, since no
 node is there yet; what stands in a node's class runs under the node's; any other function under
@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rsltrace.audit.calls import Place
 from rsltrace.audit.files import SourceFile, collect_modules
-from rsltrace.audit.look import Place
 from rsltrace.audit.model import Treatment
 from rsltrace.audit.rules import allowed
 from rsltrace.audit.scopes import Scope
@@ -43,7 +43,7 @@ class _Group:
     files: frozenset[Path] = frozenset()
 
 
-class Treating:
+class GuardTreatment:
     """Says what is done about a place. ``policy`` is the job's, None if it has no guard at all."""
 
     def __init__(self, policy: Policy | None, groups: Sequence[_Group] = ()) -> None:
@@ -51,7 +51,9 @@ class Treating:
         self._groups = groups
 
     @classmethod
-    def of_job(cls, job: Job, targets: Sequence[str | Path], folders: Sequence[Path]) -> Treating:
+    def of_job(
+        cls, job: Job, targets: Sequence[str | Path], folders: Sequence[Path]
+    ) -> GuardTreatment:
         """Return what the guards of a job and its nodes do; ``targets`` are those of the nodes."""
         if not job.guard.enabled:
             return cls(None)
@@ -74,7 +76,7 @@ class Treating:
             group.files = frozenset(one.path.resolve() for one in reached.files.values())
         return cls(of_job, groups)
 
-    def done(self, source: SourceFile, place: Place) -> tuple[Treatment, str]:
+    def of(self, source: SourceFile, place: Place) -> tuple[Treatment, str]:
         """Return the treatment of a place, and what that means; of several, the least safe."""
         groups = self._that_get_to(source, place)
         if not groups:

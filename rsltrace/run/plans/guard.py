@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.world import World
 
 
-class Guarding:
+class RunGuard:
     """The guard of one run; without one (``guard: false``) everything here does nothing."""
 
     def __init__(self, job: Job, stack: ExitStack) -> None:
@@ -126,9 +126,9 @@ class Guarding:
         return nullcontext() if self.guard is None else engage(self.guard)
 
 
-def guarding(stack: ExitStack, job: Job) -> Guarding:
+def install_guard(stack: ExitStack, job: Job) -> RunGuard:
     """Put the replacements in place until ``stack`` ends."""
-    made = Guarding(job, stack)
+    made = RunGuard(job, stack)
     if job.guard.enabled:
         if job.guard.pins:
             stack.enter_context(pinned_place())
@@ -141,22 +141,8 @@ def guarding(stack: ExitStack, job: Job) -> Guarding:
     return made
 
 
-def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
-    """Return a name for an entry that other entries (of other classes) do not change."""
-
-    def own(other: NodeSpec) -> tuple[str, str | None, str | None]:
-        return other.target, other.namespace, other.name
-
-    same = sum(1 for other in before if own(other) == own(spec))
-    name = " ".join(part for part in own(spec) if part)
-    return f"{name} #{same + 1}" if same else name
-
-
 def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
     return frozenset(re.split("[:./]", spec.target)[0] for spec in nodes) - {
         "rsltrace",
         "rclpy",
     }
-
-
-__all__ = ["Guarding", "entry_key", "guarding"]
