@@ -30,7 +30,7 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
     lines += _fields(diff)
     if not diff.identical:
         report = report_lines(diff, options)
-        lines += ["<details><summary>Full report</summary>", "", *_code(plain_text(report))]
+        lines += ["<details><summary>Full report</summary>", "", *code_block(plain_text(report))]
         lines += ["", "</details>", ""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -108,7 +108,8 @@ def _code_span(text: str) -> str:
     return f"`{printable(text).replace('`', chr(39))}`"
 
 
-def _code(text: str) -> list[str]:
+def code_block(text: str) -> list[str]:
+    """Return text as the lines of a block of code, which it cannot end."""
     longest = max((len(run) for run in _FENCE.findall(text)), default=2)
     fence = "`" * (longest + 1)
     return [f"{fence}text", text.rstrip("\n"), fence]

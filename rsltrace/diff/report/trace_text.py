@@ -8,17 +8,13 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
-    BAD,
     BLANK,
-    FAINT,
     HEIGHT,
     NOTHING,
-    SIDE_A,
-    SIDE_B,
-    TITLE,
     Line,
     Piece,
     Section,
+    Style,
     cut,
     fitted,
     in_columns,
@@ -58,8 +54,11 @@ def trace_report(
         return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
     lines = fitted(head, [*sections, _next(first, 0)], None)
     for number, other in enumerate(others, start=2):
-        lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
-        lines += wrapped(as_sentence(other.sentence), width, style=BAD)
+        lines += [
+            BLANK,
+            line((f"independent divergence {number}: {other.verdict.value}", Style.TITLE)),
+        ]
+        lines += wrapped(as_sentence(other.sentence), width, style=Style.BAD)
         lines += fitted([], [*divergence_sections(other, width, options), _next(other, 0)], None)
     return lines
 
@@ -83,7 +82,7 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     else:
         said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)
         text = f"not within tolerance: {said}"
-    return wrapped(f"  {text}", width, style=TITLE, indent="    ")
+    return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
 
 def _facts(side: Side) -> list[Piece]:
@@ -93,7 +92,7 @@ def _facts(side: Side) -> list[Piece]:
         (f"{side.events} events", ""),
         (f"{format_seconds(side.end_ns)} s", ""),
         (f"digest {side.digest}", ""),
-        (printable(ended), FAINT),
+        (printable(ended), Style.FAINT),
     ]
 
 
@@ -130,16 +129,16 @@ def _settings(diff: Diff, width: int) -> Section:
         [
             [
                 (printable(str(setting)), ""),
-                (a, SIDE_A),
-                ("|", FAINT),
-                (b, SIDE_B),
+                (a, Style.SIDE_A),
+                ("|", Style.FAINT),
+                (b, Style.SIDE_B),
             ]
             for setting in diff.settings
             for a, b in [_values(setting, room)]
         ],
         widest=max(room, 34),
     )
-    title: Piece = ("job and environment differ", TITLE)
+    title: Piece = ("job and environment differ", Style.TITLE)
     if len(rows) == 1:
         (row,) = rows
         return Section((), [cut(line(title, ": ", *row[1:]), width)], 1, "settings")
