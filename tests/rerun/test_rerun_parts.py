@@ -23,8 +23,8 @@ from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
 from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
 from rsltrace_viewer.rerun_export.messages.tracks import Track
 
-from rsltrace.diff.result.divergence import Verdict
 from rsltrace.diff.result.traces import Diff, Side
+from rsltrace.diff.result.verdicts import Verdict
 
 S = 1_000_000_000
 

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from rsltrace.diff.report.events import event_text
 from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.divergence import ENDED_BY_EXCEPTION
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -38,6 +38,12 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
     return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
 
 
+def how_many_diverge(diffs: Sequence[Diff | BagDiff]) -> str:
+    """Return ``2 of 3 runs diverge``."""
+    count = sum(diff.diverged for diff in diffs)
+    return f"{count} of {len(diffs)} runs diverge{'s' if count == 1 else ''}"
+
+
 def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     """Return the table of several runs, with a sentence that counts them first.
 
@@ -46,7 +52,7 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     diverged = sum(diff.diverged for diff in diffs)
     golden = printable(diffs[0].a.path)
     if diverged:
-        sentence = f"{diverged} of {len(diffs)} runs diverge from {golden}."
+        sentence = f"{how_many_diverge(diffs)} from {golden}."
     else:
         near = sum(diff.within_tolerance for diff in diffs)
         within = f", {near} of them within tolerance" if near else ""

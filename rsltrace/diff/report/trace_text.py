@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from itertools import takewhile
+from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
     BLANK,
@@ -21,11 +21,13 @@ from rsltrace.diff.report.line import (
     line,
     wrapped,
 )
-from rsltrace.diff.result.divergence import Divergence
 from rsltrace.diff.result.traces import Diff, Setting, Side
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import as_sentence
+
+if TYPE_CHECKING:
+    from rsltrace.diff.result.divergence import Divergence
 
 _ALIKE_SHOWN = 12
 _ALL_HINT = "--all shows them"
@@ -41,6 +43,9 @@ def trace_report(
     before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
     if not diff.divergences:
         return fitted(head, [before, _settings(diff, width)], None)
+    # Most runs are identical: their report loads no more than this.
+    from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
+
     first, *others = diff.divergences
     sections = [
         before,
