@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from rsltrace.diff.bags.comparison import diff_bags
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.result.bags import BagDiff
-    from rsltrace.diff.result.divergence import Verdict
     from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result.verdicts import Verdict
     from rsltrace.errors import RsltraceError
     from rsltrace.job import (
         BagSpec,

@@ -268,16 +268,16 @@ def _show(lines: list[Line]) -> None:
     from rich.console import Console
     from rich.text import Text
 
-    from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
+    from rsltrace.diff.report.line import Style
 
     styles = {
-        TITLE: "bold",
-        GOOD: "bold green",
-        BAD: "bold red",
-        SIDE_A: "cyan",
-        SIDE_B: "magenta",
-        FAINT: "dim",
-        COMMAND: "bold",
+        Style.TITLE: "bold",
+        Style.GOOD: "bold green",
+        Style.BAD: "bold red",
+        Style.SIDE_A: "cyan",
+        Style.SIDE_B: "magenta",
+        Style.FAINT: "dim",
+        Style.COMMAND: "bold",
     }
     console = Console(highlight=False, soft_wrap=True)
     for row in lines:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
-from rsltrace.words.entities import EntityKey
+
+if TYPE_CHECKING:
+    from rsltrace.words.entities import EntityKey
 
 
 def event_title(kind: EventKind, entity: EntityKey) -> str:

@@ -121,7 +121,7 @@ def test_several_runs_make_a_table(diff: Callable[..., Done]) -> None:
     done = diff(A, A, B)
     assert done.returncode == 1
     lines = done.stdout.splitlines()
-    assert lines[0] == f"1 of 2 runs diverge from {A}."
+    assert lines[0] == f"1 of 2 runs diverges from {A}."
     assert lines[2].split() == ["run", "verdict", "event", "time", "where"]
     assert lines[3].split()[:2] == [str(A), "identical"]
     row = f"{B} same-input-different-output 64 2.100000000 /obstacle_filter: subscription /scan"

@@ -12,8 +12,8 @@ import pytest
 from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
 
 import rsltrace
-from rsltrace.diff.result.divergence import Root, Verdict
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventKind, OutputKind

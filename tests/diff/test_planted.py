@@ -21,8 +21,8 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.causes.propagation import Propagation
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import Verdict
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace

@@ -12,8 +12,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 import rsltrace
-from rsltrace.diff.result.divergence import Root, Verdict
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import Root, Verdict
 
 pytestmark = pytest.mark.ros
 

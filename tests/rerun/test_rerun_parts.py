@@ -23,8 +23,8 @@ from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
 from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
 from rsltrace_viewer.rerun_export.messages.tracks import Track
 
-from rsltrace.diff.result.divergence import Verdict
 from rsltrace.diff.result.traces import Diff, Side
+from rsltrace.diff.result.verdicts import Verdict
 
 S = 1_000_000_000
 
@@ -196,10 +196,9 @@ def test_lists_are_cut_by_their_counts() -> None:
 
 
 def test_texts_of_a_trace_are_no_markdown() -> None:
-    side = Side("a|b.mcap", "0" * 16, 1, 2, True)
-    diff = Diff(side, side, Verdict.SCHEDULE, "*bold* <b>\x1b[31m\n# title", 1)
-    text = document(diff)
-    assert "\\*bold\\* \\<b\\>" in text
-    assert "\x1b" not in text
-    assert "a\\|b.mcap" in text
-    assert "\n# title" not in text
+    side = Side("a```.mcap", "0" * 16, 1, 2, True)
+    diff = Diff(side, side, Verdict.SCHEDULE, "*bold* <b>\x1b[31m\n# title\n```", 1)
+    title, _, fence, *lines, end = document(diff).splitlines()
+    assert (title, fence, end) == ("# schedule", "````text", "````")
+    assert "a```.mcap" in "\n".join(lines)
+    assert not any(line.startswith(("#", "````")) or "\x1b" in line for line in lines)

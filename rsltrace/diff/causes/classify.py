@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 from rsltrace.diff.causes.event_views import CLOCK_OF, phrase, raised
 from rsltrace.diff.causes.propagation import NODE
-from rsltrace.diff.result.divergence import MessageDifference, Root, Verdict
+from rsltrace.diff.result.divergence import MessageDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 from rsltrace.words.phrases import at_time

@@ -21,11 +21,10 @@ from rsltrace.diff.result.divergence import (
     Divergence,
     MessageDifference,
     Reach,
-    Root,
-    Verdict,
 )
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 

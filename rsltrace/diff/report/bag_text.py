@@ -6,16 +6,12 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import payload_lines
 from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
-    BAD,
-    FAINT,
     HEIGHT,
     NOTHING,
-    SIDE_A,
-    SIDE_B,
-    TITLE,
     Line,
     Piece,
     Section,
+    Style,
     cut,
     fitted,
     in_columns,
@@ -62,7 +58,7 @@ def _facts(side: Recording) -> list[Piece]:
         (printable(side.kind), ""),
         (f"{side.messages} messages", ""),
         (format_duration(side.end_ns - side.start_ns), ""),
-        ("" if side.complete else "cut off", FAINT),
+        ("" if side.complete else "cut off", Style.FAINT),
     ]
 
 
@@ -70,9 +66,9 @@ def _message(found: MessageDivergence, width: int) -> Section:
     title = f"{printable(found.topic)} ({printable(found.type)})"
     rows: list[Line] = []
     cells = []
-    for name, style, message in (("a", SIDE_A, found.a), ("b", SIDE_B, found.b)):
+    for name, style, message in (("a", Style.SIDE_A, found.a), ("b", Style.SIDE_B, found.b)):
         if message is None:
-            cells.append([(name, style), ("nothing here", FAINT)])
+            cells.append([(name, style), ("nothing here", Style.FAINT)])
         else:
             time = f"log time {format_seconds(message.stamp_ns)} s"
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])
@@ -80,7 +76,7 @@ def _message(found: MessageDivergence, width: int) -> Section:
     only = None if found.presence is Presence.BOTH else found.a or found.b
     preview = only.preview if only is not None else ""
     rows += payload_lines(found.fields, found.more_fields, preview, found.reason, width)
-    return Section(line((title, TITLE)), rows, 14, "lines", least=6)
+    return Section(line((title, Style.TITLE)), rows, 14, "lines", least=6)
 
 
 def _before(found: MessageDivergence, width: int) -> Section:
@@ -88,18 +84,20 @@ def _before(found: MessageDivergence, width: int) -> Section:
         return NOTHING
     side = "a" if found.a is not None else "b"
     rows = [cut(_brief(message), width) for message in found.before]
-    title = line((f"before it on {printable(found.topic)}", TITLE), (f" (of {side})", FAINT))
+    title = line(
+        (f"before it on {printable(found.topic)}", Style.TITLE), (f" (of {side})", Style.FAINT)
+    )
     return Section(title, rows, 1, "messages", least=0, drop="first")
 
 
 def _brief(message: BagMessage) -> Line:
     head = f"  {message.index}  {format_seconds(message.stamp_ns)}  "
-    return line((head, FAINT), printable(message.preview))
+    return line((head, Style.FAINT), printable(message.preview))
 
 
 def _topics(diff: BagDiff, width: int) -> Section:
     names = ("equal", "tolerated", "differ", "only a", "only b", "first at")
-    header: list[Piece] = [("topic", FAINT), *((name, FAINT) for name in names)]
+    header: list[Piece] = [("topic", Style.FAINT), *((name, Style.FAINT) for name in names)]
     shared = sorted(diff.topics, key=_first_place)
     cells = [header, *(_topic_cells(topic) for topic in shared)]
     for lone, at in ((diff.topics_only_a, 4), (diff.topics_only_b, 5)):
@@ -115,16 +113,20 @@ def _first_place(topic: TopicDiff) -> tuple[bool, int]:
 def _topic_cells(topic: TopicDiff) -> list[Piece]:
     counts = (topic.equal, topic.tolerated, topic.differing, topic.only_a, topic.only_b)
     when = f"{format_seconds(topic.first.after_ns)} s" if topic.first is not None else ""
-    style = BAD if topic.diverged else ""
+    style = Style.BAD if topic.diverged else ""
     return [
         (printable(topic.topic), style),
-        *((str(count), "" if count else FAINT) for count in counts),
+        *((str(count), "" if count else Style.FAINT) for count in counts),
         (when, ""),
     ]
 
 
 def _lone_cells(topic: LoneTopic, at: int) -> list[Piece]:
-    cells: list[Piece] = [(printable(topic.topic), BAD), *[("0", FAINT)] * 5, ("no such topic", "")]
+    cells: list[Piece] = [
+        (printable(topic.topic), Style.BAD),
+        *[("0", Style.FAINT)] * 5,
+        ("no such topic", ""),
+    ]
     cells[at] = (str(topic.messages), "")
     cells[-1] = (f"only in {'a' if at == 4 else 'b'}", "")
     return cells

@@ -4,17 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.report.line import (
-    FAINT,
-    SIDE_A,
-    SIDE_B,
-    Line,
-    Piece,
-    cut,
-    in_columns,
-    line,
-    wrapped,
-)
+from rsltrace.diff.report.line import Line, Piece, Style, cut, in_columns, line, wrapped
 from rsltrace.diff.result.divergence import MessageDifference
 from rsltrace.diff.result.fields import ULP_TOLD_MAX, FieldDifference
 from rsltrace.model.event import OutputKind
@@ -82,30 +72,40 @@ def payload_lines(
     or the reason why nothing can be said."""
     rows = _field_lines(fields, width)
     if more_fields:
-        rows.append(line((f"{_INDENT}… {more_fields} more fields", FAINT)))
+        rows.append(line((f"{_INDENT}… {more_fields} more fields", Style.FAINT)))
     if preview:
         rows.append(line(f"{_INDENT}{shortened(printable(preview), width - len(_INDENT))}"))
     if reason:
-        rows += wrapped(f"{_INDENT}{printable(reason)}", width, style=FAINT, indent=_INDENT)
+        rows += wrapped(f"{_INDENT}{printable(reason)}", width, style=Style.FAINT, indent=_INDENT)
     return rows
 
 
 def _field_lines(differences: Sequence[FieldDifference], width: int) -> list[Line]:
     """Return lines for differing fields: short values side by side, others below each other."""
+    paths = min(max((len(found.path) for found in differences), default=0), _PATH_MAX)
+    inline_max = min(_INLINE_MAX, (width - paths - 11) // 2)  # what differs must not be cut off
     rows = []
     for found in differences:
         path = (printable(found.path), "")
         if found.first:
             rows.append([path, (distance_text(found), "")])
             rows += _element_rows(found)
-        elif max(len(found.a), len(found.b)) <= _INLINE_MAX:
-            distance = (distance_text(found), FAINT)
-            rows.append([path, (found.a, SIDE_A), ("|", FAINT), (found.b, SIDE_B), distance])
+        elif max(len(found.a), len(found.b)) <= inline_max:
+            distance = (distance_text(found), Style.FAINT)
+            rows.append(
+                [
+                    path,
+                    (found.a, Style.SIDE_A),
+                    ("|", Style.FAINT),
+                    (found.b, Style.SIDE_B),
+                    distance,
+                ]
+            )
         else:
-            rows.append([path, (distance_text(found), FAINT)])
+            rows.append([path, (distance_text(found), Style.FAINT)])
             room = max(width - len(_INDENT) - 6, 20)
-            rows.append([(f"  a {shortened(found.a, room)}", SIDE_A)])
-            rows.append([(f"  b {shortened(found.b, room)}", SIDE_B)])
+            rows.append([(f"  a {shortened(found.a, room)}", Style.SIDE_A)])
+            rows.append([(f"  b {shortened(found.b, room)}", Style.SIDE_B)])
     return [cut(row, width) for row in in_columns(rows, indent=_INDENT, widest=_PATH_MAX)]
 
 
@@ -116,8 +116,8 @@ def _element_rows(found: FieldDifference) -> list[list[Piece]]:
         binary = found.a.endswith(" bytes")
         for place, a, b in found.first:
             label = f"{place:#06x}" if binary else f"[{place}]"
-            rows.append([(f"  {label} a {a}", SIDE_A)])
-            rows.append([(f"  {' ' * len(label)} b {b}", SIDE_B)])
+            rows.append([(f"  {label} a {a}", Style.SIDE_A)])
+            rows.append([(f"  {' ' * len(label)} b {b}", Style.SIDE_B)])
         return rows
     texts = [f"[{place}] {a} | {b}" for place, a, b in found.first]
     return [[(f"  {',  '.join(texts)}", "")]]

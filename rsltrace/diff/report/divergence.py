@@ -9,15 +9,11 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
 from rsltrace.diff.report.events import event_cells, event_key, event_text
 from rsltrace.diff.report.line import (
-    BAD,
-    FAINT,
     NOTHING,
-    SIDE_A,
-    SIDE_B,
-    TITLE,
     Line,
     Piece,
     Section,
+    Style,
     cut,
     in_columns,
     line,
@@ -64,15 +60,17 @@ def _event(found: Divergence, width: int) -> Section:
         if (a.index, a.stamp_ns) == (b.index, b.stamp_ns):
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         if not title.startswith("event ") or a.flags != b.flags or not found.messages:
-            rows += _did([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
+            rows += _did([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
     elif some is not None:
         title = "where they diverge" if a and b else "the event"
-        rows += _events_of([("a", SIDE_A, a), ("b", SIDE_B, b)], width)
+        rows += _events_of([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
     else:
         title = ""
     for message in found.messages:
         rows += _message(message, width)
-    return Section(cut(line((title, TITLE)), width) if title else (), rows, 12, "lines", least=3)
+    return Section(
+        cut(line((title, Style.TITLE)), width) if title else (), rows, 12, "lines", least=3
+    )
 
 
 def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
@@ -87,7 +85,7 @@ def _did(sides: list[tuple[str, str, EventView]], width: int) -> list[Line]:
 def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> list[Line]:
     rows = []
     for name, style, event in sides:
-        cells = event_cells(event) if event is not None else [("nothing here", FAINT)]
+        cells = event_cells(event) if event is not None else [("nothing here", Style.FAINT)]
         rows.append([(name, style), *cells])
     return [cut(row, width) for row in in_columns(rows, widest=52)]
 
@@ -99,7 +97,7 @@ def _message(message: MessageDifference, width: int) -> list[Line]:
     )
     told = message.fields or message.preview
     if not told and (message.presence == "both" or message.reason):
-        rows.append(line((f"    hashes {hashes_text(message)}", FAINT)))
+        rows.append(line((f"    hashes {hashes_text(message)}", Style.FAINT)))
     return rows
 
 
@@ -111,15 +109,15 @@ def _state(found: Divergence, width: int) -> Section:
         cut(
             line(
                 f"  {printable(one.path)}  ",
-                (_value(one.a), SIDE_A),
-                ("  |  ", FAINT),
-                (_value(one.b), SIDE_B),
+                (_value(one.a), Style.SIDE_A),
+                ("  |  ", Style.FAINT),
+                (_value(one.b), Style.SIDE_B),
             ),
             width,
         )
         for one in found.state
     ]
-    return Section(line(("state of the node after it", TITLE)), rows, 6, "values", least=2)
+    return Section(line(("state of the node after it", Style.TITLE)), rows, 6, "values", least=2)
 
 
 def _value(value: str | None) -> str:
@@ -135,32 +133,32 @@ def _calls(found: Divergence, width: int) -> Section:
     for call in found.calls:
         events = [event for event in (call.event_a, call.event_b) if event is not None]
         earlier = "" if here.intersection(events) else f", event {events[0]}"
-        mark = ("! ", BAD) if call.a != call.b else ("= ", FAINT)
+        mark = ("! ", Style.BAD) if call.a != call.b else ("= ", Style.FAINT)
         what = f"{call.source}: {printable(call.call)}{earlier}"
         if call.a == call.b:
             rows.append(cut(line("  ", mark, what), width))
         else:
             a, b = ("not called" if v is None else printable(v) for v in (call.a, call.b))
             if len(what) + len(a) + len(b) + 28 <= width:
-                pair = ((a, SIDE_A), ("  |  ", FAINT), (b, SIDE_B))
+                pair = ((a, Style.SIDE_A), ("  |  ", Style.FAINT), (b, Style.SIDE_B))
                 rows.append(cut(line("  ", mark, f"{what}  ", *pair), width))
             else:
                 rows.append(cut(line("  ", mark, what), width))
-                for name, style, value in (("a", SIDE_A, a), ("b", SIDE_B, b)):
+                for name, style, value in (("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)):
                     rows.append(cut(line("      ", (f"{name} ", style), value), width))
-        rows.append(cut(line((f"      at {printable(call.where)}", FAINT)), width))
+        rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
     if len(rows) == 2:  # one call, with its answers beside it, and where it was made
-        rows[0] = cut(line(("call from outside: ", TITLE), *rows[0][1:]), width)
+        rows[0] = cut(line(("call from outside: ", Style.TITLE), *rows[0][1:]), width)
         return Section((), rows, 2, "", least=1)
     title = "calls whose answers come from outside"
-    return Section(line((title, TITLE)), rows, 8, "lines", least=3)
+    return Section(line((title, Style.TITLE)), rows, 8, "lines", least=3)
 
 
 def _cause(found: Divergence, width: int) -> Section:
     if not found.root_sentence and len(found.chain) < 2:
         return NOTHING
     title, *more = wrapped(f"cause: {printable(found.root_sentence)}", width, indent="  ")
-    title = line(("cause:", TITLE), title[0][0].removeprefix("cause:"))
+    title = line(("cause:", Style.TITLE), title[0][0].removeprefix("cause:"))
     last = len(found.chain) - 1
     rows = [cut(_step(step, at, last=at == last), width) for at, step in enumerate(found.chain)]
     if last == 0:
@@ -177,12 +175,12 @@ def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
     if step.a and step.b and step.a.index != step.b.index:
         index = f"{step.a.index}/{step.b.index}"
     relation = printable(step.relation)
-    end: Piece = ("  <- here" if last and depth else "", BAD)
+    end: Piece = ("  <- here" if last and depth else "", Style.BAD)
     return line(
         f"  {branch}",
-        (f"{index} ", FAINT),
+        (f"{index} ", Style.FAINT),
         f"{event_text(event)}{side}",
-        (f"  {relation}" if relation else "", FAINT),
+        (f"  {relation}" if relation else "", Style.FAINT),
         end,
     )
 
@@ -213,9 +211,11 @@ def _listed(
     alike = list(map(event_key, a)) == list(map(event_key, b))
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=52)]
-        heading = line((f"{title} (the same in both)", TITLE))
+        heading = line((f"{title} (the same in both)", Style.TITLE))
         return Section(heading, rows, keep, "events", least, drop="first")
-    heading = line((f"{title} ", TITLE), ("(a left, b right; = is the same in both)", FAINT))
+    heading = line(
+        (f"{title} ", Style.TITLE), ("(a left, b right; = is the same in both)", Style.FAINT)
+    )
     return Section(heading, _side_by_side(a, b, width), keep, "events", least, drop="first")
 
 
@@ -234,7 +234,9 @@ def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int
             continue
         for left, right in zip_longest(a[i:i_end], b[j:j_end]):
             text = f"  {_brief(left, half):<{half}}"
-            rows.append(line((text, SIDE_A), ("| ", FAINT), (_brief(right, half), SIDE_B)))
+            rows.append(
+                line((text, Style.SIDE_A), ("| ", Style.FAINT), (_brief(right, half), Style.SIDE_B))
+            )
     return rows
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.diff.report.line import FAINT, Piece
+from rsltrace.diff.report.line import Piece, Style
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
@@ -20,8 +20,8 @@ def event_cells(event: EventView) -> list[Piece]:
     flags = (f"[{name}]" for name in flag_names(event.flags))
     done = ", ".join(filter(None, [printable(event.summary), *flags]))
     return [
-        (str(event.index), FAINT),
-        (format_seconds(event.stamp_ns), FAINT),
+        (str(event.index), Style.FAINT),
+        (format_seconds(event.stamp_ns), Style.FAINT),
         (event_text(event), ""),
         (f"-> {done}" if done else "", ""),
     ]

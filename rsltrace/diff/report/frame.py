@@ -4,20 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rsltrace.diff.report.line import (
-    BAD,
-    COMMAND,
-    GOOD,
-    SIDE_A,
-    SIDE_B,
-    TITLE,
-    Line,
-    Piece,
-    Section,
-    line,
-    side_lines,
-    wrapped,
-)
+from rsltrace.diff.report.line import Line, Piece, Section, Style, line, side_lines, wrapped
 from rsltrace.model.printable import printable
 from rsltrace.words.phrases import as_sentence
 
@@ -32,12 +19,12 @@ def head_lines(
 
     Facts are path, kind or size, and so on; the first four stay whatever the width.
     """
-    style = GOOD if good else BAD
+    style = Style.GOOD if good else Style.BAD
     lines = wrapped(as_sentence(sentence), width, style=style)
     if len(lines) > _SENTENCE_LINES:
         lines = lines[:_SENTENCE_LINES]
         lines[-1] = line((lines[-1][0][0][: width - 1] + "…", style))
-    names: tuple[Piece, Piece] = (("a", SIDE_A), ("b", SIDE_B))
+    names: tuple[Piece, Piece] = (("a", Style.SIDE_A), ("b", Style.SIDE_B))
     named = [[name, *facts] for name, facts in zip(names, sides, strict=True)]
     lines += side_lines(named, width, kept=5)
     if verdict:
@@ -50,7 +37,7 @@ def notes_section(notes: Sequence[str], width: int) -> Section:
     rows = [
         row
         for note in notes
-        for row in wrapped(f"note: {printable(note)}", width, style=TITLE, indent="  ")
+        for row in wrapped(f"note: {printable(note)}", width, style=Style.TITLE, indent="  ")
     ]
     return Section((), rows, min(len(rows), _NOTES_LEAST), "notes")
 
@@ -59,5 +46,5 @@ def next_section(command: str, *before: str) -> Section:
     """Return the command to run next, if there is one, below lines of text."""
     rows = [line(text) for text in before]
     if command:
-        rows.append(line(("next: ", TITLE), (printable(command), COMMAND)))
+        rows.append(line(("next: ", Style.TITLE), (printable(command), Style.COMMAND)))
     return Section((), rows, len(rows), "", len(rows))

@@ -11,14 +11,19 @@ from textwrap import wrap
 
 from rsltrace.model.printable import shortened
 
-PLAIN = ""
-TITLE = "title"
-GOOD = "good"
-BAD = "bad"
-SIDE_A = "a"
-SIDE_B = "b"
-FAINT = "faint"
-COMMAND = "command"
+
+class Style:
+    """What a piece is."""
+
+    PLAIN = ""
+    TITLE = "title"
+    GOOD = "good"
+    BAD = "bad"
+    SIDE_A = "a"
+    SIDE_B = "b"
+    FAINT = "faint"
+    COMMAND = "command"
+
 
 HEIGHT = 40
 """Lines of a report unless more is asked for, or the terminal says otherwise."""
@@ -35,7 +40,7 @@ BLANK: Line = ()
 
 def line(*pieces: str | Piece) -> Line:
     """Return a line of pieces; a bare text has no style."""
-    return tuple((piece, PLAIN) if isinstance(piece, str) else piece for piece in pieces)
+    return tuple((piece, Style.PLAIN) if isinstance(piece, str) else piece for piece in pieces)
 
 
 def plain_text(lines: Iterable[Line]) -> str:
@@ -43,7 +48,7 @@ def plain_text(lines: Iterable[Line]) -> str:
     return "".join(f"{''.join(text for text, _ in row).rstrip()}\n" for row in lines)
 
 
-def wrapped(text: str, width: int, *, style: str = PLAIN, indent: str = "") -> list[Line]:
+def wrapped(text: str, width: int, *, style: str = Style.PLAIN, indent: str = "") -> list[Line]:
     """Return a sentence as lines of at most ``width`` characters; paths are not broken."""
     rows = wrap(
         text, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False
@@ -67,12 +72,12 @@ def in_columns(
     ]
     lines = []
     for row in rows:
-        pieces: list[Piece] = [(indent, PLAIN)]
+        pieces: list[Piece] = [(indent, Style.PLAIN)]
         for at, (text, style) in enumerate(row):
             last = at == len(row) - 1
             pieces.append((text if last else f"{text:<{widths[at]}}", style))
             if not last:
-                pieces.append(("  ", PLAIN))
+                pieces.append(("  ", Style.PLAIN))
         lines.append(tuple(pieces))
     return lines
 
@@ -157,7 +162,9 @@ class Section:
         if not self.height:
             return []
         noun = self.noun if self.hidden != 1 else _singular(self.noun)
-        more = [line((f"  … {self.hidden} more {noun}", FAINT))] if self.hidden and noun else []
+        more = (
+            [line((f"  … {self.hidden} more {noun}", Style.FAINT))] if self.hidden and noun else []
+        )
         gap = {"first": 0, "middle": (len(self.rows) + 1) // 2}.get(self.drop, len(self.rows))
         rows = [*self.rows[:gap], *more, *self.rows[gap:]]
         return [BLANK, *([self.title] if self.title else []), *rows]

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import distance_text, message_title
 from rsltrace.diff.report.line import plain_text
-from rsltrace.diff.report.several import COLUMNS, several_cells
+from rsltrace.diff.report.several import COLUMNS, how_many_diverge, several_cells
 from rsltrace.diff.report.text import report_lines
 from rsltrace.diff.result.bags import BagDiff
 from rsltrace.diff.result.fields import FieldDifference
@@ -30,7 +30,7 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
     lines += _fields(diff)
     if not diff.identical:
         report = report_lines(diff, options)
-        lines += ["<details><summary>Full report</summary>", "", *_code(plain_text(report))]
+        lines += ["<details><summary>Full report</summary>", "", *code_block(plain_text(report))]
         lines += ["", "</details>", ""]
     return "\n".join(lines).rstrip() + "\n"
 
@@ -38,7 +38,7 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
 def several_markdown(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a table of all runs, and below it those that diverge."""
     diverged = [diff for diff in diffs if diff.diverged]
-    verdict = f"{len(diverged)} of {len(diffs)} runs diverge" if diverged else "all runs agree"
+    verdict = how_many_diverge(diffs) if diverged else "all runs agree"
     lines = [f"### rsltrace: {verdict}", "", f"Golden: {_code_span(diffs[0].a.path)}", ""]
     lines += _table(COLUMNS, [several_cells(diff) for diff in diffs])
     text = "\n".join(lines) + "\n"
@@ -108,7 +108,8 @@ def _code_span(text: str) -> str:
     return f"`{printable(text).replace('`', chr(39))}`"
 
 
-def _code(text: str) -> list[str]:
+def code_block(text: str) -> list[str]:
+    """Return text as the lines of a block of code, which it cannot end."""
     longest = max((len(run) for run in _FENCE.findall(text)), default=2)
     fence = "`" * (longest + 1)
     return [f"{fence}text", text.rstrip("\n"), fence]

@@ -6,10 +6,10 @@ import shlex
 from collections.abc import Sequence
 
 from rsltrace.diff.report.events import event_text
-from rsltrace.diff.report.line import BAD, FAINT, GOOD, TITLE, Line, Piece, in_columns, line
+from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.divergence import ENDED_BY_EXCEPTION
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 
@@ -38,6 +38,12 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
     return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
 
 
+def how_many_diverge(diffs: Sequence[Diff | BagDiff]) -> str:
+    """Return ``2 of 3 runs diverge``."""
+    count = sum(diff.diverged for diff in diffs)
+    return f"{count} of {len(diffs)} runs diverge{'s' if count == 1 else ''}"
+
+
 def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     """Return the table of several runs, with a sentence that counts them first.
 
@@ -46,24 +52,24 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
     diverged = sum(diff.diverged for diff in diffs)
     golden = printable(diffs[0].a.path)
     if diverged:
-        sentence = f"{diverged} of {len(diffs)} runs diverge from {golden}."
+        sentence = f"{how_many_diverge(diffs)} from {golden}."
     else:
         near = sum(diff.within_tolerance for diff in diffs)
         within = f", {near} of them within tolerance" if near else ""
         sentence = f"All {len(diffs)} runs agree with {golden}{within}."
-    rows: list[list[Piece]] = [[(name, FAINT) for name in COLUMNS]]
+    rows: list[list[Piece]] = [[(name, Style.FAINT) for name in COLUMNS]]
     for diff in diffs:
         path, *rest = several_cells(diff)
-        style = BAD if diff.diverged else GOOD
+        style = Style.BAD if diff.diverged else Style.GOOD
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
-    lines = [line((sentence, BAD if diverged else GOOD)), line()]
+    lines = [line((sentence, Style.BAD if diverged else Style.GOOD)), line()]
     lines += in_columns(rows, indent="", widest=60)
     if failed := [text for diff in diffs if (text := _failure(diff))]:
-        lines += [line(), *(line((text, BAD)) for text in failed)]
+        lines += [line(), *(line((text, Style.BAD)) for text in failed)]
     first = next((diff for diff in diffs if diff.diverged), None)
     if first is not None:
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
-        lines += [line(), line(("next: ", TITLE), printable(command))]
+        lines += [line(), line(("next: ", Style.TITLE), printable(command))]
     return lines
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.line import HEIGHT, Line
-from rsltrace.diff.result.bags import BagDiff
 from rsltrace.diff.result.traces import Diff
+
+if TYPE_CHECKING:
+    from rsltrace.diff.result.bags import BagDiff
 
 
 def report_lines(

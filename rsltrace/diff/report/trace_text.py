@@ -3,33 +3,31 @@
 from __future__ import annotations
 
 from itertools import takewhile
+from typing import TYPE_CHECKING
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
-    BAD,
     BLANK,
-    FAINT,
     HEIGHT,
     NOTHING,
-    SIDE_A,
-    SIDE_B,
-    TITLE,
     Line,
     Piece,
     Section,
+    Style,
     cut,
     fitted,
     in_columns,
     line,
     wrapped,
 )
-from rsltrace.diff.result.divergence import Divergence
 from rsltrace.diff.result.traces import Diff, Setting, Side
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import as_sentence
+
+if TYPE_CHECKING:
+    from rsltrace.diff.result.divergence import Divergence
 
 _ALIKE_SHOWN = 12
 _ALL_HINT = "--all shows them"
@@ -45,6 +43,9 @@ def trace_report(
     before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
     if not diff.divergences:
         return fitted(head, [before, _settings(diff, width)], None)
+    # Most runs are identical: their report loads no more than this.
+    from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
+
     first, *others = diff.divergences
     sections = [
         before,
@@ -58,8 +59,11 @@ def trace_report(
         return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
     lines = fitted(head, [*sections, _next(first, 0)], None)
     for number, other in enumerate(others, start=2):
-        lines += [BLANK, line((f"independent divergence {number}: {other.verdict.value}", TITLE))]
-        lines += wrapped(as_sentence(other.sentence), width, style=BAD)
+        lines += [
+            BLANK,
+            line((f"independent divergence {number}: {other.verdict.value}", Style.TITLE)),
+        ]
+        lines += wrapped(as_sentence(other.sentence), width, style=Style.BAD)
         lines += fitted([], [*divergence_sections(other, width, options), _next(other, 0)], None)
     return lines
 
@@ -83,7 +87,7 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     else:
         said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)
         text = f"not within tolerance: {said}"
-    return wrapped(f"  {text}", width, style=TITLE, indent="    ")
+    return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
 
 def _facts(side: Side) -> list[Piece]:
@@ -93,7 +97,7 @@ def _facts(side: Side) -> list[Piece]:
         (f"{side.events} events", ""),
         (f"{format_seconds(side.end_ns)} s", ""),
         (f"digest {side.digest}", ""),
-        (printable(ended), FAINT),
+        (printable(ended), Style.FAINT),
     ]
 
 
@@ -130,16 +134,16 @@ def _settings(diff: Diff, width: int) -> Section:
         [
             [
                 (printable(str(setting)), ""),
-                (a, SIDE_A),
-                ("|", FAINT),
-                (b, SIDE_B),
+                (a, Style.SIDE_A),
+                ("|", Style.FAINT),
+                (b, Style.SIDE_B),
             ]
             for setting in diff.settings
             for a, b in [_values(setting, room)]
         ],
         widest=max(room, 34),
     )
-    title: Piece = ("job and environment differ", TITLE)
+    title: Piece = ("job and environment differ", Style.TITLE)
     if len(rows) == 1:
         (row,) = rows
         return Section((), [cut(line(title, ": ", *row[1:]), width)], 1, "settings")

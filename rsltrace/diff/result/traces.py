@@ -7,11 +7,15 @@ unsigned 64-bit.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from rsltrace.diff.result.bags import BagDiff
-from rsltrace.diff.result.divergence import Divergence, Verdict
 from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
-from rsltrace.words.entities import EntityKey
+from rsltrace.diff.result.verdicts import Verdict
+
+if TYPE_CHECKING:  # most runs are identical: their diff loads no more than it needs
+    from rsltrace.diff.result.bags import BagDiff
+    from rsltrace.diff.result.divergence import Divergence
+    from rsltrace.words.entities import EntityKey
 
 
 @dataclass(frozen=True, slots=True)

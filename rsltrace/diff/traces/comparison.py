@@ -21,8 +21,9 @@ from rsltrace.diff.causes.propagation import (
 )
 from rsltrace.diff.causes.settings import entity_settings, environment_settings
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import Divergence, Verdict
+from rsltrace.diff.result.divergence import Divergence
 from rsltrace.diff.result.traces import Diff, Setting
+from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.counts import EventCounts
 from rsltrace.diff.traces.ended_runs import failures, judge_end, who_ended
 from rsltrace.diff.traces.sides import interruptions, side

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import Verdict
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.trace.reader import Trace
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rsltrace.diff.causes.classify import Judgement
-from rsltrace.diff.result.divergence import ENDED_BY_EXCEPTION, Root, Verdict
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION, Root, Verdict
 from rsltrace.diff.traces.sides import stop_reason
 from rsltrace.model.event import Event, EventFlag, EventKind
 from rsltrace.trace.reader import Trace

@@ -10,24 +10,26 @@ Where an event is in one run only, it is marked where it happened there.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import report_lines
+from rsltrace.diff.report.line import plain_text
+from rsltrace.diff.report.markdown import code_block
 from rsltrace.diff.result.divergence import (
-    CallDifference,
     CauseStep,
     Divergence,
-    MessageDifference,
-    StateDifference,
 )
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Diff
-from rsltrace.model.printable import printable, shortened
-from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_seconds
+from rsltrace.words.phrases import event_title
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists, make_chunk
 from rsltrace_viewer.rerun_export.paths import join
 
@@ -36,9 +38,8 @@ AGREEMENT = "/divergence/agreement"
 CHAIN = "/divergence/chain"
 _AGREE, _DIFFER = "the runs agree", "the runs differ"
 _GREEN, _RED = 0x4CAF50FF, 0xEF5350FF
-_VALUE_WIDTH = 18
-_LINE_WIDTH = 50
-_FIELDS_MAX = 20
+_WIDTH = 60
+"""Characters of a line in the text panel."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,95 +141,18 @@ def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
 
 
 def document(diff: Diff) -> str:
-    """Return the diff as Markdown, for people."""
-    lines = [
-        f"# {'Identical' if diff.identical else _text(diff.verdict.value)}",
-        "",
-        _text(diff.sentence),
-    ]
-    lines += ["", "| | a | b |", "|---|---|---|"]
-    lines += [
-        f"| trace | {_text(diff.a.path)} | {_text(diff.b.path)} |",
-        f"| digest | `{diff.a.digest}` | `{diff.b.digest}` |",
-        f"| events | {diff.a.events} | {diff.b.events} |",
-        f"| end | {format_seconds(diff.a.end_ns)} s | {format_seconds(diff.b.end_ns)} s |",
-        "",
-        f"The first **{diff.agreeing}** events are the same.",
-    ]
-    for number, divergence in enumerate(diff.divergences, 1):
-        lines += ["", *_divergence(divergence, number, len(diff.divergences))]
-    if diff.settings:
-        lines += ["", "## Job and environment", "", "| | a | b |", "|---|---|---|"]
-        lines += [f"| {_text(str(s))} | {_value(s.a)} | {_value(s.b)} |" for s in diff.settings]
-    lines += [f"\n{_text(note)}" for note in diff.notes]
-    return "\n".join(lines) + "\n"
+    """Return the report on the diff as Markdown, for a narrow panel.
 
-
-def _divergence(divergence: Divergence, number: int, count: int) -> Iterator[str]:
-    yield f"## Divergence {number} of {count}" if count > 1 else "## Where they diverge"
-    yield ""
-    for name, view in (("a", divergence.a), ("b", divergence.b)):
-        yield f"- **{name}**: {_text(_event(view)) if view else 'nothing there'}"
-    for message in divergence.messages:
-        yield ""
-        yield from _message(message)
-    yield from _beside(divergence)
-    if divergence.chain:
-        yield ""
-        yield "### From the root"
-        yield ""
-        for place, step in enumerate(divergence.chain, 1):
-            yield f"{place}. {_text(_step(step))}"
-    if divergence.root_sentence:
-        yield ""
-        yield _text(divergence.root_sentence)
-    if divergence.reaches:
-        yield ""
-        reached = ", ".join(
-            f"{_text(reach.topic)} after {format_duration(reach.after_ns)}"
-            for reach in divergence.reaches
-        )
-        yield f"It reaches {reached}."
-    if divergence.next_step:
-        yield ""
-        yield f"`{printable(divergence.next_step)}`"
-
-
-def _message(message: MessageDifference) -> Iterator[str]:
-    what = "its input" if message.position < 0 else f"output {message.position + 1}"
-    yield f"**{_text(message.topic)}** ({_text(message.type)}, {what}): {message.presence}"
-    if message.reason:
-        yield f" {_text(message.reason)}"
-    if message.preview:
-        yield f" `{printable(shortened(message.preview, 3 * _VALUE_WIDTH))}`"
-    if message.fields:
-        yield ""
-        yield "```"  # a table would cut off the digits that differ
-        for field in message.fields[:_FIELDS_MAX]:
-            difference = f"|a-b| {field.absolute:.6g}" if field.absolute is not None else ""
-            yield _code(f"{field.path}  {difference} {field.note}".rstrip())
-            for name, value in (("a", field.a), ("b", field.b)):
-                yield _code(f"  {name}  {'—' if value is None else shortened(value, _LINE_WIDTH)}")
-        more = len(message.fields[_FIELDS_MAX:]) + message.more_fields
-        if more:
-            yield f"{more} more"
-        yield "```"
-
-
-def _beside(divergence: Divergence) -> Iterator[str]:
-    """Yield what differs beside the messages: the node's state, answers that came from outside."""
-    told: list[tuple[str, str, StateDifference | CallDifference]]
-    told = [("State of the node after it", one.path, one) for one in divergence.state]
-    told += [
-        (f"Call from outside ({_text(call.source)}, at {_text(call.where)})", call.call, call)
-        for call in divergence.calls
-        if call.a != call.b
-    ]
-    for number, (title, name, one) in enumerate(told[:_FIELDS_MAX]):
-        if not number or told[number - 1][0] != title:
-            yield from ("", f"**{title}**", "")
-        a, b = ("—" if v is None else shortened(v, _VALUE_WIDTH) for v in (one.a, one.b))
-        yield from ("```", _code(f"{name}  {a}  |  {b}"), "```")
+    The events before a divergence are left out: they are on the timelines.
+    """
+    divergences = tuple(
+        replace(each, before_a=(), before_b=(), same_node_a=(), same_node_b=())
+        for each in diff.divergences
+    )
+    shown = replace(diff, divergences=divergences)
+    report = report_lines(shown, DiffOptions(everything=True), width=_WIDTH)
+    title = "Identical" if diff.identical else diff.verdict.value
+    return "\n".join((f"# {title}", "", *code_block(plain_text(report)))) + "\n"
 
 
 def _step(step: CauseStep) -> str:
@@ -239,26 +163,9 @@ def _step(step: CauseStep) -> str:
 
 
 def _event(view: EventView) -> str:
-    what = f"{view.entity.node or '(run)'} {view.kind.label} {view.entity.name}"
-    return printable(f"#{view.index} at {format_seconds(view.stamp_ns)} s: {what}")
+    when = f"#{view.index} at {format_seconds(view.stamp_ns)} s"
+    return f"{when}: {event_title(view.kind, view.entity)}"
 
 
 def _either(a: EventView | None, b: EventView | None) -> EventView | None:
     return a if a is not None else b
-
-
-def _text(text: str) -> str:
-    """Return a text that Markdown shows as it is, in a table as well."""
-    safe = printable(text)
-    for character in "\\`*_{}[]<>|#":
-        safe = safe.replace(character, f"\\{character}")
-    return safe
-
-
-def _code(text: str) -> str:
-    """Return a text as a line of a block of code, which it cannot end."""
-    return printable(text).replace("`", "'")
-
-
-def _value(text: str | None) -> str:
-    return "—" if text is None else _text(shortened(text, _VALUE_WIDTH))

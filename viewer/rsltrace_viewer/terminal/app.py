@@ -80,7 +80,7 @@ class ViewerApp(Stepping):
         if event.kind == "search":
             self.session.set_search(event.text)
             if self.session.search is not None:
-                self.action_again(1)
+                self.action_next_match(1)
         elif event.kind == "filter":
             self._filter(event.text)
         elif not self.session.empty and event.text.strip():

@@ -83,8 +83,8 @@ KEYS: tuple[Key, ...] = (
         "search",
         2,
     ),
-    Key("n", "n", "again(1)", "next match; without a search, next divergence", FIND),
-    Key("N", "N", "again(-1)", "previous match or divergence", FIND),
+    Key("n", "n", "next_match(1)", "next match; without a search, next divergence", FIND),
+    Key("N", "N", "next_match(-1)", "previous match or divergence", FIND),
     Key(
         "F", "F", "ask('filter')", "show only some events: node:/x kind:timer …", FIND, "filter", 6
     ),
@@ -129,5 +129,5 @@ def footer_keys(*, two: bool, searching: str) -> list[tuple[str, str, str]]:
             shown, words = _SHOWN.get(key.short, key.shown.split(" ")[0]), key.short
         entries.append((shown, words, key.action))
     if searching:
-        entries.insert(3, ("n N", searching, "again(1)"))
+        entries.insert(3, ("n N", searching, "next_match(1)"))
     return entries

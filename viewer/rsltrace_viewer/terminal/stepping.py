@@ -71,7 +71,7 @@ class Stepping(Shell):
         condition, name = SEEK[what]
         self._seek(condition, step, name)
 
-    def action_again(self, step: int) -> None:
+    def action_next_match(self, step: int) -> None:
         """Go to the next match of the search; without one, to the next divergence."""
         session = self.session
         if session.search is not None:

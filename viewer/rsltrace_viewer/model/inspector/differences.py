@@ -8,13 +8,10 @@ from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import distance_text
-from rsltrace.diff.result.divergence import (
-    ENDED_BY_EXCEPTION,
-    Divergence,
-    MessageDifference,
-)
+from rsltrace.diff.result.divergence import Divergence, MessageDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds

@@ -13,17 +13,17 @@ from textual.widgets import Static
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
-from rsltrace.diff.report.line import BAD, COMMAND, FAINT, GOOD, SIDE_A, SIDE_B, TITLE
+from rsltrace.diff.report.line import Style
 from rsltrace.diff.result.traces import Diff
 
 _STYLES = {
-    TITLE: "bold $text-primary",
-    GOOD: "bold $text-success",
-    BAD: "bold $text-error",
-    SIDE_A: "$text-warning",
-    SIDE_B: "$text-success",
-    FAINT: "$text-muted",
-    COMMAND: "bold",
+    Style.TITLE: "bold $text-primary",
+    Style.GOOD: "bold $text-success",
+    Style.BAD: "bold $text-error",
+    Style.SIDE_A: "$text-warning",
+    Style.SIDE_B: "$text-success",
+    Style.FAINT: "$text-muted",
+    Style.COMMAND: "bold",
 }
 
 

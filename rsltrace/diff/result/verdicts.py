@@ -1,0 +1,47 @@
+"""Why two runs diverge, in one word each: verdicts and roots."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+
+class Verdict(Enum):
+    """Why two runs diverge. The set is closed; ``Diff.sentence`` puts it in words."""
+
+    IDENTICAL = "identical"
+    SAME_INPUT_DIFFERENT_OUTPUT = "same-input-different-output"
+    DIFFERENT_INPUT = "different-input"
+    SCHEDULE = "schedule"
+    TIMING = "timing"
+    MISSING = "missing"
+    EXTRA = "extra"
+    ENDED_EARLY = "ended-early"
+    RAN_LONGER = "ran-longer"
+    EXCEPTION = "exception"
+    DRAW = "draw"
+    """What chance decided about a message: its delay, whether it is lost."""
+    GRAPH = "graph"
+    ENVIRONMENT = "environment"
+
+
+class Root(Enum):
+    """Where the cause chain of a different input ends."""
+
+    EXTERNAL_INPUT = "external-input"
+    """A bag message (or another value from outside) is itself different."""
+    CALLBACK = "callback"
+    """An event whose inputs agree and whose outputs do not."""
+    SCHEDULE = "schedule"
+    TIMING = "timing"
+    MISSING = "missing"
+    EXTRA = "extra"
+    EXCEPTION = "exception"
+    DRAW = "draw"
+    """A delay, a loss or an execution time was drawn differently."""
+    JOB = "job"
+    """Parameters, seed, code: the constructor already behaved differently."""
+    UNKNOWN = "unknown"
+
+
+ENDED_BY_EXCEPTION = "ended by an exception"
+"""In the note of a run that ended so, after its letter."""
