@@ -270,7 +270,7 @@ def test_a_server_in_a_node_is_asked_again_by_the_trace(go: Callable[..., Any]) 
     def ask() -> None:
         for _ in range(6000):
             try:
-                with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
+                with socket.create_connection(("127.0.0.1", port), timeout=600) as client:
                     client.sendall(b"%d\n" % time.time_ns())
                     answers.append(client.makefile().readline())
                     return
