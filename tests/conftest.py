@@ -18,7 +18,7 @@ settings.register_profile(
 settings.register_profile(
     "explore", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
 )
-settings.register_profile("long", settings.get_profile("same"), max_examples=1000)
+settings.register_profile("long", settings.get_profile("same"), max_examples=400)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
 
 # A shell that starts us in the background has us ignore Ctrl-C, and so would all that we start.

@@ -62,7 +62,7 @@ def harness(*arguments: object) -> subprocess.CompletedProcess[str]:
         [sys.executable, str(SUITE), *map(str, arguments)],
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=1500,
     )
 
 
@@ -71,7 +71,7 @@ def test_every_outcome_is_told(tmp_path: Path) -> None:
     folder.mkdir(parents=True)
     (folder / "test_node.py").write_text(MODULE)
     (folder / "__init__.py").write_text("raise ImportError('needs a build folder')\n")
-    done = harness("--rclpy", tmp_path, "--list", tmp_path / "passed.txt", "--timeout", 60)
+    done = harness("--rclpy", tmp_path, "--list", tmp_path / "passed.txt", "--timeout", 500)
     assert done.returncode == 1, done.stdout + done.stderr
     said = done.stdout
     name = "test/test_node.py::TestAll::test_"

@@ -66,7 +66,7 @@ def test_a_callback_that_does_nothing_nasty_costs_nothing(tmp_path: Path) -> Non
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=900,
     )
     assert done.returncode == 0, done.stderr
     _, short, long = json.loads(done.stdout.splitlines()[-1])

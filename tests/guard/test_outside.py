@@ -203,12 +203,12 @@ def missing():
     except FileNotFoundError as error: return str(error)
 def impatient():
     try: subprocess.run('date +%N; exec sleep 60', shell=True, capture_output=True, timeout=0.3)
-    except subprocess.TimeoutExpired as error: return error.stdout.decode()
+    except subprocess.TimeoutExpired as error: return (error.stdout or b'').decode()
 def waiting():
     process = subprocess.Popen(['sleep', '60'])
     try: process.wait(0.1)
     except subprocess.TimeoutExpired: process.terminate()
-    return process.wait(timeout=20)
+    return process.wait(timeout=300)
 def shells():
     with os.popen('date +%N') as lines:
         return lines.read(), os.system(

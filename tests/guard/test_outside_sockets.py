@@ -172,13 +172,13 @@ BY_SOCKET = {
     "select": """
 with socket.create_connection(ADDRESS) as s:
     s.sendall(b'a\\n')
-    ready = select.select([s], [], [], 20)
+    ready = select.select([s], [], [], 200)
     answers = [len(ready[0]), s.recv(99).decode(), select.select([s], [s], [], 0.05)[1] == [s]]
 """,
     "poll": """
 with socket.create_connection(ADDRESS) as s:
     poll = select.poll(); poll.register(s, select.POLLIN); s.sendall(b'a\\n')
-    answers = [len(poll.poll(20_000)), s.recv(99).decode(), poll.poll(20)]
+    answers = [len(poll.poll(200_000)), s.recv(99).decode(), poll.poll(20)]
 """,
     "epoll": """
 with socket.create_connection(ADDRESS) as s, select.epoll() as poll:
@@ -189,7 +189,7 @@ with socket.create_connection(ADDRESS) as s, select.epoll() as poll:
 with socket.create_connection(ADDRESS) as s, selectors.DefaultSelector() as selector:
     s.setblocking(False)
     selector.register(s, selectors.EVENT_READ, 'mine'); s.sendall(b'a\\n')
-    answers = [[key.data for key, _ in selector.select(20)], s.recv(99).decode()]
+    answers = [[key.data for key, _ in selector.select(200)], s.recv(99).decode()]
     try: s.recv(1)
     except BlockingIOError: answers.append('none')
 """,
@@ -198,7 +198,7 @@ with socket.create_connection(ADDRESS) as s:
     s.settimeout(0.05); answers = []
     try: s.recv(9)
     except TimeoutError as error: answers.append(str(error))
-    s.settimeout(20); s.sendall(b'a\\n'); answers.append(s.makefile().readline())
+    s.settimeout(200); s.sendall(b'a\\n'); answers.append(s.makefile().readline())
 """,
     "asyncio": """
 async def talk(name):
@@ -270,7 +270,7 @@ def test_a_server_in_a_node_is_asked_again_by_the_trace(go: Callable[..., Any]) 
     def ask() -> None:
         for _ in range(6000):
             try:
-                with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
+                with socket.create_connection(("127.0.0.1", port), timeout=600) as client:
                     client.sendall(b"%d\n" % time.time_ns())
                     answers.append(client.makefile().readline())
                     return
@@ -319,7 +319,7 @@ answers = [os.isatty(fd), os.read(fd, 99).decode(), stat.S_ISCHR(os.fstat(fd).st
 os.close(fd)
 """,
     "pyserial": """
-with serial.Serial(PATH, 115200, timeout=20) as port:
+with serial.Serial(PATH, 115200, timeout=200) as port:
     port.write(b'ab\\n')
     answers = [port.readline().decode(), port.in_waiting]
     port.timeout = 0.02

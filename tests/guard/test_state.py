@@ -7,11 +7,11 @@ import collections
 import copy
 import dataclasses
 import enum
-import gc
 import math
+import os
 import random
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -278,7 +278,7 @@ def test_an_object_may_say_itself_what_its_state_is() -> None:
 
 # -- in runs --------------------------------------------------------------------------------------
 
-PLANTINGS = 200
+PLANTINGS = 5 * int(os.environ.get("RSLTRACE_PLANTED", "8"))
 
 PLANTED: dict[str, Any] = {"at": -1, "change": lambda node: None}
 
@@ -348,17 +348,8 @@ def recorded(path: Path, node: Any, state: object, at: int, change: Callable[[An
     return path
 
 
-@pytest.fixture
-def frozen_heap() -> Iterator[None]:
-    """Keep what tests before this one have left out of the collections after each run."""
-    gc.collect()
-    gc.freeze()
-    yield
-    gc.unfreeze()
-
-
 @pytest.mark.ros
-@pytest.mark.usefixtures("frozen_heap")
+@pytest.mark.repeated
 def test_the_first_diverging_event_is_the_planted_one(tmp_path: Path) -> None:
     from rsltrace.diff import diff_files
 

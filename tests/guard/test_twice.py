@@ -237,6 +237,6 @@ def test_rsltrace_is_not_user_code_even_if_it_lies_in_the_search_path(tmp_path: 
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=900,
     )
     assert done.returncode == 0, done.stderr

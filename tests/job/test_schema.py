@@ -24,7 +24,8 @@ from rsltrace.job.values.checks import FROM_FILE
 
 ROOT = Path(__file__).parents[2]
 JOBS = sorted([*ROOT.glob("examples/*/*job*.yaml"), *ROOT.glob("sample_traces/*/*job*.yaml")])
-VALIDATOR = jsonschema.Draft202012Validator(job_schema())
+SCHEMA = job_schema()
+VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 
 
 def problems(text: str) -> list[str]:
@@ -33,7 +34,7 @@ def problems(text: str) -> list[str]:
 
 
 def test_the_schema_is_one() -> None:
-    jsonschema.Draft202012Validator.check_schema(job_schema())
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
 
 
 @pytest.mark.parametrize("path", JOBS, ids=lambda path: f"{path.parent.name}-{path.stem}")
@@ -99,11 +100,13 @@ FIELDS = dict(fields())
 @pytest.mark.parametrize("name", FIELDS)
 def test_examples_are_right(name: str) -> None:
     field = FIELDS[name]
-    schema = {**field_schema(field), "$defs": job_schema()["$defs"]}
+    schema = field_schema(field)
+    jsonschema.Draft202012Validator.check_schema(schema)
+    validator = jsonschema.Draft202012Validator({**schema, "$defs": SCHEMA["$defs"]})
     annotation: Any = Annotated[(field.annotation, *field.metadata, field.description)]
     for example in field.examples or []:
         TypeAdapter(annotation).validate_python(example, context=FROM_FILE)
-        jsonschema.validate(example, schema)
+        validator.validate(example)
 
 
 def test_every_key_is_described_and_has_an_example() -> None:
@@ -118,4 +121,4 @@ def test_the_command_prints_it() -> None:
     done = subprocess.run(
         [sys.executable, "-m", "rsltrace", "schema"], capture_output=True, text=True, check=True
     )
-    assert json.loads(done.stdout) == job_schema()
+    assert json.loads(done.stdout) == SCHEMA

@@ -71,7 +71,7 @@ def test_every_command_does_what_it_shows(tmp_path: Path) -> None:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
                 text=True,
-                timeout=300,
+                timeout=1800,
                 check=False,
             )
             ran += 1

@@ -295,7 +295,7 @@ def _start(folder: Path) -> subprocess.Popen[str]:
 
 
 def _wait_for_bytes(path: Path, size: int) -> None:
-    deadline = time.monotonic() + 240
+    deadline = time.monotonic() + 600
     while not path.exists() or path.stat().st_size < size:
         assert time.monotonic() < deadline, "the run wrote nothing"
         time.sleep(0.05)

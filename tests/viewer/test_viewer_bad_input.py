@@ -204,7 +204,7 @@ async def wait(viewer: Any, happened: Callable[[], bool]) -> None:
     """Wait until something happened."""
     import asyncio
 
-    for _ in range(2400):
+    for _ in range(12000):
         if happened():
             break
         await asyncio.sleep(0.05)
