@@ -75,7 +75,7 @@ def _try_all(
 ) -> None:
     with log.open("w", encoding="utf-8") as file:
         for one, seed in planned:
-            verdict = campaign.try_case(one, seed, work, corpus, out)
+            verdict = campaign.try_or_tell(one, seed, work, corpus, out)
             print(campaign.as_json(verdict), file=file, flush=True)
             for complaint in verdict.complaints:
                 key = f"{one.name}/{verdict.attack}: {complaint.wrong.value}"
@@ -100,6 +100,8 @@ def _long(options: argparse.Namespace, chosen: list[Family], work: Path, corpus:
                 planned = _endless(chosen, first + number, options.workers, until)
                 _try_all(planned, work, corpus, options.out, log)
                 code = 0
+            except KeyboardInterrupt:
+                code = 0
             finally:
                 sys.stdout.flush()
                 os._exit(code)
@@ -110,8 +112,9 @@ def _long(options: argparse.Namespace, chosen: list[Family], work: Path, corpus:
             failed |= os.waitpid(pid, 0)[1] != 0
     except KeyboardInterrupt:
         for pid in workers:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(pid, signal.SIGINT)
+                os.waitpid(pid, 0)
     return _report(options, logs) or int(failed)
 
 

@@ -7,6 +7,7 @@ import json
 import shutil
 import tempfile
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -19,6 +20,15 @@ from tests.attack.known import KNOWN
 from tests.attack.model import Case, Complaint, Ran, Verdict, Wrong
 
 _ENDS = {0: "answer", 1: "answer", 2: "named error", 3: "named error"}
+
+
+def try_or_tell(family: Family, seed: int, work: Path, corpus: Corpus, kept: Path) -> Verdict:
+    """Try a case; if the attack itself fails, say so and go on."""
+    try:
+        return try_case(family, seed, work, corpus, kept)
+    except Exception:
+        told = (Complaint(Wrong.BROKEN, traceback.format_exc()[-1500:]),)
+        return Verdict(family.name, family.attack_of(seed), seed, (), told, 0.0, 0.0, 0.0, 0.0)
 
 
 def try_case(family: Family, seed: int, work: Path, corpus: Corpus, kept: Path) -> Verdict:

@@ -25,6 +25,7 @@ class Wrong(str, Enum):
     SECRET = "secret"  # a password or signature on stdout or stderr
     ANSWER = "answer"  # something was told that is not so
     UNREAD = "unread"  # "identical", by hashes that are not those of a forged file's contents
+    BROKEN = "broken"  # the attack itself failed
     LOST = "lost"  # what was said to be kept is not there
 
 
