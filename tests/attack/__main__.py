@@ -18,6 +18,7 @@ from tests.attack import campaign, execution
 from tests.attack.campaign import Tally
 from tests.attack.corpus import REPOSITORY, Corpus
 from tests.attack.families import NAMES, Family, family
+from tests.attack.known import item_of
 
 
 def main() -> int:
@@ -79,7 +80,7 @@ def _try_all(
             print(campaign.as_json(verdict), file=file, flush=True)
             for complaint in verdict.complaints:
                 key = f"{one.name}/{verdict.attack}: {complaint.wrong.value}"
-                known = " (known)" if key in campaign.KNOWN else ""
+                known = f" ({item})" if (item := item_of(key)) else ""
                 print(f"{key}{known}: {complaint.text!r:.300}\n  {complaint.command}")
                 print(f"  {verdict.reproducer}", flush=True)
 
@@ -147,7 +148,7 @@ def _report(options: argparse.Namespace, logs: list[Path]) -> int:
         if verdict.skipped:
             print(f"skipped {verdict.family}/{verdict.attack}: {verdict.skipped}")
     for key, count in sorted(tally.found.items()):
-        print(f"{count:5}  {key}  {campaign.KNOWN.get(key, 'NEW')}")
+        print(f"{count:5}  {key}  {item_of(key) or 'NEW'}")
     return 1 if tally.unknown() else 0
 
 
