@@ -38,7 +38,6 @@ def test_the_halves_are_all_families() -> None:
     assert sorted(HALVES[0] + HALVES[1]) == sorted(NAMES)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("half", HALVES, ids=("files", "runs"))
 def test_nothing_gives_way_that_is_not_known(tmp_path: Path, half: tuple[str, ...]) -> None:
     words = [sys.executable, "-m", "tests.attack", "--slice", "--out", str(tmp_path)]
