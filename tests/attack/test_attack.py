@@ -46,7 +46,9 @@ def test_nothing_gives_way_that_is_not_known(tmp_path: Path, half: tuple[str, ..
     done = subprocess.run(
         words, cwd=REPOSITORY, capture_output=True, text=True, timeout=1800, check=False
     )
-    lines = (tmp_path / "cases.jsonl").read_text().splitlines()
+    log = tmp_path / "cases.jsonl"
+    assert log.exists(), done.stderr
+    lines = log.read_text().splitlines()
     tally = campaign.Tally()
     for line in lines:
         tally.add(campaign.from_json(line))
