@@ -4,6 +4,7 @@
 # What takes long or needs a quiet machine has targets of its own, which CI runs, too:
 #   make test-native   comparisons with rclpy's own executors over DDS, in real time
 #   make test-long     long campaigns, and everything random with many more cases
+#   make attack        hostile files, jobs, nodes, servers and disks, for an hour
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
 PYTHON ?= python3
@@ -14,7 +15,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-kilted rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
+.PHONY: demo test test-native test-long test-kilted attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -62,6 +63,13 @@ test-native: compiled
 LONG := HYPOTHESIS_PROFILE=long RSLTRACE_RUNS=100 RSLTRACE_PLANTED=40
 test-long: compiled
 	$(LONG) $(BIN)/python -m pytest -n auto --dist worksteal -m 'long or repeated or hypothesis' $(PYTEST)
+
+# The standing attack (tests/attack); what gave way is kept in out/attack with the line that repeats
+# it, beside the figures of the run: make attack ATTACK_MINUTES=5 ATTACK_SEED=1234
+ATTACK_MINUTES ?= 60
+ATTACK_SEED ?=
+attack: compiled
+	$(BIN)/python -m tests.attack --minutes $(ATTACK_MINUTES) $(if $(ATTACK_SEED),--seed $(ATTACK_SEED))
 
 # rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
 RCLPY ?=

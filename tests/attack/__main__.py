@@ -18,6 +18,7 @@ from tests.attack import campaign, execution
 from tests.attack.campaign import Tally
 from tests.attack.corpus import REPOSITORY, Corpus
 from tests.attack.families import NAMES, Family, family
+from tests.attack.known import item_of
 
 
 def main() -> int:
@@ -75,11 +76,11 @@ def _try_all(
 ) -> None:
     with log.open("w", encoding="utf-8") as file:
         for one, seed in planned:
-            verdict = campaign.try_case(one, seed, work, corpus, out)
+            verdict = campaign.try_or_tell(one, seed, work, corpus, out)
             print(campaign.as_json(verdict), file=file, flush=True)
             for complaint in verdict.complaints:
                 key = f"{one.name}/{verdict.attack}: {complaint.wrong.value}"
-                known = " (known)" if key in campaign.KNOWN else ""
+                known = f" ({item})" if (item := item_of(key)) else ""
                 print(f"{key}{known}: {complaint.text!r:.300}\n  {complaint.command}")
                 print(f"  {verdict.reproducer}", flush=True)
 
@@ -100,6 +101,8 @@ def _long(options: argparse.Namespace, chosen: list[Family], work: Path, corpus:
                 planned = _endless(chosen, first + number, options.workers, until)
                 _try_all(planned, work, corpus, options.out, log)
                 code = 0
+            except KeyboardInterrupt:
+                code = 0
             finally:
                 sys.stdout.flush()
                 os._exit(code)
@@ -110,8 +113,9 @@ def _long(options: argparse.Namespace, chosen: list[Family], work: Path, corpus:
             failed |= os.waitpid(pid, 0)[1] != 0
     except KeyboardInterrupt:
         for pid in workers:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGTERM)
+            with contextlib.suppress(ProcessLookupError, ChildProcessError):
+                os.kill(pid, signal.SIGINT)
+                os.waitpid(pid, 0)
     return _report(options, logs) or int(failed)
 
 
@@ -144,7 +148,7 @@ def _report(options: argparse.Namespace, logs: list[Path]) -> int:
         if verdict.skipped:
             print(f"skipped {verdict.family}/{verdict.attack}: {verdict.skipped}")
     for key, count in sorted(tally.found.items()):
-        print(f"{count:5}  {key}  {campaign.KNOWN.get(key, 'NEW')}")
+        print(f"{count:5}  {key}  {item_of(key) or 'NEW'}")
     return 1 if tally.unknown() else 0
 
 

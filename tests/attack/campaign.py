@@ -7,6 +7,7 @@ import json
 import shutil
 import tempfile
 import time
+import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -15,10 +16,19 @@ from pathlib import Path
 from tests.attack import execution, oracle
 from tests.attack.corpus import Corpus
 from tests.attack.families import Family
-from tests.attack.known import KNOWN
+from tests.attack.known import item_of
 from tests.attack.model import Case, Complaint, Ran, Verdict, Wrong
 
 _ENDS = {0: "answer", 1: "answer", 2: "named error", 3: "named error"}
+
+
+def try_or_tell(family: Family, seed: int, work: Path, corpus: Corpus, kept: Path) -> Verdict:
+    """Try a case; if the attack itself fails, say so and go on."""
+    try:
+        return try_case(family, seed, work, corpus, kept)
+    except Exception:
+        told = (Complaint(Wrong.BROKEN, traceback.format_exc()[-1500:]),)
+        return Verdict(family.name, family.attack_of(seed), seed, (), told, 0.0, 0.0, 0.0, 0.0)
 
 
 def try_case(family: Family, seed: int, work: Path, corpus: Corpus, kept: Path) -> Verdict:
@@ -111,7 +121,7 @@ class Tally:
 
     def unknown(self) -> list[Verdict]:
         """Return the cases with a complaint that no known failure covers."""
-        return [verdict for verdict in self.verdicts if verdict.keys - KNOWN.keys()]
+        return [verdict for verdict in self.verdicts if new_of(verdict)]
 
     def table(self) -> str:
         """Return the figures as Markdown, a row for each family."""
@@ -128,11 +138,16 @@ class Tally:
         return "\n".join(rows) + "\n"
 
 
+def new_of(verdict: Verdict) -> frozenset[str]:
+    """Return those of a case's complaints that are not known."""
+    return frozenset(key for key in verdict.keys if not item_of(key))
+
+
 def _row(name: str, verdicts: Iterable[Verdict]) -> str:
     own = list(verdicts)
     ends = Counter(outcome for verdict in own for outcome in verdict.outcomes)
-    new = sum(1 for verdict in own if verdict.keys - KNOWN.keys())
-    known = sum(1 for verdict in own if verdict.keys and not verdict.keys - KNOWN.keys())
+    new = sum(1 for verdict in own if new_of(verdict))
+    known = sum(1 for verdict in own if verdict.keys and not new_of(verdict))
     other = sum(ends.values()) - ends["answer"] - ends["named error"]
     cells = (
         name,
@@ -156,7 +171,7 @@ def as_json(verdict: Verdict) -> str:
     value["complaints"] = [
         {"wrong": c.wrong.value, "text": c.text, "command": c.command} for c in verdict.complaints
     ]
-    value["known"] = sorted(verdict.keys & KNOWN.keys())
+    value["known"] = sorted(verdict.keys - new_of(verdict))
     value["reproducer"] = verdict.reproducer
     return json.dumps(value)
 

@@ -49,6 +49,8 @@ def preload(*, ros: bool) -> None:
         if module.name.split(".")[1] in roots and not module.name.endswith("__main__"):
             with contextlib.suppress(ImportError):
                 importlib.import_module(module.name)
+    for name in ("aiohttp", "fsspec.implementations.http", "textual.app", "rosbags.rosbag2"):
+        importlib.import_module(name)
     if ros:
         for name in ("rclpy.node", "std_msgs.msg", "std_srvs.srv", "rsltrace.run"):
             importlib.import_module(name)

@@ -1,9 +1,50 @@
 """What gives way today, each with the item of the trust issue that will mend it.
 
 It shrinks to nothing: the test fails when an entry no longer shows in the slice of ``make test``.
-A key is ``family/attack: what was wrong``.
+A key is ``family/attack: what was wrong``, or a pattern of such.
 """
 
 from __future__ import annotations
 
-KNOWN: dict[str, str] = {}
+from collections.abc import Iterable
+from fnmatch import fnmatchcase
+
+KNOWN: dict[str, str] = {
+    "traces/*: answer": "item 1",
+    "records/*: unread": "item 9",
+    "records/*: forged": "item 9",
+    "schemas/*: unread": "item 9",
+    "schemas/*: forged": "item 9",
+    "texts/*: unread": "item 9",
+    "texts/*: forged": "item 9",
+    "texts/*: unnamed": "item 9",
+    "pasted/*: executed": "item 3",
+    "servers/*: secret": "item 8",
+    "nodes/dup2_over_all: lost": "item 2",
+    "nodes/fork_and_go_on: lost": "item 2",
+    "nodes/fork_and_raise: traceback": "item 2",
+    "nodes/delete_output: lost": "item 2",
+    "nodes/truncate_output: lost": "item 2",
+    "nodes/replace_output: lost": "item 2",
+    "nodes/overwrite_output: lost": "item 2",
+    "nodes/log_escapes: raw": "item 4",
+    "nodes/raises_escapes: raw": "item 4",
+    "nodes/log_escapes: traceback": "item 5",
+    "nodes/negative_period: traceback": "item 5",
+    "nodes/wrong_field: traceback": "item 5",
+    "nodes/destroy_publisher: traceback": "item 5",
+    "nodes/hang_up_self: died": "item 6",
+    "nodes/closed_stdout: traceback": "item 10",
+    "disks/stderr-full: status": "item 10",
+}
+
+
+def item_of(key: str) -> str:
+    """Return the item that will mend what a key stands for; "" if nobody knows of it."""
+    return next((item for known, item in KNOWN.items() if fnmatchcase(key, known)), "")
+
+
+def mended(keys: Iterable[str]) -> list[str]:
+    """Return the entries that none of ``keys`` has to do with."""
+    seen = list(keys)
+    return sorted(known for known in KNOWN if not any(fnmatchcase(k, known) for k in seen))

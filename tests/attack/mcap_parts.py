@@ -148,7 +148,9 @@ def _relocate(
         record = part.record
         assert isinstance(record, records.SummaryOffset)
         start, size = groups.get(record.group_opcode, [record.group_start, record.group_length])
-        part.record = records.SummaryOffset(record.group_opcode, size, start)
+        part.record = records.SummaryOffset(
+            group_opcode=record.group_opcode, group_start=start, group_length=size
+        )
     elif part.opcode == Opcode.ATTACHMENT and segments_in(part) is not None:
         rows = [list(row) for row in segments_in(part) or ()]
         for row in rows:

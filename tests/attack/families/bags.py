@@ -173,8 +173,8 @@ def _sql(rng: Random, case: Case, corpus: Corpus) -> None:
             [
                 "ALTER TABLE messages RENAME TO m",
                 "CREATE VIEW messages AS WITH RECURSIVE c(id, topic_id, timestamp, data) AS ("
-                "SELECT 1, 1, 1, x'00' UNION ALL SELECT id + 1, 1, id, x'00' FROM c) "
-                "SELECT * FROM c",
+                "SELECT 1, 1, 1, x'00' UNION ALL SELECT id + 1, 1, id, x'00' FROM c) SELECT * "
+                "FROM c",
             ],
             [
                 "ALTER TABLE topics RENAME TO t",

@@ -21,7 +21,9 @@ record: {segment_events: %d}
 """
 
 
-def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
+def _attack(
+    number: int, status: int, *, early: bool = False
+) -> Callable[[Random, Case, Corpus], None]:
     def attack(rng: Random, case: Case, corpus: Corpus) -> None:
         folder = case.folder
         put_robot(folder)
@@ -37,8 +39,8 @@ def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
         fresh = rng.random() < 0.3
         if not fresh:
             words.append("--no-pin")
-        grown = rng.choice((0, 1, 2000, rng.randrange(200_000), rng.randrange(1_500_000)))
-        delay = rng.uniform(0.0, 0.6) if grown == 0 else 0.0
+        grown = rng.choice((1, 2000, rng.randrange(200_000), rng.randrange(1_500_000)))
+        kill = Kill(number, 0, rng.uniform(0.0, 0.8)) if early else Kill(number, grown)
         case.user_code = True
         case.names = ("job.yaml", recordings.OUTPUT, "interrupted")
         case.commands.append(
@@ -47,7 +49,7 @@ def _attack(number: int, status: int) -> Callable[[Random, Case, Corpus], None]:
                 oracle.RECORDING | {status, -number},
                 folder,
                 fresh=fresh,
-                kill=Kill(number, grown, delay),
+                kill=kill,
                 limits=Limits(cpu_s=40, rss_mib=500),
             )
         )
@@ -67,14 +69,20 @@ def _judge(case: Case, runs: Sequence[Ran], old: str, status: int) -> list[Compl
     return recordings.judge(case, runs, old=old, whole_if=whole)
 
 
+_ENDS = {
+    "sigkill": (signal.SIGKILL, -signal.SIGKILL),
+    "sigterm": (signal.SIGTERM, 143),
+    "sigint": (signal.SIGINT, 130),
+    "sighup": (signal.SIGHUP, 129),
+}
+
 FAMILY = Family(
     "kills",
     {
-        "sigkill": _attack(signal.SIGKILL, -signal.SIGKILL),
-        "sigterm": _attack(signal.SIGTERM, 143),
-        "sigint": _attack(signal.SIGINT, 130),
-        "sighup": _attack(signal.SIGHUP, 129),
+        **{name: _attack(*end) for name, end in _ENDS.items()},
+        **{f"{name}-early": _attack(*end, early=True) for name, end in _ENDS.items()},
     },
-    rounds=1,
+    slow=frozenset(f"{name}-early" for name in _ENDS),  # what they hit is up to the wall clock
+    rounds=2,
     ros=True,
 )

@@ -297,6 +297,20 @@ FAMILY = Family(
         "drips-headers": _attack(_drips_headers),
         "each-slow": _attack(_each_slow),
     },
+    sliced=frozenset(
+        (
+            "honest",
+            "honest-with-secrets",
+            "no-ranges",
+            "wrong-range",
+            "short",
+            "size-huge",
+            "not-found",
+            "redirect-file",
+            "redirect-secret",
+            "packed-bomb",
+        )
+    ),
     slow=frozenset(("endless", "silent", "drips", "drips-headers", "each-slow")),
     rounds=1,
 )

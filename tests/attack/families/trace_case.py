@@ -86,10 +86,10 @@ def _judge_identical(
         text = "called identical, though it is cut or another run"
     elif hostile is not None and original is not None and hostile != original:
         text = "called identical, though its messages are others"
-        if "--check" not in ran.command.words:
-            wrong = Wrong.UNREAD  # its checksums are right; only reading all of it would tell
+        wrong = Wrong.FORGED if "--check" in ran.command.words else Wrong.UNREAD
     elif hostile is None and "--check" in ran.command.words:
         text = "called identical with --check, though the mcap package refuses the file"
+        wrong = Wrong.FORGED
     else:
         return []
     return [Complaint(wrong, text, ran.line)]

@@ -297,7 +297,7 @@ def recursion_of_data(node):
 
 
 def set_timer(node):
-    signal.setitimer(signal.ITIMER_REAL, 0.5)
+    signal.setitimer(signal.ITIMER_REAL, 0.02)
 
 
 def set_alarm(node):
