@@ -39,8 +39,9 @@ def _attack(
         fresh = rng.random() < 0.3
         if not fresh:
             words.append("--no-pin")
-        grown = rng.choice((1, 2000, rng.randrange(200_000), rng.randrange(1_500_000)))
-        kill = Kill(number, 0, rng.uniform(0.0, 0.8)) if early else Kill(number, grown)
+        kill = Kill(number, rng.choice((6000, 6000 + rng.randrange(1_000_000))))
+        if early:  # before the first segment, or before there is a file
+            kill = Kill(number, rng.choice((0, 1)), rng.uniform(0.0, 0.8))
         case.user_code = True
         case.names = ("job.yaml", recordings.OUTPUT, "interrupted")
         case.commands.append(
