@@ -27,9 +27,8 @@ def _attack(
     def attack(rng: Random, case: Case, corpus: Corpus) -> None:
         folder = case.folder
         put_robot(folder)
-        (folder / "job.yaml").write_text(
-            _JOB % (rng.choice(("20s", "60s")), rng.choice((16, 500, 4096)))
-        )
+        segment = rng.choice((16, 500, 4096) if early else (16, 500))
+        (folder / "job.yaml").write_text(_JOB % (rng.choice(("20s", "60s")), segment))
         old = ""
         words = ["record", "job.yaml", "-o", recordings.OUTPUT, "--quiet"]
         if rng.random() < 0.5:
