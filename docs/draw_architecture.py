@@ -74,7 +74,7 @@ class Step(NamedTuple):
 
 
 STEPS = (
-    Step(212, 322, "1", ("publish() (boundary)",), MESSAGE),
+    Step(212, 322, "1", ("publish() (handles)",), MESSAGE),
     Step(450, 322, "2", ("to CDR bytes (wire)",), MESSAGE),
     Step(450, 555, "3", ("matched, delayed,", "queued, or lost"), MESSAGE),
     Step(450, 646, "4", ("its time has come,", "and it is next"), MESSAGE),
