@@ -52,6 +52,11 @@ class Domain:
         self.graph.add_node(participant)
         return participant
 
+    def leave(self, participant: Participant) -> None:
+        """Take a participant out of the domain, with all that it has made."""
+        for entity in [*participant.timers, *self.graph.endpoints_of(participant), participant]:
+            entity.destroy()
+
     def publisher(
         self, node: Participant, topic: str, type: MessageType, qos: Qos = DEFAULT_QOS
     ) -> Publisher:
