@@ -7,10 +7,15 @@ counterexamples: ``HYPOTHESIS_PROFILE=explore python -m pytest …``.
 import gc
 import os
 import signal
-from collections.abc import Generator
+import subprocess
+from collections.abc import Callable, Generator
+from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from hypothesis import HealthCheck, settings
+
+from rsltrace.cli.main import cli
 
 settings.register_profile(
     "same", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -59,3 +64,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         items[:] = [item for item in items if item not in set(left_out)]
         config.hook.pytest_deselected(items=left_out)
+
+
+@pytest.fixture
+def command(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run the rsltrace command in ``tmp_path``, in this process: starting one takes a second.
+
+    For what it says and writes. Signals, pipes and the pin need a process of their own.
+    """
+    monkeypatch.chdir(tmp_path)
+
+    def call(*words: object, charset: str = "utf-8") -> subprocess.CompletedProcess[str]:
+        try:
+            runner = CliRunner(mix_stderr=False, charset=charset)  # click before 8.2
+        except TypeError:
+            runner = CliRunner(charset=charset)
+        texts = [str(word) for word in words]
+        result = runner.invoke(cli, texts, prog_name="rsltrace", catch_exceptions=False)
+        return subprocess.CompletedProcess(texts, result.exit_code, result.stdout, result.stderr)
+
+    return call

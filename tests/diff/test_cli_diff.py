@@ -12,6 +12,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -28,20 +29,9 @@ Done = subprocess.CompletedProcess[str]
 
 
 @pytest.fixture
-def diff(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Done]:
-    """Run the command in this process; what only a process shows, the tests of terminals ask."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(*arguments: object, charset: str = "utf-8") -> Done:
-        try:
-            runner = CliRunner(mix_stderr=False, charset=charset)  # click before 8.2
-        except TypeError:
-            runner = CliRunner(charset=charset)
-        words = ["diff", *map(str, arguments)]
-        result = runner.invoke(cli, words, catch_exceptions=False)
-        return Done(words, result.exit_code, result.stdout, result.stderr)
-
-    return call
+def diff(command: Callable[..., Done]) -> Callable[..., Done]:
+    """Run ``rsltrace diff`` in this process; what only a process shows, tests below ask one."""
+    return partial(command, "diff")
 
 
 def test_the_exit_status_is_that_of_the_process(tmp_path: Path) -> None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,6 +14,7 @@ from rsltrace.job import LaunchSpec, load_job
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros
+Command = Callable[..., subprocess.CompletedProcess[str]]
 
 NODES = """
 from rclpy.node import Node
@@ -60,19 +59,8 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def rsltrace(folder: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    def call(*arguments: object) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, "-m", "rsltrace", *map(str, arguments)],
-            capture_output=True,
-            text=True,
-            timeout=300,
-            cwd=folder,
-            env=dict(os.environ),
-            check=False,
-        )
-
-    return call
+def rsltrace(folder: Path, command: Command) -> Command:
+    return command
 
 
 def topics(path: Path) -> dict[str, int]:
@@ -85,7 +73,7 @@ def topics(path: Path) -> dict[str, int]:
     return {name: timers for name in names if name in ("/chat", "/chatter", "/other")}
 
 
-def test_record_a_launch_file(rsltrace: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+def test_record_a_launch_file(rsltrace: Command) -> None:
     refused = rsltrace("record", "--launch", "demo.launch.xml", "--until", "2")
     assert refused.returncode == 2
     assert "demo.launch.xml:11:3: rviz2/rviz2: there is no package 'rviz2'" in refused.stderr
@@ -108,9 +96,7 @@ def test_record_a_launch_file(rsltrace: Callable[..., subprocess.CompletedProces
     ]
 
 
-def test_print_job_gives_a_job_that_does_the_same(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
-) -> None:
+def test_print_job_gives_a_job_that_does_the_same(rsltrace: Command, folder: Path) -> None:
     launch = ("--launch", "demo.launch.xml", "--skip-unsupported", "--until", "2")
     first = rsltrace("record", *launch)
     (folder / "printed.yaml").write_text(rsltrace("record", *launch, "--print-job").stdout)
@@ -118,9 +104,7 @@ def test_print_job_gives_a_job_that_does_the_same(
     assert first.stdout == second.stdout
 
 
-def test_a_launch_file_in_a_job(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
-) -> None:
+def test_a_launch_file_in_a_job(rsltrace: Command, folder: Path) -> None:
     wrong = JOB + "launch:\n  - {file: demo.launch.xml, arguments: {wrd: five}}\n"
     (folder / "wrong.yaml").write_text(wrong)
     line = wrong.count("\n")
@@ -144,7 +128,7 @@ def test_a_launch_file_in_a_job(
 
 
 def test_words_that_do_not_fit_together(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]],
+    rsltrace: Command,
 ) -> None:
     for arguments, message in [
         ((), "Missing argument 'JOB' (or --launch FILE)"),
@@ -174,9 +158,7 @@ def _write(path: Path, text: str) -> Path:
 # -- --ros-args ------------------------------------------------------------------------------------
 
 
-def test_ros_arguments_have_the_last_word(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
-) -> None:
+def test_ros_arguments_have_the_last_word(rsltrace: Command, folder: Path) -> None:
     (folder / "sub").mkdir()
     (folder / "sub" / "p.yaml").write_text("talker: {ros__parameters: {word: filed, rate: 8.0}}\n")
     cases: list[tuple[list[str], dict[str, int]]] = [
@@ -196,9 +178,7 @@ def test_ros_arguments_have_the_last_word(
         )
 
 
-def test_ros_arguments_win_over_names_given_in_the_job(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]], folder: Path
-) -> None:
+def test_ros_arguments_win_over_names_given_in_the_job(rsltrace: Command, folder: Path) -> None:
     (folder / "named.yaml").write_text(
         "nodes: [{node: demo_nodes:Talker, name: mine, remappings: {chatter: /chat}}]\n"
         "stop: {duration: 1s}\n"
@@ -210,7 +190,7 @@ def test_ros_arguments_win_over_names_given_in_the_job(
     assert {"/other", "/space/mine"} <= names
 
 
-def test_wrong_ros_arguments(rsltrace: Callable[..., subprocess.CompletedProcess[str]]) -> None:
+def test_wrong_ros_arguments(rsltrace: Command) -> None:
     for words, message in [
         (["-p", "rate"], "ros_arguments (--ros-args): "),
         (["--params-file", "none.yaml"], "none.yaml"),
@@ -268,7 +248,7 @@ EXECUTABLES = """<launch>
 
 
 def test_installed_executables_run_with_what_the_launch_file_gives_them(
-    rsltrace: Callable[..., subprocess.CompletedProcess[str]], prefix: Path, folder: Path
+    rsltrace: Command, prefix: Path, folder: Path
 ) -> None:
     (prefix / "lib" / "demo" / "talker").write_text(TALKER)
     (folder / "robots.launch.xml").write_text(EXECUTABLES)
