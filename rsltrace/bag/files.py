@@ -15,7 +15,9 @@ from rsltrace.bag.sqlite_recover import recover_database
 from rsltrace.bag.storage import Storage
 from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
+from rsltrace.mcap.limits import FILE_BYTES_MIN, FILE_GROWTH_MAX
 from rsltrace.mcap.records import MAGIC as MCAP_MAGIC
+from rsltrace.mcap.source import not_regular
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -64,6 +66,8 @@ def open_files(path: Path, *, recover: bool = False) -> BagFiles:
             if path.name == NAME:
                 raise BagError(f"{path}: name the bag's folder, {path.parent}")
             _open_file(path, files, None, recover=recover)
+        elif path.exists():
+            raise BagError(f"{path} is {not_regular(path)}: name a bag's folder or file")
         else:
             raise BagError(f"{path}: there is no such bag")
     except OSError as error:
@@ -129,9 +133,15 @@ def _decompressed(path: Path, files: BagFiles) -> Path:
 
     folder = files._stack.enter_context(TemporaryDirectory(prefix="rsltrace-bag-"))
     target = Path(folder, path.name.removesuffix(".zstd"))
+    most = max(FILE_BYTES_MIN, FILE_GROWTH_MAX * path.stat().st_size)
     try:
         with path.open("rb") as source, target.open("wb") as sink:
-            zstandard.ZstdDecompressor().copy_stream(source, sink)
+            for piece in zstandard.ZstdDecompressor().read_to_iter(source, write_size=1 << 20):
+                if sink.tell() > most:
+                    raise BagError(
+                        f"{path}: it unpacks to more than {most} bytes, which no bag does"
+                    )
+                sink.write(piece)
     except zstandard.ZstdError as error:
         raise BagError(f"{path}: cannot be decompressed ({error}): copy it again") from None
     return target

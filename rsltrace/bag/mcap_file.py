@@ -88,7 +88,7 @@ class McapFile:
             raise ValueError(f"{self.path} is closed")
         try:
             if part.is_chunk:
-                records = read_chunk(self._source, part.span, needs_crc=False)
+                records = read_chunk(self._source, part.span, strict=False)
             else:
                 records = self._source.read_at(*part.span)
             messages = cut_messages(

@@ -113,7 +113,7 @@ def scan_records(
 
 def _scan_chunk(source: ByteSource, span: Span, index: McapIndex) -> None:
     try:
-        records = read_chunk(source, span, needs_crc=False)
+        records = read_chunk(source, span, strict=False)
         counts: Counter[int] = Counter()
         start_ns, end_ns = 2**64 - 1, 0
         for opcode, at, after in records_in(records):

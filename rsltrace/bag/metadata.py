@@ -10,6 +10,7 @@ from typing import Any
 from rsltrace.bag.qos import parse_qos
 from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
+from rsltrace.mcap.limits import METADATA_YAML_BYTES_MAX
 
 NAME = "metadata.yaml"
 _RECORDING = re.compile(r"\.(mcap|db3)(\.zstd)?$")
@@ -114,8 +115,10 @@ def _load(path: Path) -> Any:
     from ruamel.yaml.error import YAMLError
 
     try:
+        if path.stat().st_size > METADATA_YAML_BYTES_MAX:
+            raise BagError(f"{path}: larger than any bag's; run 'ros2 bag reindex'")
         return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
-    except (YAMLError, UnicodeDecodeError) as error:
+    except (YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise BagError(f"{path}: not YAML ({error}); run 'ros2 bag reindex'") from None
     except OSError as error:
         raise BagError(f"{path}: {error.strerror}") from None

@@ -53,7 +53,7 @@ def _parse_text(text: str) -> tuple[BagQos, ...]:
 
     try:
         value = YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+    except (YAMLError, RecursionError) as error:
         raise ValueError(f"the QoS profiles are not YAML: {error}") from None
     if isinstance(value, str):
         raise ValueError(f"a list of QoS profiles was expected, not {value!r}")

@@ -17,6 +17,7 @@ from rsltrace.bag.storage import Extent, Storage, StoredTopic
 from rsltrace.bag.topic import BagTopic
 from rsltrace.errors import BagError
 from rsltrace.mcap.chunk import PUBLISH_TIME_BYTES
+from rsltrace.mcap.limits import MESSAGE_BYTES_MAX
 from rsltrace.model.stamp import format_duration
 
 STAMP_NS_MAX = 2**63 - 1
@@ -216,10 +217,9 @@ class Bag:
         decompressor = zstandard.ZstdDecompressor()
         for stamp_ns, topic, data in messages:
             try:
-                if head:
-                    yield stamp_ns, topic, data[:head] + decompressor.decompress(data[head:])
-                else:
-                    yield stamp_ns, topic, decompressor.decompress(data)
+                if zstandard.frame_content_size(data[head:]) > MESSAGE_BYTES_MAX:
+                    raise zstandard.ZstdError(f"it has more than {MESSAGE_BYTES_MAX} bytes")
+                yield stamp_ns, topic, data[:head] + decompressor.decompress(data[head:])
             except zstandard.ZstdError as error:
                 raise BagError(
                     f"{self.path}: a message on {self.topics[topic].name} at {stamp_ns} ns cannot "

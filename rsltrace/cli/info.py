@@ -37,8 +37,7 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     was killed is shown as far as it goes.
     """
     with Trace.open(trace) as opened:
-        if check:
-            opened.check()
+        opened.check() if check else opened.check_settings()
         counts = count(opened)
         if as_json:
             click.echo(json.dumps(_as_json(opened, counts), indent=2))

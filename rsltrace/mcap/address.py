@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 _SIGNS_MIN = 3
 """Shorter pieces of an address are not taken out of texts: they would be found in any word."""
 
 _ADDRESS = re.compile(r"[A-Za-z][A-Za-z0-9+.-]*://[^\s'\"<>)\]}]+")
-
-
-def is_address(place: Path | str) -> bool:
-    """Whether ``place`` is an address and not a path."""
-    return isinstance(place, str) and "://" in place
 
 
 def public(address: str) -> str:

@@ -35,12 +35,12 @@ class MessageView(NamedTuple):
 
 
 def read_chunk(
-    source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX, *, needs_crc: bool = True
+    source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX, *, strict: bool = True
 ) -> bytes:
     """Return the records of the chunk at ``span``. Raises Damaged.
 
     What is larger than ``size_max`` is refused before anything is unpacked. MCAP lets a writer
-    leave the CRC out by writing 0, which ``needs_crc`` compares like any.
+    leave the CRC out by writing 0, and add fields to the end of a record; ``strict`` does not.
     """
     if span.length < _CHUNK_HEAD.size:
         raise Damaged(f"its length is given as {span.length}")
@@ -49,15 +49,18 @@ def read_chunk(
     if opcode != Opcode.CHUNK or length + _HEAD_BYTES != span.length:
         raise Damaged("there is no chunk where the index says")
     data_at = _CHUNK_HEAD.size + text + _U64.size
-    if data_at > len(record) or data_at + _U64.unpack_from(record, data_at - 8)[0] > len(record):
-        raise Damaged("the chunk's bytes run past the end of its record")
+    data_end = data_at
+    if data_at <= span.length:
+        data_end += _U64.unpack_from(record, data_at - _U64.size)[0]
+    if data_end > span.length or (strict and data_end != span.length):
+        raise Damaged("the chunk's bytes do not end where its record does")
     if size > size_max:
         raise Damaged(f"a chunk of {size} bytes, where at most {size_max} can be")
-    data = memoryview(record)[data_at : data_at + _U64.unpack_from(record, data_at - 8)[0]]
+    data = memoryview(record)[data_at:data_end]
     records = _unpacked(data, record[_CHUNK_HEAD.size : data_at - _U64.size], size)
     if len(records) != size:
         raise Damaged(f"the chunk holds {len(records)} bytes where {size} are promised")
-    if (crc or needs_crc) and crc32(records) != crc:
+    if (crc or strict) and crc32(records) != crc:
         raise Damaged("the chunk's CRC does not match its content")
     return records
 

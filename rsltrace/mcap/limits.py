@@ -31,8 +31,10 @@ SCHEMA_BYTES_MAX = 256 << 10
 SCHEMAS_BYTES_MAX = 4 << 20
 """Of all types that are decoded of one trace."""
 
-SCHEMA_ITEMS_MAX = 16384
-"""Items of all fixed arrays of strings or messages in a schema: each becomes a line of code."""
+SCHEMA_ITEMS_MAX = 4096
+SCHEMAS_ITEMS_MAX = 16384
+"""Items of all fixed arrays of strings or messages, in a schema and in all that are decoded of one
+trace: each becomes lines of code, and a thousand of them take a second."""
 
 RESPONSE_BYTES_MAX = 64 << 20
 """A server may know no ranges and send all; what is larger has to be downloaded by its owner."""

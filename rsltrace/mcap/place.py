@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rsltrace.mcap.address import is_address
 from rsltrace.mcap.source import ByteSource, FileSource
 
 
@@ -13,8 +12,8 @@ def open_source(place: Path | str) -> ByteSource:
 
     Raises SetupError for an address when fsspec, which reads it, is not installed.
     """
-    if is_address(place):
+    if isinstance(place, str) and "://" in place:
         from rsltrace.mcap.remote import open_remote  # a library that local files do not need
 
-        return open_remote(str(place))
+        return open_remote(place)
     return FileSource(Path(place))

@@ -68,30 +68,34 @@ class Fields:
 
     def take(self, length: int) -> bytes:
         """Return the next ``length`` bytes."""
-        end = self.position + length
+        begin = self.position
+        end = begin + length
         if end > len(self._data):
-            left = len(self._data) - self.position
-            raise Damaged(f"{length} bytes are expected where {left} are left")
-        piece = self._data[self.position : end]
+            raise self._ended(length)
         self.position = end
-        return piece
+        return self._data[begin:end]
 
     def u16(self) -> int:
         """Return the next unsigned 16-bit integer."""
-        return int(_U16.unpack(self.take(2))[0])
+        return self._integer(_U16)
 
     def u32(self) -> int:
         """Return the next unsigned 32-bit integer."""
-        return int(_U32.unpack(self.take(4))[0])
+        return self._integer(_U32)
 
     def u64(self) -> int:
         """Return the next unsigned 64-bit integer."""
-        return int(_U64.unpack(self.take(8))[0])
+        return self._integer(_U64)
 
     def text(self) -> str:
         """Return the next string."""
+        begin = self.position + 4
+        end = begin + self._integer(_U32)
+        if end > len(self._data):
+            raise self._ended(end - begin)
+        self.position = end
         try:
-            return self.take(self.u32()).decode("utf-8")
+            return self._data[begin:end].decode()
         except UnicodeDecodeError as error:
             raise Damaged(f"a text is not UTF-8: {error}") from error
 
@@ -110,6 +114,18 @@ class Fields:
         if len(data) % _CHANNEL_NUMBER.size:
             raise Damaged("a map is cut off")
         return list(_CHANNEL_NUMBER.iter_unpack(data))
+
+    def _integer(self, layout: struct.Struct) -> int:
+        try:
+            (value,) = layout.unpack_from(self._data, self.position)
+        except struct.error:
+            raise self._ended(layout.size) from None
+        self.position += layout.size
+        return int(value)
+
+    def _ended(self, length: int) -> Damaged:
+        left = len(self._data) - self.position
+        return Damaged(f"{length} bytes are expected where {left} are left")
 
 
 class Header(NamedTuple):

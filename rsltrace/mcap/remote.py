@@ -37,6 +37,8 @@ Fetch = Callable[[int, int], bytes]
 class RemoteSource:
     """A ByteSource in blocks over ``fetch``. ``requests`` counts the calls of it."""
 
+    is_remote = True
+
     def __init__(self, name: str, size: int, fetch: Fetch) -> None:
         self._name = name
         self._size = size

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from rsltrace.errors import OutputError
 from rsltrace.mcap.records import MAGIC
+from rsltrace.mcap.source import not_regular
 
 
 class Sink:
@@ -26,9 +27,9 @@ class Sink:
         self.path = path
         self.offset = 0
         self.crc = 0
-        if force and not _may_be_replaced(path):
+        if force and (why := _why_not_replaced(path)):
             raise OutputError(
-                f"cannot write the trace {path}: what is there is no trace (it is not MCAP); "
+                f"cannot write the trace {path}: what is there is no trace ({why}); "
                 "remove it yourself, or choose another place with -o"
             )
         flags = os.O_WRONLY | os.O_CREAT | (os.O_TRUNC if force else os.O_EXCL)
@@ -60,16 +61,17 @@ class Sink:
             os.close(fd)
 
 
-def _may_be_replaced(path: Path) -> bool:
-    """Say whether nothing but a trace would be lost: ``-o job.yaml`` is a slip of the pen."""
+def _why_not_replaced(path: Path) -> str:
+    """Say what is there if it is no trace, "" if it is: ``-o job.yaml`` is a slip of the pen."""
     try:
-        if not path.is_file():
-            return True
+        kind = not_regular(path)
+        if kind:
+            return "" if kind == "a folder" else f"it is {kind}"
         with path.open("rb") as file:
             begin = file.read(len(MAGIC))
     except OSError:
-        return True  # opening it to write says what is wrong
-    return MAGIC.startswith(begin)
+        return ""  # opening it to write says what is wrong
+    return "" if MAGIC.startswith(begin) else "it is not MCAP"
 
 
 def _why_not_created(path: Path, error: OSError) -> str:

@@ -34,6 +34,11 @@ class ByteSource(Protocol):
         """How many bytes were fetched from the storage so far."""
         ...
 
+    @property
+    def is_remote(self) -> bool:
+        """Whether reading all of it would take long."""
+        ...
+
     def read_at(self, offset: int, length: int) -> bytes:
         """Return exactly ``length`` bytes from ``offset``. Raises an error if it cannot."""
         ...
@@ -68,6 +73,8 @@ def not_regular(path: Path) -> str:
 
 class FileSource:
     """A file on disk."""
+
+    is_remote = False
 
     def __init__(self, path: Path, error: type[RsltraceError] = TraceError) -> None:
         """Open ``path``. Raises ``error``, as all methods do, if it cannot be read as a file."""

@@ -40,6 +40,8 @@ _BEFORE_CRC = RECORD_HEAD.size + 16
 _DATA_END_BYTES = RECORD_HEAD.size + 4
 _BLOCK_BYTES = 1 << 20
 _CHUNK_INDEX = int(Opcode.CHUNK_INDEX)
+_SCHEMA, _CHANNEL, _STATISTICS = int(Opcode.SCHEMA), int(Opcode.CHANNEL), int(Opcode.STATISTICS)
+_ATTACHMENT_INDEX, _METADATA_INDEX = int(Opcode.ATTACHMENT_INDEX), int(Opcode.METADATA_INDEX)
 
 
 class Footer(NamedTuple):
@@ -67,18 +69,18 @@ class Summary:
 
     def add(self, opcode: int, body: bytes) -> None:
         """Take over a record, unless it is the index of a chunk. Raises Damaged."""
-        if opcode == Opcode.SCHEMA:
+        if opcode == _SCHEMA:
             schema = parse_schema(body)
             self.schemas.setdefault(schema.id, schema)
-        elif opcode == Opcode.CHANNEL:
+        elif opcode == _CHANNEL:
             channel = parse_channel(body)
             self.channels.setdefault(channel.id, channel)
-        elif opcode == Opcode.STATISTICS:
+        elif opcode == _STATISTICS:
             self.statistics = parse_statistics(body)
-        elif opcode in (Opcode.ATTACHMENT_INDEX, Opcode.METADATA_INDEX):
+        elif opcode in (_ATTACHMENT_INDEX, _METADATA_INDEX):
             entry = Fields(body)
             span = Span(entry.u64(), entry.u64())
-            if opcode == Opcode.ATTACHMENT_INDEX:
+            if opcode == _ATTACHMENT_INDEX:
                 entry.take(24)  # log time, creation time, size
                 self.attachments[entry.text()] = span
             else:
@@ -129,12 +131,14 @@ def read_summary(source: ByteSource, footer: Footer) -> Summary:
     data = source.read_at(footer.summary_start, length + _BEFORE_CRC)
     if footer.crc and crc32(data) != footer.crc:
         raise Damaged("its CRC does not match")
+    chunk_indexes: list[bytes] = []
+    summary = Summary(chunk_indexes)
     records = data[:length]
-    found = [(opcode, records[start:end]) for opcode, start, end in records_in(records)]
-    summary = Summary([body for opcode, body in found if opcode == _CHUNK_INDEX])
-    for opcode, body in found:
-        if opcode != _CHUNK_INDEX:
-            summary.add(opcode, body)
+    for opcode, start, end in records_in(records):
+        if opcode == _CHUNK_INDEX:
+            chunk_indexes.append(records[start:end])
+        else:
+            summary.add(opcode, records[start:end])
     return summary
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
@@ -14,13 +13,6 @@ from rsltrace.mcap.source import ByteSource
 _BLOCK_BYTES = 1 << 20
 _TORN_BYTES = 64 << 10
 _KNOWN = frozenset(map(int, Opcode))
-
-
-class Record(NamedTuple):
-    """A whole record of a file: what it is, and where."""
-
-    opcode: int
-    span: Span
 
 
 def read_body(source: ByteSource, span: Span, opcode: int) -> bytes:
@@ -34,8 +26,11 @@ def read_body(source: ByteSource, span: Span, opcode: int) -> bytes:
     return record[RECORD_HEAD.size :]
 
 
-def walk_records(source: ByteSource, start: int, end: int) -> Iterator[Record]:
-    """Yield the records between two places of a file. Raises Damaged at one that is not whole."""
+def walk_records(source: ByteSource, start: int, end: int) -> Iterator[tuple[int, Span]]:
+    """Yield opcode and place of the records between two places of a file.
+
+    Raises Damaged at one that is not whole.
+    """
     at = start
     while at < end:
         if at + RECORD_HEAD.size > end:
@@ -44,23 +39,23 @@ def walk_records(source: ByteSource, start: int, end: int) -> Iterator[Record]:
         span = Span(at, length + RECORD_HEAD.size)
         if span.end > end:
             raise Damaged(f"the record at byte {at} runs past the end of its section")
-        yield Record(opcode, span)
+        yield opcode, span
         at = span.end
 
 
-def whole_records(source: ByteSource) -> Iterator[Record]:
-    """Yield the records of a file without an end, as far as they are whole.
+def whole_records(source: ByteSource) -> Iterator[tuple[int, Span]]:
+    """Yield what ``walk_records`` does of a file without an end, as far as it is whole.
 
     Raises Damaged, telling why, where the rest is not the beginning of one more record: a file
     that was cut ends in the middle of one, or in zeros, which a crash leaves where data should be.
     """
     at = len(MAGIC)
     try:
-        for record in walk_records(source, at, source.size):
-            if record.opcode not in _KNOWN:
+        for opcode, span in walk_records(source, at, source.size):
+            if opcode not in _KNOWN:
                 break
-            yield record
-            at = record.span.end
+            yield opcode, span
+            at = span.end
     except Damaged:
         pass  # where it was cut, or is damaged
     if why := _not_torn(source, at):
@@ -78,7 +73,7 @@ def _not_torn(source: ByteSource, at: int) -> str:
     opcode, length = RECORD_HEAD.unpack_from(head)
     if opcode not in _KNOWN:
         return f"no record of MCAP begins with {opcode}"
-    said = _said_by_fields(opcode, head[RECORD_HEAD.size :])
+    said = length_by_fields(opcode, head[RECORD_HEAD.size :])
     if said is not None and said != length:
         return f"its length is given as {length}, its fields say {said}"
     return ""
@@ -104,7 +99,7 @@ _BEFORE_TEXTS = {
 these follow each other."""
 
 
-def _said_by_fields(opcode: int, body: bytes) -> int | None:
+def length_by_fields(opcode: int, body: bytes) -> int | None:
     """Return how long a record's fields say that it is, None where they are cut off, too."""
     if opcode not in _BEFORE_TEXTS:
         return None

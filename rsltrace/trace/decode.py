@@ -12,6 +12,7 @@ import dataclasses
 import math
 import re
 import struct
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from rosbags.typesys.msg import get_types_from_msg, normalize_msgtype
 from rosbags.typesys.store import Typestore
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
 
@@ -29,11 +31,8 @@ _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", r
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _INTEGER_TYPES = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 _BASE_TYPES = _INTEGER_TYPES | {"bool", "byte", "char", "float32", "float64", "string"}
-_SCHEMA_BYTES_MAX = 1 << 20
 _NESTING_MAX = 32
 _ARRAY_ITEMS_MAX = 1 << 32
-_UNROLLED_ITEMS_MAX = 4096
-"""The generator writes a statement per element of a fixed array of strings or messages."""
 _NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 
 
@@ -49,8 +48,8 @@ class Decoder:
         self._channel = channel
         if channel.schema_encoding != SCHEMA_ENCODING:
             raise self._unusable(f"its encoding is {channel.schema_encoding!r}")
-        if len(channel.schema_text) > _SCHEMA_BYTES_MAX:
-            raise self._unusable(f"it is longer than {_SCHEMA_BYTES_MAX} characters")
+        if len(channel.schema_text) > limits.SCHEMA_BYTES_MAX:
+            raise self._unusable(f"it is longer than {limits.SCHEMA_BYTES_MAX} characters")
         if not _TYPE_NAME.fullmatch(channel.type):
             raise self._unusable(f"{channel.type!r} is no name of a type")
         # Types named without a package are looked up beside the type: those a service names are in
@@ -59,6 +58,9 @@ class Decoder:
         try:
             types = get_types_from_msg(channel.schema_text, self._name)
             checked: dict[str, Any] = {name: ([], _checked_fields(name, types)) for name in types}
+            self.items = sum(map(_unrolled, checked.values()))
+            if self.items > limits.SCHEMA_ITEMS_MAX:
+                raise _UnsafeSchema(f"its fixed arrays have {self.items} strings or messages")
             depths: dict[str, int] = {}
             for name in types:
                 _nesting(name, types, depths)
@@ -83,12 +85,49 @@ class Decoder:
                 f"{error}"
             ) from error
 
+    def of(self, channel: ChannelInfo) -> Decoder:
+        """Return this decoder for another channel of the same schema."""
+        other = copy(self)
+        other._channel = channel
+        return other
+
     def _unusable(self, why: object) -> TraceError:
         first_line = (str(why).splitlines() or [type(why).__name__])[0]
         return TraceError(
             f"messages on {self._channel.topic} cannot be decoded: the trace's schema of "
             f"{self._channel.type or 'their type'} is not usable ({first_line})"
         )
+
+
+class Decoders:
+    """The decoders of a trace: one for all channels of a schema, within limits for all schemas."""
+
+    def __init__(self) -> None:
+        self._by_channel: dict[int, Decoder] = {}
+        self._by_schema: dict[tuple[str, str, str], Decoder] = {}
+        self._bytes = 0
+        self._items = 0
+
+    def of(self, channel: ChannelInfo) -> Decoder:
+        """Return the decoder of a channel. Raises TraceError if its schema is unusable."""
+        decoder = self._by_channel.get(channel.id)
+        if decoder is None:
+            key = (channel.type, channel.schema_encoding, channel.schema_text)
+            made = self._by_schema.get(key) or self._make(channel)
+            self._by_schema[key] = made
+            decoder = self._by_channel[channel.id] = made.of(channel)
+        return decoder
+
+    def _make(self, channel: ChannelInfo) -> Decoder:
+        self._bytes += len(channel.schema_text)
+        if self._bytes > limits.SCHEMAS_BYTES_MAX or self._items > limits.SCHEMAS_ITEMS_MAX:
+            raise TraceError(
+                f"messages on {channel.topic} cannot be decoded: the schemas of this trace are "
+                "larger than those of any robot"
+            )
+        made = Decoder(channel)
+        self._items += made.items
+        return made
 
 
 def to_plain(value: object) -> Any:
@@ -133,6 +172,12 @@ def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:
     return fields
 
 
+def _unrolled(definition: tuple[list[Any], list[tuple[str, Any]]]) -> int:
+    """Return for how many items the generator writes a statement: those of fixed arrays."""
+    arrays = [detail for _, (kind, detail) in definition[1] if kind == Nodetype.ARRAY]
+    return sum(n for item, n in arrays if item[0] == Nodetype.NAME or item[1][0] == "string")
+
+
 def _check_type(description: Any, types: dict[str, Any]) -> None:
     kind, detail = description
     if kind == Nodetype.BASE:
@@ -147,11 +192,9 @@ def _check_type(description: Any, types: dict[str, Any]) -> None:
         if item[0] not in (Nodetype.BASE, Nodetype.NAME):
             raise _UnsafeSchema("it has an array of arrays")
         _check_type(item, types)
-        unrolled = kind == Nodetype.ARRAY and (item[0] == Nodetype.NAME or item[1][0] == "string")
-        limit = _UNROLLED_ITEMS_MAX if unrolled else _ARRAY_ITEMS_MAX
         # A fixed array of nothing would let arrays of arrays count forever without using data.
         smallest = 1 if kind == Nodetype.ARRAY else 0
-        if not isinstance(size, int) or not smallest <= size <= limit:
+        if not isinstance(size, int) or not smallest <= size <= _ARRAY_ITEMS_MAX:
             raise _UnsafeSchema(f"an array cannot have {size} items")
     else:
         raise _UnsafeSchema(f"there is no kind of field {kind!r}")

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.mcap.limits import RESPONSE_BYTES_MAX
 from rsltrace.mcap.place import open_source
 from rsltrace.mcap.records import Header
 from rsltrace.mcap.source import ByteSource
@@ -46,11 +47,10 @@ from rsltrace.trace.guarded import parse_counts
 from rsltrace.trace.index import ChannelInfo, read_summary
 from rsltrace.trace.payloads import PayloadReader
 from rsltrace.trace.pieces import read_attachment, read_metadata
-from rsltrace.trace.scan import scan
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
-    from rsltrace.trace.decode import Decoder
+    from rsltrace.trace.decode import Decoders
 
 RUN = Entity(0, 0, EntityKind.SYSTEM, "", "", 0, {})
 """The run itself, in traces that do not describe it: what belongs to no node."""
@@ -67,7 +67,12 @@ class Trace:
         """Read the index of ``source``, which belongs to this object from now on."""
         self._source = source
         try:
-            index = read_summary(source) if has_end(source) else scan(source)
+            if has_end(source):
+                index = read_summary(source)
+            else:
+                from rsltrace.trace.scan import scan  # which whole traces do not need
+
+                index = scan(source)
             ids: dict[str, list[int]] = {}
             for channel in index.channels.values():
                 ids.setdefault(channel.topic, []).append(channel.id)
@@ -84,7 +89,8 @@ class Trace:
                 ids.get(TOPIC_OUTPUTS, [0])[0],
             )
             self._payloads = PayloadReader(source, index)
-            self._decoders: dict[int, Decoder] = {}
+            self._data_checked = False
+            self._decoders: Decoders | None = None
             self._check_result()
         except BaseException:
             source.close()
@@ -212,9 +218,22 @@ class Trace:
 
         An interrupted trace has no checksum over the file; its hashes are checked all the same.
         """
-        if self._index.summary_start:
-            check_data_section(self._source, self._index.summary_start)
+        self._check_data()
         check_hashes(self._source, self._segments)
+
+    def check_settings(self) -> None:
+        """Raise TraceError unless job, environment and sources are as they were recorded.
+
+        They are covered by the checksum of the file up to its summary, so this reads it. It does
+        nothing for an interrupted trace, which has none, and a large one at an address.
+        """
+        if not (self._source.is_remote and self.size > RESPONSE_BYTES_MAX):
+            self._check_data()
+
+    def _check_data(self) -> None:
+        if self._index.summary_start and not self._data_checked:
+            check_data_section(self._source, self._index.summary_start)
+            self._data_checked = True
 
     # Entities.
 
@@ -224,6 +243,11 @@ class Trace:
         entities = {RUN.id: RUN}
         for stamp_ns, _, data in self.messages(TOPIC_ENTITIES):
             entity = unpack_entity(data, stamp_ns)
+            if entity.id > len(entities):  # tables by id would be as large as it says
+                raise TraceError(
+                    f"{self.name}: entity {entity.id} follows {len(entities) - 1} others; ids "
+                    "count up, so the trace is damaged or was not made by rsltrace"
+                )
             entities[entity.id] = entity
         return entities
 
@@ -348,14 +372,12 @@ class Trace:
             found = channel
         if found is None:
             raise TraceError(f"{self.name} has no topic {channel}")
-        decoder = self._decoders.get(found.id)
-        if decoder is None:
-            from rsltrace.trace.decode import (
-                Decoder,  # its library takes as long as opening a trace
-            )
+        if self._decoders is None:
+            # Its library takes as long as opening a trace.
+            from rsltrace.trace.decode import Decoders
 
-            decoder = self._decoders[found.id] = Decoder(found)
-        return decoder.decode(data)
+            self._decoders = Decoders()
+        return self._decoders.of(found).decode(data)
 
     def _channel(self, topic: str, type_name: str) -> ChannelInfo | None:
         """Return the channel of a topic: the one of that type, where there are several."""

@@ -18,7 +18,7 @@ from rsltrace.mcap.chunk import read_chunk
 from rsltrace.mcap.records import Damaged, Fields, Span
 from rsltrace.mcap.source import ByteSource
 from rsltrace.mcap.summary import Summary
-from rsltrace.mcap.walk import read_body, whole_records
+from rsltrace.mcap.walk import length_by_fields, read_body, whole_records
 from rsltrace.trace.format import METADATA_FORMAT, SEGMENT_DTYPE, TOPIC_EVENTS, TOPIC_OUTPUTS
 from rsltrace.trace.index import ChunkEntry, TraceIndex, check_version, not_a_trace, read_header
 from rsltrace.trace.pieces import messages_in
@@ -78,29 +78,30 @@ class _Scanner:
 
     def _take(self, opcode: int, span: Span) -> None:
         """Take over a record. Raises Damaged."""
-        source, summary = self._source, self._summary
         if opcode == Opcode.CHUNK:
             self._chunk(span)
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._message_index(span)
+            return
+        if opcode == Opcode.DATA_END:
+            return
+        body = read_body(self._source, span, opcode)
+        said = length_by_fields(opcode, body)
+        if said != len(body):
+            raise Damaged(f"its length is given as {len(body)}, its fields say {said}")
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._message_index(span, Fields(body).u16())
         elif opcode in _NAMED_AFTER:
-            fields = Fields(read_body(source, span, opcode))
+            fields = Fields(body)
             fields.take(_NAMED_AFTER[opcode])
-            named = summary.metadata if opcode == Opcode.METADATA else summary.attachments
-            named[fields.text()] = span
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            summary.add(opcode, read_body(source, span, opcode))
-            ids = {channel.topic: channel.id for channel in summary.channels.values()}
+            metadata, attachments = self._summary.metadata, self._summary.attachments
+            (metadata if opcode == Opcode.METADATA else attachments)[fields.text()] = span
+        else:
+            self._summary.add(opcode, body)
+            ids = {channel.topic: channel.id for channel in self._summary.channels.values()}
             self._event_channel = ids.get(TOPIC_EVENTS, -1)
             self._output_channel = ids.get(TOPIC_OUTPUTS, -1)
-        elif opcode != Opcode.DATA_END:
-            raise Damaged(f"a record of kind {opcode} is where a trace has none")
 
-    def _message_index(self, span: Span) -> None:
-        fields = Fields(read_body(self._source, span, Opcode.MESSAGE_INDEX))
-        channel_id = fields.u16()
-        fields.take(fields.u32())
-        if not fields.at_end or not self._chunks or channel_id not in self._chunks[-1].counts:
+    def _message_index(self, span: Span, channel_id: int) -> None:
+        if not self._chunks or channel_id not in self._chunks[-1].counts:
             raise Damaged("it is not the index of the chunk before it")
         last = self._chunks[-1]
         self._chunks[-1] = last._replace(indexes={**last.indexes, channel_id: span})

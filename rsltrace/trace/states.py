@@ -51,9 +51,13 @@ def _leaf(leaf: Any, before: Leaf | None) -> Leaf:
     count = int(np.prod(shape, dtype=object)) if shape else 1
     if dtype.hasobject or not 0 <= count * dtype.itemsize <= ARRAY_BYTES_MAX:
         raise ValueError(f"an array of {shape} {dtype}")
-    data = bytearray(count * dtype.itemsize)
-    if isinstance(before, np.ndarray) and before.nbytes == len(data):
-        data[:] = before.tobytes()
+    size = count * dtype.itemsize
+    if isinstance(before, np.ndarray) and before.nbytes == size:
+        data = bytearray(before.tobytes())
+    elif len(leaf["blocks"]) * BLOCK_BYTES >= size:
+        data = bytearray(size)
+    else:
+        raise ValueError(f"an array of {size} bytes, of which there are fewer")
     for number, block in leaf["blocks"].items():
         try:
             piece = base64.b64decode(block, validate=True)

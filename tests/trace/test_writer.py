@@ -328,10 +328,15 @@ def test_channel_metadata_is_that_of_rosbag2(tmp_path: Path) -> None:
 # -- a disk that refuses --------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has /dev/full")
-def test_a_full_disk_at_the_first_byte_is_an_output_error() -> None:
-    with pytest.raises(OutputError, match=r"/dev/full: No space left on device \(ENOSPC\)"):
-        TraceWriter(Path("/dev/full"), force=True)
+def test_a_full_disk_at_the_first_byte_is_an_output_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(fd: int, data: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr("rsltrace.mcap.sink.os.write", refuse)
+    with pytest.raises(OutputError, match=r"run.mcap: No space left on device \(ENOSPC\)"):
+        TraceWriter(tmp_path / "run.mcap", force=True)
 
 
 def fill(path: Path) -> str:

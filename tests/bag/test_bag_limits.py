@@ -1,0 +1,84 @@
+"""Recordings that ask for much, and things that are no files."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zstandard
+
+from rsltrace.bag import files as files_module
+from rsltrace.bag import metadata as metadata_module
+from rsltrace.bag import open_bag
+from rsltrace.bag import reader as reader_module
+from rsltrace.diff.file_kind import is_recording, is_trace
+from rsltrace.errors import BagError
+from rsltrace.mcap.limits import CHUNK_BYTES_MAX
+
+Maker = Callable[..., Path]
+
+
+def message(path: Path | str) -> str:
+    with pytest.raises(BagError) as caught:
+        open_bag(path)
+    return str(caught.value)
+
+
+def test_a_chunk_larger_than_any_bag_has_is_refused(mcap_bytes: Any, tmp_path: Path) -> None:
+    file = mcap_bytes().chunk([(0, 1, b"good")])
+    file.chunk([(0, 10, b"12")], size=CHUNK_BYTES_MAX + 1).finish(tmp_path / "a.mcap", ["/a"])
+    with open_bag(tmp_path / "a.mcap") as bag, pytest.raises(BagError, match="where at most") as e:
+        list(bag.messages())
+    assert f"a chunk of {CHUNK_BYTES_MAX + 1} bytes" in str(e.value)
+
+
+def test_a_compressed_file_that_fills_the_disk_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files_module, "FILE_BYTES_MIN", 1 << 20)
+    path = tmp_path / "a.mcap.zstd"
+    path.write_bytes(zstandard.compress(bytes(100 << 20)))
+    assert "unpacks to more than" in message(path)
+
+
+def test_a_compressed_message_that_takes_all_memory_is_refused(
+    bag_maker: Maker, samples: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_maker(tmp_path / "bag", samples, compression="message", storage="sqlite3")
+    monkeypatch.setattr(reader_module, "MESSAGE_BYTES_MAX", 8)
+    assert "it has more than 8 bytes" in message(path)
+
+
+def test_a_metadata_file_of_any_size_is_not_parsed(
+    bag_maker: Maker, samples: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = bag_maker(tmp_path / "bag", samples)
+    monkeypatch.setattr(metadata_module, "METADATA_YAML_BYTES_MAX", 100)
+    assert "larger than any bag's" in message(path)
+
+
+def test_brackets_without_end_are_no_metadata(
+    bag_maker: Maker, mcap_maker: Maker, samples: Any, tmp_path: Path
+) -> None:
+    path = bag_maker(tmp_path / "bag", samples)
+    (path / "metadata.yaml").write_text("[" * 5000)
+    assert "metadata.yaml: not YAML" in message(path)
+    mcap_maker(tmp_path / "a.mcap", samples, metadata={"offered_qos_profiles": "[" * 5000})
+    assert "the QoS profiles are not YAML" in message(tmp_path / "a.mcap")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_pipes_and_devices_are_no_recordings(tmp_path: Path) -> None:
+    """And are not opened to find out, which would wait for a writer."""
+    pipe = tmp_path / "pipe.mcap"
+    os.mkfifo(pipe)
+    assert (
+        message(pipe) == f"{pipe} is a named pipe, not a regular file: name a bag's folder or file"
+    )
+    assert "is not a regular file" in message("/dev/zero")
+    for path in (pipe, Path("/dev/zero")):
+        assert not is_trace(path)
+        assert not is_recording(path)
