@@ -34,71 +34,71 @@ def test_nobody_has_to_listen_to_the_nodes(
 
 @pytest.mark.parametrize("until", ["x", "-3", "", "nan"])
 def test_a_bad_until_is_named_as_it_was_typed(
-    job_file: Callable[..., Path], rsltrace: Any, until: str
+    job_file: Callable[..., Path], command: Any, until: str
 ) -> None:
     job_file(JOB)
-    done = rsltrace("record", "job.yaml", "--until", until)
+    done = command("record", "job.yaml", "--until", until)
     assert done.returncode == 2
     assert done.stderr.startswith("rsltrace: error: --until: ")
 
 
-def test_two_nodes_of_one_name_are_explained(job_file: Callable[..., Path], rsltrace: Any) -> None:
+def test_two_nodes_of_one_name_are_explained(job_file: Callable[..., Path], command: Any) -> None:
     job_file("nodes: [{node: nodes_under_test:Listener}, {node: nodes_under_test:Listener}]\n")
-    done = rsltrace("record", "job.yaml")
+    done = command("record", "job.yaml")
     assert done.returncode == 3
     assert "there is already a node named /listener; give one of them another name" in done.stderr
     assert "Traceback" not in done.stderr
 
 
 def test_a_number_without_end_is_not_printed_in_full(
-    job_file: Callable[..., Path], rsltrace: Any
+    job_file: Callable[..., Path], command: Any
 ) -> None:
     job_file(f"nodes: [{{node: nodes_under_test:Listener}}]\nseed: {'9' * 5000}\n")
-    done = rsltrace("record", "job.yaml")
+    done = command("record", "job.yaml")
     assert done.returncode == 2
     assert "...' is too long a number" in done.stderr
     assert len(done.stderr) < 500
 
 
-def test_a_recording_is_no_job(job_file: Callable[..., Path], rsltrace: Any) -> None:
+def test_a_recording_is_no_job(job_file: Callable[..., Path], command: Any) -> None:
     job_file(JOB)
-    assert rsltrace("record", "job.yaml", "--until", "0.1", "-o", "run.mcap").returncode == 0
-    done = rsltrace("record", "run.mcap")
+    assert command("record", "job.yaml", "--until", "0.1", "-o", "run.mcap").returncode == 0
+    done = command("record", "run.mcap")
     assert done.returncode == 2
     assert "run.mcap: this is a recording, not a job file" in done.stderr
 
 
 @pytest.mark.parametrize("key", ["base", "include"])
 def test_other_files_are_not_named_on_the_command_line(
-    job_file: Callable[..., Path], rsltrace: Any, key: str
+    job_file: Callable[..., Path], command: Any, key: str
 ) -> None:
     job_file(JOB)
-    done = rsltrace("check", "job.yaml", "--set", f"{key}=other.yaml")
+    done = command("check", "job.yaml", "--set", f"{key}=other.yaml")
     assert done.returncode == 2, "it would be left out in silence"
     assert f"--set: {key}: is read before the command line is" in done.stderr
 
 
-def test_a_module_is_no_job(job_file: Callable[..., Path], rsltrace: Any) -> None:
+def test_a_module_is_no_job(job_file: Callable[..., Path], command: Any) -> None:
     job_file("nodes: []\n")
-    done = rsltrace("record", "nodes_under_test.py")
+    done = command("record", "nodes_under_test.py")
     assert done.returncode == 2
     assert done.stderr == (
         "rsltrace: error: nodes_under_test.py: this is Python, not a job file; "
         "`rsltrace init --from nodes_under_test.py` writes one\n"
     )
     job_file("nodes: [{node: 'nodes_under_test.py:Talker'}]\n")
-    done = rsltrace("record", "job.yaml")
+    done = command("record", "job.yaml")
     assert "a module is named with dots: nodes_under_test:Talker\n" in done.stderr
 
 
-def test_a_command_that_is_misspelt(rsltrace: Any) -> None:
-    done = rsltrace("recrod", "job.yaml")
+def test_a_command_that_is_misspelt(command: Any) -> None:
+    done = command("recrod", "job.yaml")
     assert done.returncode == 2
     assert done.stderr.endswith("Error: No such command 'recrod'. Did you mean 'record'?\n")
-    assert rsltrace("xyzzy").stderr.endswith("Error: No such command 'xyzzy'.\n")
+    assert command("xyzzy").stderr.endswith("Error: No such command 'xyzzy'.\n")
 
 
-def test_a_job_without_an_end_says_so(job_file: Callable[..., Path], rsltrace: Any) -> None:
+def test_a_job_without_an_end_says_so(job_file: Callable[..., Path], command: Any) -> None:
     """It runs until somebody stops it, here the node; one that is told when does not say it."""
     code = """
 class Weary(Talker):
@@ -108,6 +108,6 @@ class Weary(Talker):
 """
     job_file("nodes: [{node: 'nodes_under_test:Weary'}]\n", code)
     note = "note: the job does not say when the run ends: 'stop:' in it does, --until T, and Ctrl-C"
-    endless = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    endless = command("record", "job.yaml", "-o", "run.mcap")
     assert (endless.returncode, note in endless.stderr) == (3, True)
-    assert note not in rsltrace("record", "job.yaml", "--until", "1", "-o", "2.mcap").stderr
+    assert note not in command("record", "job.yaml", "--until", "1", "-o", "2.mcap").stderr

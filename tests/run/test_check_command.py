@@ -96,9 +96,9 @@ to look at:
 """
 
 
-def test_the_report_of_a_job(rsltrace: Any, job_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_the_report_of_a_job(command: Any, job_file: Callable[..., Path], tmp_path: Path) -> None:
     job_file(JOB, NODES)
-    done = rsltrace("check", "job.yaml", "--set", "stop.duration=2s", "--graph", "g.svg")
+    done = command("check", "job.yaml", "--set", "stop.duration=2s", "--graph", "g.svg")
     assert done.stderr == ""
     assert done.stdout == EXPECTED
     assert done.returncode == 1
@@ -112,9 +112,9 @@ def test_the_report_of_a_job(rsltrace: Any, job_file: Callable[..., Path], tmp_p
     assert not list(tmp_path.glob("*.mcap"))
 
 
-def test_a_job_in_which_nothing_is_wrong(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., Path]) -> None:
     job_file(FINE)
-    done = rsltrace("check", "job.yaml", "--format", "json")
+    done = command("check", "job.yaml", "--format", "json")
     assert done.returncode == 0
     values = json.loads(done.stdout)
     assert values["job"]["livelock_limit"] == 100_000
@@ -132,19 +132,19 @@ def main():
 """
 
 
-def test_a_main_that_spins_waits_for_nothing(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+def test_a_main_that_spins_waits_for_nothing(command: Any, job_file: Callable[..., Path]) -> None:
     job_file("nodes: [{main: nodes_under_test:main}, {node: nodes_under_test:Listener}]\n", MAIN)
-    done = rsltrace("check", "job.yaml")
+    done = command("check", "job.yaml")
     assert done.stdout.endswith("  ->  /listener\n\nnothing looks wrong\n")
     assert done.stderr == "next: rsltrace record job.yaml\n"
 
 
-def test_a_topic_that_is_played_and_published(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+def test_a_topic_that_is_played_and_published(command: Any, job_file: Callable[..., Path]) -> None:
     job_file(FINE)
-    done = rsltrace("record", "job.yaml", "--set", "stop.duration=3s", "--bag", "numbers")
+    done = command("record", "job.yaml", "--set", "stop.duration=3s", "--bag", "numbers")
     assert done.returncode == 0, done.stderr
     job_file(FINE + "bags: [numbers]\n")
-    done = rsltrace("check", "job.yaml")
+    done = command("check", "job.yaml")
     assert done.returncode == 1
     assert done.stdout.endswith(
         "to look at:\n"
@@ -152,7 +152,7 @@ def test_a_topic_that_is_played_and_published(rsltrace: Any, job_file: Callable[
         "unless both are meant: bags: [{path: ..., exclude: [/numbers]}]\n"
     )
     job_file(FINE + "bags: [{path: numbers, exclude: [/numbers]}]\n")
-    assert rsltrace("check", "job.yaml").returncode == 0
+    assert command("check", "job.yaml").returncode == 0
 
 
 @pytest.mark.parametrize(
@@ -164,18 +164,18 @@ def test_a_topic_that_is_played_and_published(rsltrace: Any, job_file: Callable[
     ],
 )
 def test_a_job_that_cannot_run(
-    rsltrace: Any, job_file: Callable[..., Path], job: str, expected: str
+    command: Any, job_file: Callable[..., Path], job: str, expected: str
 ) -> None:
     job_file(job, NODES)
-    done = rsltrace("check", "job.yaml")
+    done = command("check", "job.yaml")
     assert done.returncode == 2
     assert expected in done.stderr
     assert done.stdout == ""
 
 
-def test_only_svg_is_drawn(rsltrace: Any, job_file: Callable[..., Path]) -> None:
+def test_only_svg_is_drawn(command: Any, job_file: Callable[..., Path]) -> None:
     job_file(FINE)
-    done = rsltrace("check", "job.yaml", "--graph", "graph.png")
+    done = command("check", "job.yaml", "--graph", "graph.png")
     assert done.returncode == 2
     assert "graph.png should end in .svg" in done.stderr
 
@@ -221,7 +221,7 @@ def test_the_picture_of_a_graph_is_the_same_every_time(job_file: Callable[..., P
 
 
 def test_what_keeps_ends_apart_is_shown_with_its_values(
-    rsltrace: Any, job_file: Callable[..., Path]
+    command: Any, job_file: Callable[..., Path]
 ) -> None:
     code = """
 from rclpy.duration import Duration
@@ -242,7 +242,7 @@ class Picky(Node):
         self.create_subscription(UInt64, 'slow', print, qos)
 """
     job_file("nodes: [{node: nodes_under_test:Slow}, {node: nodes_under_test:Picky}]\n", code)
-    done = rsltrace("check", "job.yaml")
+    done = command("check", "job.yaml")
     assert done.returncode == 1
     assert done.stdout.endswith(
         "do not connect: liveliness and deadline (/slow offers reliable, volatile, keep last 1, "

@@ -154,7 +154,7 @@ def main():
 
 
 def test_check_names_them_and_a_run_that_failed_does_not(
-    rsltrace: Any, job_file: Callable[..., Path], record_job: Callable[..., Any]
+    command: Any, job_file: Callable[..., Path], record_job: Callable[..., Any]
 ) -> None:
     fails = """
 class Failing(Node):
@@ -166,13 +166,13 @@ class Failing(Node):
     assert record_job(bad, fails, output=None).notes == ()
     yaml = "nodes: [{node: nodes_under_test:Talker}]\nclocks: [{node: /talkr, offset: 1s}]\n"
     job_file(yaml + "stop: {duration: 1s}\n")
-    done = rsltrace("check", "job.yaml")
+    done = command("check", "job.yaml")
     assert done.returncode == 1
     assert done.stdout.endswith(
         "to look at:\n  job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n"
         "(what nodes create later, in callbacks, is not there yet)\n"
     )
-    done = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    done = command("record", "job.yaml", "-o", "run.mcap")
     assert done.returncode == 0
     assert "note: job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n" in done.stderr
 
