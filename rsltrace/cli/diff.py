@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -156,14 +155,7 @@ def diff(
         relative=relative,
         by=by,
     )
-    try:
-        return _diff(golden, others, form, options, output, check=check)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        # Python's own exit status for a bug would be 1, which here says that the runs diverge.
-        traceback.print_exc()
-        return EXIT_USAGE
+    return _diff(golden, others, form, options, output, check=check)
 
 
 def _diff(
