@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 
@@ -229,7 +230,7 @@ def _print(
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
-        output.write_text(render(one_or_all, form, options), encoding="utf-8")
+        write_text(output, render(one_or_all, form, options))
         click.echo(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
     elif form != "text":
         click.echo(render(one_or_all, form, options), nl=False)

@@ -162,7 +162,7 @@ class Session:
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
             self._import_what_is_named()
-        check_bag_types(self._bags)
+        check_bag_types(self.job, self._bags)
         if self._output is not None:
             self._open_trace(stack, self._output)
         self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
