@@ -52,21 +52,37 @@ def open_standard_streams() -> None:
     for number, name in ((1, "stdout"), (2, "stderr")):
         stream = getattr(sys, name)
         if stream is None:
-            devnull = os.open(os.devnull, os.O_WRONLY)
-            if devnull != number:
-                os.dup2(devnull, number)
-                os.close(devnull)
+            _lead_nowhere(number)
         elif not isinstance(stream, io.TextIOWrapper) or stream.fileno() != number:
             continue  # somebody else's, who calls us
-        raw = _Stream(number, f"standard {name[3:]}put", heedless=name == "stderr")
-        opened = io.TextIOWrapper(
-            io.BufferedWriter(raw),
-            encoding=getattr(stream, "encoding", "utf-8"),
-            errors="backslashreplace",
-            line_buffering=getattr(stream, "line_buffering", True),
-            write_through=getattr(stream, "write_through", False),
-        )
-        setattr(sys, name, opened)
+        _open(number, name, stream)
+
+
+def reopen_standard_streams() -> None:
+    """Open those again that a node has closed; their descriptors are not."""
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if isinstance(stream, io.TextIOWrapper) and stream.closed:
+            _open(number, name, stream)
+
+
+def _open(number: int, name: str, stream: io.TextIOWrapper | None) -> None:
+    raw = _Stream(number, f"standard {name[3:]}put", heedless=name == "stderr")
+    opened = io.TextIOWrapper(
+        io.BufferedWriter(raw),
+        encoding=getattr(stream, "encoding", "utf-8"),
+        errors="backslashreplace",
+        line_buffering=getattr(stream, "line_buffering", True),
+        write_through=getattr(stream, "write_through", False),
+    )
+    setattr(sys, name, opened)
+
+
+def _lead_nowhere(number: int) -> None:
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    if devnull != number:
+        os.dup2(devnull, number)
+        os.close(devnull)
 
 
 def status_of(command: Callable[[], object]) -> int:
@@ -122,8 +138,6 @@ def _failed(message: str, status: int) -> int:
 def _forget_output() -> None:
     """Send what is still buffered to nowhere, or Python would fail on it again at exit."""
     try:
-        devnull = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(devnull, sys.stdout.fileno())
-        os.close(devnull)
+        _lead_nowhere(sys.stdout.fileno())
     except (OSError, ValueError):
         pass  # not a real file: nothing is flushed to it later either

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.exit_status import status_without_output
+from rsltrace.cli.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import NodeError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
@@ -131,6 +131,7 @@ def record(
             replay=replay,
         )
     status = result.exit_code
+    reopen_standard_streams()
     try:
         _report(result, path, told, as_json=as_json)
         if bag is not None:

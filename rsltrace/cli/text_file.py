@@ -29,8 +29,8 @@ def write_text(path: Path, text: str) -> None:
     final = Path(os.path.realpath(path))
     work = final.with_name(f".{final.name}.part-{os.getpid()}")
     try:
-        if final.exists() and not final.is_file():
-            final.write_text(text, encoding="utf-8")
+        if path.exists() and not path.is_file():
+            path.write_text(text, encoding="utf-8")
             return
         with work.open("x", encoding="utf-8") as file, undone(work):
             file.write(text)

@@ -62,6 +62,7 @@ HARMLESS = {
     "goes to another folder": "os.mkdir('other'); os.chdir('other')",
     "may open nothing more": "resource.setrlimit(resource.RLIMIT_NOFILE, (3, 4096))",
     "has no more standard streams": "sys.stdout = sys.stderr = sys.__stdout__ = None",
+    "closes its standard streams": "sys.stdout.close(); sys.stderr.close()",
     "turns standard streams elsewhere": (
         "self.own = open('own', 'w'); [os.dup2(self.own.fileno(), n) for n in (0, 1, 2)]"
     ),
