@@ -15,7 +15,7 @@
         └── GuardError               3  a node made a call that its job forbids (see ``guard:``)
 
 A job can end a run with an exit status of its own (see ``stop:``); these are for failures.
-An interrupted run (Ctrl-C, SIGTERM) exits with 130 or 143, as shells expect.
+An interrupted run (Ctrl-C, SIGTERM, SIGHUP) exits with 130, 143 or 129, as shells expect.
 """
 
 from __future__ import annotations

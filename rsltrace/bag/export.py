@@ -6,6 +6,7 @@ A trace is a bag already, one that carries more; some tools, and some people, wa
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import textwrap
 from collections.abc import Iterator, Sequence
@@ -121,8 +122,7 @@ def _write(
             )
         start_ns = end_ns = 0
         if kept:
-            # Globs of the topics themselves; a topic's name has no glob characters in it.
-            with open_bag(trace, topics=[c.topic for c in kept], recover=True) as bag:
+            with open_bag(trace, topics=[_literal(c.topic) for c in kept], recover=True) as bag:
                 sequences = dict.fromkeys(ids, 0)
                 start_ns = bag.start_ns
                 for end_ns, number, data in bag.messages():
@@ -133,6 +133,11 @@ def _write(
                     )
         writer.finish()  # type: ignore[no-untyped-call]
     return start_ns, end_ns
+
+
+def _literal(topic: str) -> str:
+    """Return the glob that fits a topic alone; a trace made elsewhere may have any name in it."""
+    return re.sub(r"[*?[]", r"[\g<0>]", topic)
 
 
 @contextmanager

@@ -196,6 +196,7 @@ def _recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
         result = json.loads(last[0])
         digest, events = str(result["digest"]), int(result["events"])
         failure = str(result["error"] or "")
+        path = Path(result["path"])  # a trace that was there stays if no run comes about
     except (ValueError, KeyError, TypeError):
         digest, events, failure = "", 0, ""
     if done.timed_out:

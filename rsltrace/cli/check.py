@@ -12,7 +12,8 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.text import table
-from rsltrace.errors import EXIT_USAGE, NodeError, OutputError, RunError
+from rsltrace.cli.text_file import write_text
+from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 
@@ -89,10 +90,7 @@ def _draw(checked: Checked, path: Path) -> None:
     from rsltrace.cli.graph_svg import graph_svg
 
     picture = graph_svg(checked.overview)
-    try:
-        path.write_text(picture, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+    write_text(path, picture)
 
 
 def _values(job: Job, checked: Checked) -> dict[str, Any]:

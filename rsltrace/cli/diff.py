@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import shutil
 import sys
-import traceback
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
 
@@ -156,14 +156,7 @@ def diff(
         relative=relative,
         by=by,
     )
-    try:
-        return _diff(golden, others, form, options, output, check=check)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        # Python's own exit status for a bug would be 1, which here says that the runs diverge.
-        traceback.print_exc()
-        return EXIT_USAGE
+    return _diff(golden, others, form, options, output, check=check)
 
 
 def _diff(
@@ -237,7 +230,7 @@ def _print(
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
-        output.write_text(render(one_or_all, form, options), encoding="utf-8")
+        write_text(output, render(one_or_all, form, options))
         click.echo(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
     elif form != "text":
         click.echo(render(one_or_all, form, options), nl=False)

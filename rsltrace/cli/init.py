@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.text_file import undone
 from rsltrace.errors import BagError, OutputError
 from rsltrace.model.stamp import format_duration, format_seconds
 
@@ -60,8 +61,9 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     nodes = [_look(source, folder) for source in sources if source not in bags]
     text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes))
     try:
-        with job.open("x", encoding="utf-8") as file:
+        with job.open("x", encoding="utf-8") as file, undone(job):
             file.write(text)
+            file.flush()
     except OSError as error:
         raise OutputError(f"{job} cannot be written: {error.strerror or error}") from error
     from rsltrace.job import load_job

@@ -1,4 +1,4 @@
-"""The ``rsltrace`` command: finds subcommands when they are used, and handles errors for all.
+"""The ``rsltrace`` command: finds subcommands when they are used.
 
 A subcommand is a module that is imported when it is called, so ``rsltrace --help`` costs what
 click costs, however much the others need.
@@ -7,20 +7,15 @@ click costs, however much the others need.
 from __future__ import annotations
 
 import importlib
-import os
 import sys
 from collections.abc import Sequence
-from typing import IO, Any, NoReturn
+from typing import Any, NoReturn
 
 import click
 
 from rsltrace._version import __version__
-from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.cli.exit_status import open_standard_streams, status_of
 from rsltrace.guard.pin import pin_recording
-
-EXIT_INTERRUPTED = 130
-EXIT_BROKEN_PIPE = 141
-"""128 + SIGPIPE, what a shell reports of any program whose reader went away."""
 
 _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
@@ -72,25 +67,12 @@ class LazyGroup(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl(list(_COMMANDS.items()))
 
-    def invoke(self, ctx: click.Context) -> Any:
-        """Run a command; the one place where an error becomes a message and an exit status."""
-        _tolerate_any_character(sys.stdout)
-        _tolerate_any_character(sys.stderr)
-        try:
-            status = super().invoke(ctx)
-            sys.stdout.flush()  # here, where a reader that went away is no traceback
-        except RsltraceError as error:
-            _fail(str(error), error.exit_code)
-        except BrokenPipeError:
-            _forget_output()
-            sys.exit(EXIT_BROKEN_PIPE)
-        except KeyboardInterrupt:
-            sys.exit(EXIT_INTERRUPTED)
-        except OSError as error:
-            _forget_output()
-            _fail(f"{error.strerror or error}{_of_file(error)}", EXIT_USAGE)
-        if isinstance(status, int) and status:
-            sys.exit(status)
+    def main(  # type: ignore[override]  # it never returns
+        self, args: Any = None, prog_name: str | None = None, **more: Any
+    ) -> NoReturn:
+        """Run the command line and exit."""
+        more["standalone_mode"] = False
+        sys.exit(status_of(lambda: super(LazyGroup, self).main(args, prog_name, **more)))
 
 
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"]})
@@ -117,51 +99,10 @@ def cli() -> None:
 def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> NoReturn:
     """Run the command line (``words``: what follows the program's name) and exit."""
     words = sys.argv[1:] if words is None else words
-    _open_standard_streams()
+    open_standard_streams()
     pin_recording(words)
     cli.main(args=list(words), prog_name=prog_name)
     raise AssertionError("click exits")
-
-
-def _open_standard_streams() -> None:
-    """Put nothing in the place of output streams that whoever started us has closed.
-
-    Python has None for them then, and the next file that is opened (the trace) would get their
-    number, for all that writes to it below Python.
-    """
-    for number, name in ((1, "stdout"), (2, "stderr")):
-        if getattr(sys, name) is None:
-            devnull = os.open(os.devnull, os.O_WRONLY)
-            if devnull != number:
-                os.dup2(devnull, number)
-                os.close(devnull)
-            setattr(sys, name, os.fdopen(number, "w", encoding="utf-8", closefd=False))
-
-
-def _fail(message: str, status: int) -> NoReturn:
-    click.echo(f"rsltrace: error: {message}", err=True)
-    sys.exit(status)
-
-
-def _of_file(error: OSError) -> str:
-    return f": {error.filename}" if error.filename else ""
-
-
-def _tolerate_any_character(stream: IO[str]) -> None:
-    """Let a terminal without Unicode show names it cannot show as escapes instead of failing."""
-    reconfigure = getattr(stream, "reconfigure", None)
-    if reconfigure is not None:
-        reconfigure(errors="backslashreplace")
-
-
-def _forget_output() -> None:
-    """Send what is still buffered to nowhere, or Python would fail on it again at exit."""
-    try:
-        devnull = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(devnull, sys.stdout.fileno())
-        os.close(devnull)
-    except (OSError, ValueError):
-        pass  # not a real file: nothing is flushed to it later either
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import NodeError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
@@ -42,7 +43,9 @@ if TYPE_CHECKING:
     help="Write the messages as a plain rosbag2 bag, too.",
 )
 @click.option(
-    "--force", is_flag=True, help="Overwrite an existing trace (never one it reads), and bag."
+    "--force",
+    is_flag=True,
+    help="Replace an existing trace (never one it reads), and bag, once the new one is whole.",
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
 @click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
@@ -85,7 +88,7 @@ def record(
     The nodes' log records go to stderr. The last line on stdout is
     "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
     The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
-    130 or 143 if interrupted.
+    130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
     from rsltrace.bag.export import check_bag_folder, export_bag
     from rsltrace.run import Observer, run
@@ -127,11 +130,16 @@ def record(
             observer=Observer(progress=on_progress, interrupt=begins, note=tell),
             replay=replay,
         )
-    _report(result, path, told, as_json=as_json)
-    if bag is not None:
-        count = export_bag(path, bag, force=force)
-        click.echo(f"wrote {bag}: {count} messages", err=True)
-    sys.exit(result.exit_code)
+    status = result.exit_code
+    reopen_standard_streams()
+    try:
+        _report(result, path, told, as_json=as_json)
+        if bag is not None:
+            count = export_bag(result.path or path, bag, force=force)
+            click.echo(f"wrote {bag}: {count} messages", err=True)
+    except OSError as error:
+        status = status_without_output(error, status)
+    sys.exit(status)
 
 
 def _say_that_it_has_no_end(job: Job) -> None:
@@ -178,8 +186,9 @@ def _note(text: str) -> None:
 
 def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) -> None:
     error = result.error
-    for note in result.notes[len(told) :]:  # the others were told when the run began
-        click.echo(f"note: {note}", err=True)
+    for note in result.notes:
+        if note not in told:  # when the run began
+            click.echo(f"note: {note}", err=True)
     if error is not None:
         if isinstance(error, NodeError) and error.traceback_text:
             click.echo(error.traceback_text.rstrip(), err=True)
@@ -190,7 +199,7 @@ def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) ->
             json.dumps(
                 {
                     "findings": sum(met.count for met in result.guarded if met.is_finding),
-                    "path": str(path),
+                    "path": str(result.path),
                     "digest": result.digest,
                     "events": result.events,
                     "start_ns": result.start_ns,
@@ -203,7 +212,8 @@ def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) ->
             )
         )
         return
-    click.echo(f"wrote {path}: {result.stop_reason}", err=True)
+    kept = f" ({path} is as it was)" if result.path != path else ""
+    click.echo(f"wrote {result.path}{kept}: {result.stop_reason}", err=True)
     click.echo(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
 
 
@@ -231,8 +241,8 @@ _SHOWN_MAX = 8
 
 @contextmanager
 def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
-    """Turn the first SIGINT or SIGTERM into a proper end of the run; a second one interrupts
-    whatever callback is stuck."""
+    """Turn the first SIGINT, SIGTERM or SIGHUP into a proper end of the run; a second one
+    interrupts whatever callback is stuck."""
     from rsltrace.loop.stop import Stop
 
     ends: list[Callable[[Stop], None]] = []
@@ -241,20 +251,27 @@ def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
     def handle(number: int, frame: object) -> None:
         if not ends:
             raise KeyboardInterrupt
-        name = "interrupted" if number == signal.SIGINT else "terminated"
-        end = ends.pop()
+        end, name = ends.pop(), _ENDS[signal.Signals(number)]
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):
             os.write(2, f"\nrsltrace: {name}, closing the trace (once more to force)\n".encode())
         end(Stop(name, 128 + number))
 
-    for caught in (signal.SIGINT, signal.SIGTERM):
-        old[caught] = signal.signal(caught, handle)
+    for caught in _ENDS:
+        if caught != signal.SIGHUP or signal.getsignal(caught) != signal.SIG_IGN:  # nohup
+            old[caught] = signal.signal(caught, handle)
     try:
         yield ends.append
     finally:
         for caught_before, handler in old.items():
             signal.signal(caught_before, handler)
+
+
+_ENDS = {
+    signal.SIGINT: "interrupted",
+    signal.SIGTERM: "terminated",
+    signal.SIGHUP: "hung up",
+}
 
 
 @contextmanager

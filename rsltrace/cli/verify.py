@@ -247,13 +247,15 @@ def _one_run(
 
 @contextmanager
 def _terminated() -> Iterator[None]:
-    """Let SIGTERM end the runs, too, instead of leaving them behind."""
+    """Let SIGTERM and SIGHUP end the runs, too, instead of leaving them behind."""
 
     def end(number: int, frame: object) -> None:
         sys.exit(128 + number)
 
-    before = signal.signal(signal.SIGTERM, end)
+    caught = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(number, end) for number in caught]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(caught, before, strict=True):
+            signal.signal(number, handler)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.text_file import write_text
 from rsltrace.errors import OutputError, SetupError, TraceError
 
 if TYPE_CHECKING:
@@ -145,10 +146,7 @@ def _export(app: ViewerApp, path: Path, size: tuple[int, int], keys: list[str]) 
     from rsltrace_viewer.terminal.screenshot import screen_of
 
     picture = screen_of(app, size, keys, svg=path.suffix == ".svg")
-    try:
-        path.write_text(picture, encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+    write_text(path, picture)
 
 
 def _has_terminal() -> bool:
@@ -164,6 +162,10 @@ def _run(app: ViewerApp) -> None:
     if sys.stdout.isatty():
         for name in ("COLUMNS", "LINES"):
             os.environ.pop(name, None)  # some shells export them; they would freeze the size
+    if "TEXTUAL_DRIVER" in os.environ and importlib.util.find_spec("textual_serve") is not None:
+        from rsltrace_viewer.terminal.serve import end_with_server
+
+        end_with_server()
     app.run()
     if app.return_code:
         sys.exit(app.return_code)
@@ -176,9 +178,10 @@ def _serve(port: int) -> None:
 
     arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
     command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])
-    click.echo(f"rsltrace view: http://127.0.0.1:{port}/ (Ctrl-C ends it)", err=True)
+    server = LocalServer(command, port)
+    click.echo(f"rsltrace view: {server.address} (Ctrl-C ends it)", err=True)
     try:
-        LocalServer(command, port).serve()
+        server.serve()
     except OSError as error:
         reason = error.strerror or str(error)
         raise OutputError(f"port {port} cannot be used: {reason}; try --port") from error

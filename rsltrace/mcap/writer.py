@@ -58,7 +58,16 @@ class McapWriter:
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._failure: OutputError | None = None
         self._sink = Sink(path, force=force)
-        self._write(MAGIC + record_bytes(Header(profile, library)))
+        try:
+            self._write(MAGIC + record_bytes(Header(profile, library)))
+        except OutputError:
+            self.abort()
+            raise
+
+    @property
+    def place(self) -> Path:
+        """Where the file is: beside the one that it replaces, until it is finished."""
+        return self._sink.place
 
     @property
     def bytes_written(self) -> int:
@@ -152,12 +161,15 @@ class McapWriter:
         )
         return offset, length
 
-    def finish(self) -> None:
-        """Write the end of the file and close it."""
+    def finish(self, *, replace: bool = True) -> None:
+        """Write the end of the file, make sure that it is there, and close it.
+
+        With ``replace``, it takes the place of the file that was there.
+        """
         self._write(record_bytes(DataEnd(self._sink.crc)))
         self._write(self._summary.tail(self._sink.offset) + MAGIC)
         try:
-            self._sink.close()
+            self._sink.finish(replace=replace)
         except OSError as error:
             raise self._failed(error) from error
 
@@ -176,7 +188,7 @@ class McapWriter:
         """
         if self._failure is None:
             self._failure = OutputError(
-                f"writing the trace {self._sink.path} was interrupted in the middle of a segment; "
+                f"writing the trace {self._sink.place} was interrupted in the middle of a segment; "
                 "what was written before is readable up to its last whole segment"
             )
 
@@ -187,6 +199,9 @@ class McapWriter:
             self._sink.write(data)
         except OSError as error:
             raise self._failed(error) from error
+        except OutputError as error:
+            self._failure = error
+            raise
         except BaseException:
             self.poison()
             raise
@@ -195,10 +210,12 @@ class McapWriter:
         code = errno.errorcode.get(error.errno or 0, "unknown")
         reason = os.strerror(error.errno) if error.errno else str(error)
         hint = _HINTS.get(error.errno or 0, "check the disk, or choose another place with -o")
+        path, place = self._sink.path, self._sink.place
+        kept = f"; {path} is as it was" if place != path else ""
         self._failure = OutputError(
-            f"cannot go on writing the trace {self._sink.path}: {reason} ({code}) after "
+            f"cannot go on writing the trace {place}: {reason} ({code}) after "
             f"{self._sink.offset} bytes, {self._progress()}; what was written is readable up to "
-            f"its last whole segment; {hint}"
+            f"its last whole segment{kept}; {hint}"
         )
         return self._failure
 

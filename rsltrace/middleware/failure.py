@@ -6,9 +6,11 @@ User exceptions can be anything: ``__str__`` may raise, and texts may hold what 
 from __future__ import annotations
 
 import contextlib
+import os
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
+from types import FrameType
 
 from rsltrace.errors import NodeError, RunError
 from rsltrace.loop.loop import Dispatchable
@@ -19,7 +21,11 @@ from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.chain import hash64
 
 _RAISED = int(EventFlag.RAISED)
-_PACKAGE = str(Path(__file__).resolve().parents[1])
+_OWN_FILES = (
+    os.path.join(Path(__file__).resolve().parents[1], ""),
+    "<serialize ",  # the code that is made for a message type
+    "<deserialize ",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,13 +109,31 @@ def _writable(text: str) -> str:
     return text.encode("utf-8", "backslashreplace").decode()
 
 
+def is_own_frame(frame: FrameType) -> bool:
+    """Say whether a frame is rsltrace's."""
+    return frame.f_code.co_filename.startswith(_OWN_FILES)
+
+
 def user_traceback(error: BaseException) -> str:
-    """Return the traceback without the frames of rsltrace that lead to the user's code."""
-    tb = error.__traceback__
-    while tb is not None and tb.tb_frame.f_code.co_filename.startswith(_PACKAGE):
-        tb = tb.tb_next
-    if tb is None:
-        tb = error.__traceback__
+    """Return the traceback without the frames of rsltrace, if there are others."""
     with contextlib.suppress(Exception):
-        return _writable("".join(traceback.format_exception(type(error), error, tb)))
+        told = traceback.TracebackException(type(error), error, error.__traceback__, compact=True)
+        if not all(map(_is_own_line, told.stack)):
+            _leave_out_own(told)
+        return _writable("".join(told.format()))
     return f"{type(error).__qualname__} (its text could not be made)"
+
+
+def _is_own_line(line: traceback.FrameSummary) -> bool:
+    return line.filename.startswith(_OWN_FILES)
+
+
+def _leave_out_own(told: traceback.TracebackException | None) -> None:
+    while told is not None:
+        told.stack = traceback.StackSummary.from_list(
+            [line for line in told.stack if not _is_own_line(line)]
+        )
+        for one in getattr(told, "exceptions", None) or ():  # of a group, from Python 3.11 on
+            _leave_out_own(one)
+        _leave_out_own(told.__context__)
+        told = told.__cause__

@@ -16,6 +16,7 @@ from rsltrace.guard.callers import is_own
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
+from rsltrace.mcap.descriptor import Descriptor
 
 if TYPE_CHECKING:
     from rsltrace.middleware.dispatcher import Dispatcher
@@ -112,7 +113,8 @@ def kept_process() -> Iterator[None]:
     mask = os.umask(0o077)
     os.umask(mask)
     try:
-        yield
+        with _kept_streams():
+            yield
     finally:
         with suppress(FileNotFoundError):
             os.chdir(folder)
@@ -123,6 +125,28 @@ def kept_process() -> Iterator[None]:
         for name, value in environment.items():
             if os.environ.get(name) != value:
                 os.environ[name] = value
+
+
+@contextmanager
+def _kept_streams() -> Iterator[None]:
+    """Put the standard streams back: nodes exchange them, and daemons turn them to nowhere."""
+    names = ("stdin", "stdout", "stderr")
+    streams = {name: getattr(sys, name) for name in names}
+    copies = {}
+    for number in range(3):
+        with suppress(OSError):
+            copies[number] = Descriptor.copy_of(number)
+    try:
+        yield
+    finally:
+        for name, stream in streams.items():
+            with suppress(Exception):
+                getattr(sys, name).flush()
+            setattr(sys, name, stream)
+        for number, copy in copies.items():
+            with suppress(OSError):
+                copy.restore(number)
+                copy.close()
 
 
 @contextmanager

@@ -19,6 +19,8 @@ def record(
 ) -> RunResult:
     """Run a job and record it to ``output`` (None: run without recording).
 
+    With ``force``, a trace that is there is replaced when the new one is whole. A run that does not
+    come about (a constructor raises) leaves it, and its own trace beside it: see the result's path.
     ``echo`` prints the nodes' log records on stderr. ``replay`` is a trace of the same job: what
     its nodes got from outside (``guard:``, mode ``record``) is given to them again.
 

@@ -20,6 +20,7 @@ from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
+from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.census import Census
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
@@ -64,6 +65,8 @@ if TYPE_CHECKING:
 class RunResult:
     """How a run went. Times are simulated nanoseconds.
 
+    ``path`` is where the trace is: beside the one that it should have replaced if no run came about
+    (see ``record``).
     ``digest`` is 16 hex digits, empty for a run that recorded nothing. ``error`` is set when the
     run failed; the trace is complete up to and including the event that failed.
     """
@@ -115,6 +118,7 @@ class Session:
         self._replay = replay
         self.stop: Stop | None = None
         self._output = output
+        self._has_begun = False
         self._force = force
         self._echo = echo
         self._observer = observer or Observer()
@@ -158,7 +162,7 @@ class Session:
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
             self._import_what_is_named()
-        check_bag_types(self._bags)
+        check_bag_types(self.job, self._bags)
         if self._output is not None:
             self._open_trace(stack, self._output)
         self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
@@ -226,10 +230,16 @@ class Session:
     def _open_trace(self, stack: ExitStack, path: Path) -> None:
         """Create the file, and write down what is known before the run."""
         job = self.job
-        check_output(job, path, self._replay)
+        for place in (path, unfinished(path)):
+            check_output(job, place, self._replay)
         self._writer = writer = stack.enter_context(
             TraceWriter(path, force=self._force, events_per_segment=job.record.segment_events)
         )
+        if writer.place != path and self._observer.note is not None:
+            self._observer.note(
+                f"{path} stays as it is until this run is over; until then it goes to "
+                f"{writer.place}"
+            )
         recorder = Recorder(writer, keep_payload=payload_filter(job))
         self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)
@@ -287,6 +297,7 @@ class Session:
                 start_players(self.world, self.job, self._bags)
             if not self.ended:
                 self.world.jump(self.start_ns)
+                self._has_begun = not self.ended
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
@@ -347,13 +358,14 @@ class Session:
                     "stop_reason": stop.reason,
                     "exit_code": str(exit_code),
                     "ended_after": str(outcome.ended_after),
-                }
+                },
+                replace=self._has_begun or exit_code == 0,
             )
         digest = self.digest
         # What finalizers say from now on comes too late.
         self.world.domain.dispatcher.recorder = None
         return RunResult(
-            path=self._output,
+            path=None if self._writer is None else self._writer.place,
             digest=digest,
             events=loop.events,
             start_ns=self.start_ns,

@@ -135,6 +135,11 @@ class TraceWriter:
         self.abort()
 
     @property
+    def place(self) -> Path:
+        """Where the trace is: beside the one that it replaces, until it is closed."""
+        return self._stream.place
+
+    @property
     def event_count(self) -> int:
         """How many events were added."""
         return self._events_written + len(self._rests)
@@ -234,13 +239,14 @@ class TraceWriter:
         channel_id = self._own_channel(TOPIC_STATES, SCHEMA_STATE)
         return self.add_payload(channel_id, stamp_ns, pack_detail(event, node, changes))
 
-    def close(self, *, result: Mapping[str, str]) -> None:
+    def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
         """Write what is left, then the indexes, and close the file.
 
         ``result`` says how the run ended (``stop_reason``, ``exit_code``; ``start_time`` and
         ``end_time`` in simulated nanoseconds, by default those of the first and last message).
         Version, digest and counts are added here. Outputs of an event that was never added are
-        left out. After an OutputError the file is closed, too.
+        left out. With ``replace``, the trace takes the place of one that was there. After an
+        OutputError the file is closed, too.
         """
         try:
             self._drop_unfinished_event()
@@ -251,7 +257,7 @@ class TraceWriter:
             self._stream.attachment(ATTACHMENT_INDEX, SEGMENT_MEDIA_TYPE, b"".join(self._segments))
             self._stream.metadata(METADATA_RESULT, self._result(result))
             self._stream.metadata(METADATA_ROSBAG2, {KEY: self._bag_metadata()})
-            self._stream.finish()
+            self._stream.finish(replace=replace)
         finally:
             self._stream.abort()
 

@@ -20,22 +20,8 @@ KNOWN: dict[str, str] = {
     "texts/*: unnamed": "item 9",
     "pasted/*: executed": "item 3",
     "servers/*: secret": "item 8",
-    "nodes/dup2_over_all: lost": "item 2",
-    "nodes/fork_and_go_on: lost": "item 2",
-    "nodes/fork_and_raise: traceback": "item 2",
-    "nodes/delete_output: lost": "item 2",
-    "nodes/truncate_output: lost": "item 2",
-    "nodes/replace_output: lost": "item 2",
-    "nodes/overwrite_output: lost": "item 2",
     "nodes/log_escapes: raw": "item 4",
     "nodes/raises_escapes: raw": "item 4",
-    "nodes/log_escapes: traceback": "item 5",
-    "nodes/negative_period: traceback": "item 5",
-    "nodes/wrong_field: traceback": "item 5",
-    "nodes/destroy_publisher: traceback": "item 5",
-    "nodes/hang_up_self: died": "item 6",
-    "nodes/closed_stdout: traceback": "item 10",
-    "disks/stderr-full: status": "item 10",
 }
 
 

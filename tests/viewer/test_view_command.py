@@ -6,6 +6,7 @@ import asyncio
 import importlib.util
 import json
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -169,29 +170,31 @@ def test_in_a_browser_on_this_machine_only(made: Path) -> None:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
     command = [sys.executable, "-m", "rsltrace", "view", str(made), "--serve", "--port", str(port)]
-    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     try:
+        assert server.stderr is not None
+        url = re.search(r"http://127[^ ]*", server.stderr.readline())[0]
         for _ in range(6000):
             with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
                 break
             time.sleep(0.1)
-        asyncio.run(_browse(port))
+        asyncio.run(_browse(port, url))
         bound = [line for line in _listening() if f":{port:04X}" in line]
         assert bound
         assert all("0100007F" in line for line in bound)
         second = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
         assert second.returncode != 0
         assert f"port {port} cannot be used" in second.stderr
+        asyncio.run(_viewers_end_with(url, server))
     finally:
         server.terminate()
-        server.wait(600)
+        server.communicate(timeout=600)
 
 
-async def _browse(port: int) -> None:
+async def _browse(port: int, url: str) -> None:
     """Do what the page does: draw what comes through the socket, send keys."""
     import aiohttp
 
-    url = f"http://127.0.0.1:{port}/"
     async with aiohttp.ClientSession() as browser:
         async with browser.get(url) as answer:
             assert "rsltrace view" in await answer.text()
@@ -205,6 +208,34 @@ async def _browse(port: int) -> None:
             await page.send_str(json.dumps(["stdin", "x"]))
             await _until(page, "too many")
             await page.send_str(json.dumps(["stdin", "q"]))
+        for path in ("", "ws", "static/", "0" * 32 + "/"):  # of somebody without the token
+            async with browser.get(f"http://127.0.0.1:{port}/{path}") as answer:
+                assert answer.status == 404
+
+
+async def _viewers_end_with(url: str, server: subprocess.Popen[str]) -> None:
+    import aiohttp
+
+    address = f"{url}ws?width=100&height=30"
+    async with aiohttp.ClientSession() as browser, browser.ws_connect(address) as page:
+        await _until(page, "/talker")
+        viewers = _children(server.pid)
+        assert viewers
+        server.kill()
+        for _ in range(600):
+            if not any(Path(f"/proc/{pid}").exists() for pid in viewers):
+                return
+            await asyncio.sleep(0.1)
+        raise AssertionError("a viewer has outlived its server")
+
+
+def _children(pid: int) -> list[str]:
+    found = []
+    for status in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            if int(status.read_text().rpartition(")")[2].split()[1]) == pid:
+                found.append(status.parent.name)
+    return found
 
 
 async def _until(page: Any, wanted: str) -> None:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import traceback
 from typing import NoReturn
 
-from rsltrace.middleware.failure import text_of
+from rsltrace.middleware.failure import text_of, user_traceback
 
 
 def exit_status(error: SystemExit) -> int:
@@ -21,7 +20,7 @@ def exit_status(error: SystemExit) -> int:
 def end_child(error: BaseException) -> NoReturn:
     """End a process that a callback forked and left by an exception: the run is its parent's."""
     if not isinstance(error, SystemExit):
-        traceback.print_exception(error)
+        print(user_traceback(error), end="", file=sys.stderr)
     elif error.code is not None and not isinstance(error.code, int):
         print(text_of(error), file=sys.stderr)
     with contextlib.suppress(Exception):

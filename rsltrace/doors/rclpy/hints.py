@@ -13,6 +13,8 @@ import os
 import re
 from types import TracebackType
 
+from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
+
 _WHEELS = frozenset(
     """
     action_msgs actionlib_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs
@@ -84,6 +86,8 @@ def hint_for(error: BaseException) -> str:
         return _STANDS_STILL
     if type(error).__name__ == "InvalidParameterTypeException":
         return _as_double(str(error))
+    if isinstance(error, AttributeError) and is_unmade(error.obj):
+        return f"; {constructor_of(error.obj)} must call super().__init__(name) first"
     if not isinstance(error, ModuleNotFoundError) or not error.name:
         return ""
     package = error.name.partition(".")[0]

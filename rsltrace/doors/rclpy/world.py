@@ -28,6 +28,7 @@ from rsltrace.doors.rclpy.stacks.blocked_groups import held_back
 from rsltrace.doors.rclpy.stacks.blocking_calls import end_blocked
 from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.exit_handlers import own_exit_handlers
+from rsltrace.doors.rclpy.stacks.forked_child import forked_children_end
 from rsltrace.doors.rclpy.stacks.process_exit import own_process_ends
 from rsltrace.doors.rclpy.stacks.program import Program
 from rsltrace.doors.rclpy.stacks.program_end import begin_program, end_programs
@@ -35,6 +36,7 @@ from rsltrace.doors.rclpy.stacks.signals import own_signal_handlers
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_waiting
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.threads import cooperative_threads
+from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
@@ -90,6 +92,7 @@ class World:
             stack.enter_context(simulated_event_loops(stacks))
             stack.enter_context(own_exit_handlers(stacks))
             stack.enter_context(own_process_ends(stacks))
+            stack.enter_context(forked_children_end(stacks))
             stack.enter_context(own_signal_handlers(stacks))
             rclpy.init(args=[])
             stacks.runners.main = getcurrent()
@@ -197,6 +200,8 @@ class World:
                 f"{name} gave a {type(node).__qualname__}, not an rclpy Node: name a Node subclass "
                 "or a function that returns a node (or a list of nodes)"
             )
+        if is_unmade(node):
+            raise RunError(f"{constructor_of(node)} has not called super().__init__(name)")
         self.nodes.append(node)
         self.stacks.executor.add_node(node)
 

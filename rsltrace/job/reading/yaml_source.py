@@ -21,6 +21,9 @@ from rsltrace.job.values.times import ExactFloat
 VALUES_MAX = 100_000
 """Aliases can make a small file mean an enormous one; no job needs this many values."""
 
+NESTING_MAX = 100
+_BRACKETS = re.compile(r"[][{}]")
+
 SHOWN_COLUMNS = 100
 
 _TAG = "tag:yaml.org,2002:"
@@ -122,6 +125,7 @@ def parse_yaml(
     count in the option. Raises ``JobError`` for anything that is not plain YAML 1.2 data with
     distinct keys.
     """
+    _check_nesting(text, name)
     source = YamlSource(name, text if option is None else option, folder, option is not None)
     # Blanks in front keep the columns; they mean nothing in front of a value on one line.
     written = text if option is None else " " * (len(option) - len(text)) + text
@@ -139,6 +143,18 @@ def parse_yaml(
     except RecursionError:
         raise JobError("the values are nested too deeply", where=name) from None
     return source
+
+
+def _check_nesting(text: str, name: str) -> None:
+    """Refuse at once what would keep the parser busy for long: its time grows with the square."""
+    depth = 0
+    for found in _BRACKETS.finditer(text):
+        depth = depth + 1 if found[0] in "[{" else max(depth - 1, 0)
+        if depth > NESTING_MAX:
+            line = text.count("\n", 0, found.start()) + 1
+            raise JobError(
+                f"brackets are nested more than {NESTING_MAX} deep", where=f"{name}:{line}"
+            )
 
 
 def bare_value(text: str) -> object:

@@ -17,6 +17,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
 from rsltrace.run.plans.stopping import end_ns_of, has_stop
+from rsltrace.trace.format import PREFIX_OWN
 
 if TYPE_CHECKING:
     from rsltrace.bag import Bag
@@ -86,8 +87,12 @@ def open_bag_of(job: Job, index: int) -> Iterator[BagInput]:
 
 
 def never_plays(topic: StoredTopic) -> bool:
-    """Services and actions are recorded as topics that only their own middleware may fill."""
-    return _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
+    """Services and actions are recorded as topics that only their own middleware may fill.
+
+    And a trace, which may be played like any bag, has topics of its own.
+    """
+    own = topic.name.startswith(PREFIX_OWN)
+    return own or _ACTION in topic.name or topic.name.endswith(_SERVICE_EVENT)
 
 
 def _check_names(job: Job, index: int, bag: Bag) -> None:
@@ -165,11 +170,12 @@ def start_ns_of(job: Job, bags: list[BagInput]) -> int:
     return min((entry.playback.start_ns for entry in bags), default=0)
 
 
-def check_bag_types(bags: list[BagInput]) -> None:
+def check_bag_types(job: Job, bags: list[BagInput]) -> None:
     """Raise BagError if a recorded topic has a type that is not installed."""
-    for entry in bags:
+    for index, entry in enumerate(bags):
+        where = f"{locate(job, ('bags', index, 'path'))}: {entry.spec.path}"
         for topic in entry.bag.topics:
-            check_type(entry.spec.path, topic)
+            check_type(where, topic)
 
 
 def check_type(bag: str, topic: BagTopic) -> type:

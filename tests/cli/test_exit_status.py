@@ -1,0 +1,68 @@
+"""Exit statuses where what the command prints to is full, or nobody reads it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+A = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback" / "a.mcap"
+B = A.with_name("b.mcap")
+pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="Linux has /dev/full")
+
+FULL = ">/dev/full"
+CLOSED_PIPE = "| true; exit ${PIPESTATUS[0]}"
+NO_STDOUT = ">&-"
+NO_STDERR = "2>&-"
+FULL_STDERR = "2>/dev/full"
+
+
+def run(words: str, redirect: str, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    words = words.replace("A", str(A)).replace("B", str(B))
+    return subprocess.run(
+        ["bash", "-c", f"{sys.executable} -m rsltrace {words} {redirect}"],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+        cwd=cwd,
+    )
+
+
+@pytest.mark.parametrize(
+    ("words", "status"),
+    [("info A", 0), ("diff A B", 1), ("diff A no.mcap", 2), ("--help", 0), ("diff --no", 2)],
+)
+def test_the_status_is_that_of_the_command_or_says_that_it_could_not_print(
+    words: str, status: int
+) -> None:
+    for redirect in (NO_STDOUT, NO_STDERR, FULL_STDERR, f"{NO_STDERR} {NO_STDOUT}"):
+        assert run(words, redirect).returncode == status, redirect
+    done = run(words, FULL)
+    assert done.returncode == 2
+    if status != 2:
+        assert done.stderr == ("rsltrace: error: No space left on device: standard output\n")
+    assert run(words, f"{FULL} {FULL_STDERR}").returncode == 2
+    done = run(words, CLOSED_PIPE)
+    assert done.returncode == (2 if status == 2 else 141), "never 1: that says that runs differ"
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(("body", "status"), [("pass", 0), ("1 / 0", 3)])
+def test_a_run_has_its_own_status_first(tmp_path: Path, body: str, status: int) -> None:
+    (tmp_path / "nodes.py").write_text(
+        "from rclpy.node import Node\n"
+        "class Any(Node):\n    def __init__(self):\n        super().__init__('any')\n"
+        "        self.create_timer(0.5, self.tick)\n"
+        f"    def tick(self):\n        self.get_logger().info('x')\n        {body}\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: nodes:Any}]\nstop: {duration: 1s}\n")
+    for redirect in (NO_STDOUT, NO_STDERR, FULL_STDERR):
+        done = run("record job.yaml --force", redirect, tmp_path)
+        assert done.returncode == status, done.stderr
+    assert run("record job.yaml --force", FULL, tmp_path).returncode == (status or 2)
+    assert run("record job.yaml --force", CLOSED_PIPE, tmp_path).returncode == (status or 141)

@@ -1,0 +1,291 @@
+"""The file under a trace, while somebody else in the process, or beside it, does things to it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import pytest
+
+from rsltrace.errors import OutputError
+from rsltrace.mcap.sink import Sink, unfinished
+
+MAGIC = b"\x89MCAP0\r\n"
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="traces are recorded on Linux")
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "run.mcap"
+
+
+def begun(path: Path, *, force: bool = False) -> Sink:
+    sink = Sink(path, force=force)
+    sink.write(MAGIC)
+    sink.write(b"first")
+    return sink
+
+
+def append(path: Path) -> None:
+    with path.open("ab") as file:
+        file.write(b"x")
+
+
+def rewrite(path: Path) -> None:
+    with path.open("r+b") as file:
+        file.seek(9)
+        file.write(b"!")
+
+
+def swap(path: Path) -> None:
+    path.rename(path.with_suffix(".moved"))
+    path.write_bytes(MAGIC + b"first")
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (Path.unlink, "it was deleted"),
+        (lambda path: os.truncate(path, 3), "it has 3 bytes and should have 13"),
+        (lambda path: path.write_bytes(b""), "it has 0 bytes and should have 13"),
+        (append, "it has 14 bytes and should have 13"),
+    ],
+)
+def test_what_is_done_to_the_file_is_found_at_the_next_write(
+    path: Path, harm: Callable[[Path], object], said: str
+) -> None:
+    sink = begun(path)
+    harm(path)
+    for _ in range(2):
+        with pytest.raises(OutputError, match=rf"{path} was changed .*: {said}; look"):
+            sink.write(b"second")
+    sink.close()
+
+
+@pytest.mark.parametrize(
+    ("harm", "said"),
+    [
+        (Path.unlink, "it was deleted"),
+        (rewrite, "its content is not what was written"),
+        (swap, "it was renamed, or another file has its name"),
+        (lambda path: path.rename(path.with_suffix(".old")), "it was renamed, or another"),
+    ],
+)
+def test_a_file_that_is_not_what_was_written_is_never_finished(
+    path: Path, harm: Callable[[Path], object], said: str
+) -> None:
+    sink = begun(path)
+    harm(path)
+    with pytest.raises(OutputError, match=said):
+        sink.finish()
+    sink.close()
+
+
+def test_a_large_file_is_read_back_if_its_time_says_that_it_was_touched(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rsltrace.mcap.sink._READ_BACK_BYTES", 0)
+    sink = begun(path)
+    rewrite(path)
+    os.utime(path, ns=(1, 1))  # a clock's tick later, as it were
+    sink.write(b"second")
+    with pytest.raises(OutputError, match="its content is not what was written"):
+        sink.finish()
+    sink.close()
+
+
+def close_all(fd: int) -> None:
+    os.close(fd)
+
+
+def put_another_in_its_place(fd: int) -> None:
+    other = os.open("own.txt", os.O_CREAT | os.O_WRONLY)
+    os.dup2(other, fd)
+    os.close(other)
+
+
+@pytest.mark.parametrize("harm", [close_all, put_another_in_its_place])
+def test_a_descriptor_that_was_taken_away_is_opened_again(
+    path: Path, monkeypatch: pytest.MonkeyPatch, harm: Callable[[int], None]
+) -> None:
+    monkeypatch.chdir(path.parent)
+    sink = begun(Path("run.mcap"))
+    number = sink._descriptor.number
+    harm(number)
+    os.mkdir("elsewhere")
+    monkeypatch.chdir("elsewhere")
+    sink.write(b"second")
+    if harm is put_another_in_its_place:
+        os.close(number)  # it is that file's, and is left open
+    harm(sink._descriptor.number)
+    monkeypatch.chdir(path.parent / "elsewhere")
+    sink.finish()
+    assert path.read_bytes() == MAGIC + b"firstsecond"
+    if harm is put_another_in_its_place:
+        assert (path.parent / "own.txt").read_bytes() == b""
+
+
+def test_a_descriptor_is_out_of_the_way_and_not_inherited(path: Path) -> None:
+    sink = begun(path)
+    number = sink._descriptor.number
+    assert number > 100
+    assert not os.get_inheritable(number)
+    sink.close()
+
+
+def test_a_moved_position_moves_nothing(path: Path) -> None:
+    sink = begun(path)
+    os.lseek(sink._descriptor.number, 0, os.SEEK_SET)
+    sink.write(b"second")
+    sink.finish()
+    assert path.read_bytes() == MAGIC + b"firstsecond"
+
+
+def test_a_forked_child_has_no_descriptor_and_cannot_write(path: Path) -> None:
+    sink = begun(path)
+    number = sink._descriptor.number
+    child = os.fork()
+    if child == 0:
+        status = 1
+        try:
+            os.fstat(number)
+        except OSError:
+            try:
+                sink.write(b"of the child")
+            except OutputError:
+                sink.close()
+                status = 0
+        os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    sink.write(b"second")
+    sink.finish()
+    assert path.read_bytes() == MAGIC + b"firstsecond"
+
+
+# -- what was there -------------------------------------------------------------------------------
+
+
+def test_what_is_replaced_stays_until_the_new_one_is_whole(path: Path) -> None:
+    path.write_bytes(MAGIC + b"old")
+    path.chmod(0o640)
+    sink = begun(path, force=True)
+    assert sink.place == unfinished(path) == path.parent / "run.unfinished.mcap"
+    assert sink.place.read_bytes() == MAGIC + b"first"
+    assert path.read_bytes() == MAGIC + b"old"
+    sink.finish()
+    assert sink.place == path
+    assert path.read_bytes() == MAGIC + b"first"
+    assert path.stat().st_mode & 0o777 == 0o640
+    assert list(path.parent.iterdir()) == [path]
+
+
+def test_what_was_given_up_is_beside_what_was_there(path: Path) -> None:
+    path.write_bytes(MAGIC + b"old")
+    begun(path, force=True).close()
+    sink = begun(path, force=True)  # takes the place of what was given up
+    sink.write(b"more")
+    sink.finish(replace=False)
+    assert sink.place == unfinished(path)
+    assert sink.place.read_bytes() == MAGIC + b"firstmore"
+    assert path.read_bytes() == MAGIC + b"old"
+
+
+def test_a_link_leads_to_what_is_replaced(path: Path) -> None:
+    (path.parent / "disk").mkdir()
+    real = path.parent / "disk" / "real.mcap"
+    real.write_bytes(MAGIC)
+    path.symlink_to(real)
+    sink = begun(path, force=True)
+    assert sink.place == path.parent / "disk" / "real.unfinished.mcap"
+    sink.finish()
+    assert path.is_symlink()
+    assert real.read_bytes() == MAGIC + b"first"
+
+
+def test_nothing_but_a_trace_is_taken_for_one_that_was_given_up(path: Path) -> None:
+    path.write_bytes(MAGIC)
+    unfinished(path).write_text("precious")
+    with pytest.raises(OutputError, match=r"run\.unfinished\.mcap: what is there is no trace"):
+        Sink(path, force=True)
+    unfinished(path).unlink()
+    unfinished(path).symlink_to(path.parent / "elsewhere")
+    with pytest.raises(OutputError, match=r"run\.unfinished\.mcap"):
+        Sink(path, force=True)
+    assert not (path.parent / "elsewhere").exists()
+    assert path.read_bytes() == MAGIC
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_two_runs_do_not_write_one_trace(path: Path, there: bool) -> None:
+    if there:
+        path.write_bytes(MAGIC + b"old")
+    sink = begun(path, force=True)
+    with pytest.raises(OutputError, match="another run is writing it; wait, or choose"):
+        Sink(path, force=True)
+    sink.finish()
+    begun(path, force=True).finish()
+
+
+def test_a_file_in_which_nothing_is_does_not_stay(path: Path) -> None:
+    script = (
+        "import resource, signal, sys\n"
+        "from pathlib import Path\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))\n"
+        "from rsltrace.errors import OutputError\n"
+        "from rsltrace.trace.writer import TraceWriter\n"
+        "try:\n    TraceWriter(Path(sys.argv[1]), force=False)\n"
+        "except OutputError as error:\n    print(error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, str(path)], capture_output=True, text=True, check=True
+    )
+    assert f"cannot go on writing the trace {path}: File too large (EFBIG)" in done.stdout
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_pipes_and_devices_are_no_files(path: Path, force: bool) -> None:
+    os.mkfifo(path)
+    with pytest.raises(OutputError, match=r"run\.mcap: it is a named pipe"):
+        Sink(path, force=force)
+    with pytest.raises(OutputError, match="/dev/null: it is a device"):
+        Sink(Path("/dev/null"), force=force)
+
+
+AS_SOMEBODY_ELSE = """
+import os, sys
+from pathlib import Path
+from rsltrace.errors import OutputError
+from rsltrace.trace.writer import TraceWriter
+os.setgid(65534)
+os.setuid(65534)
+try:
+    TraceWriter(Path(sys.argv[1]), force=sys.argv[2] == "force")
+except OutputError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize("there", ["", "force"])
+def test_a_folder_of_somebody_else(there: str) -> None:
+    """As somebody else than root, who may write anywhere."""
+    if os.getuid() != 0:
+        pytest.skip("only root may become somebody else")
+    with TemporaryDirectory() as folder:  # the folders of tests are their owner's alone
+        os.chmod(folder, 0o755)
+        path = Path(folder, "run.mcap")
+        if there:
+            path.write_bytes(MAGIC)
+        done = subprocess.run(
+            [sys.executable, "-c", AS_SOMEBODY_ELSE, str(path), there],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        place = unfinished(path) if there else path
+        assert f"cannot write the trace {place}: Permission denied; choose another" in done.stdout
+        assert path.exists() == bool(there)
