@@ -435,7 +435,8 @@ def test_options_that_make_no_sense(tmp_path: Path) -> None:
 
 
 def test_kinds_are_named_in_words(tmp_path: Path) -> None:
-    from rsltrace.diff.causes.event_views import at, phrase
+    from rsltrace.diff.causes.event_views import phrase
+    from rsltrace.words.phrases import at_time as at
 
     diff = compare(tmp_path, Fault("bit", step(20, 1)))
     view = diff.divergences[0].a
