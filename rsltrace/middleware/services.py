@@ -113,17 +113,10 @@ class Service(ServiceEnd):
         """Take the oldest request, run the callback and send what it returns."""
         if not self.may_run():
             return
-        data, event, position, digest, info = self.queue.popleft()
+        data, *cause, info = self.queue.popleft()
+        args = (data, info)
         self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            SERVICE,
-            self._answer,
-            (data, info),
-            event,
-            position,
-            digest,
+            self, self.entity_id, self.node, SERVICE, self._answer, args, *cause
         )
 
     def _answer(self, data: bytes, info: ServiceInfo) -> None:
@@ -188,18 +181,9 @@ class Client(ServiceEnd):
         """Take the oldest response and hand it to who waits for it."""
         if not self.may_run():
             return
-        data, event, position, digest, info = self.queue.popleft()
-        self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            CLIENT,
-            self._take,
-            (data, info),
-            event,
-            position,
-            digest,
-        )
+        data, *cause, info = self.queue.popleft()
+        args = (data, info)
+        self.dispatcher.execute(self, self.entity_id, self.node, CLIENT, self._take, args, *cause)
 
     def _take(self, data: bytes, info: ServiceInfo) -> None:
         callback = self._pending.pop(info.request_id.sequence_number, None)

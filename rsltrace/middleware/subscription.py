@@ -66,17 +66,9 @@ class Subscription(Receiver):
         if not self.may_run():
             return
         assert self.callback is not None
-        _, _, _, _, data, event, position, digest, _, _ = self.queue.popleft()
+        data, *cause = self.queue.popleft()[4:8]
         self.dispatcher.execute(
-            self,
-            self.entity_id,
-            self.node,
-            SUBSCRIPTION,
-            self.callback,
-            (data,),
-            event,
-            position,
-            digest,
+            self, self.entity_id, self.node, SUBSCRIPTION, self.callback, (data,), *cause
         )
 
     def trace_name(self) -> str:

@@ -22,7 +22,7 @@ _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP
 _ERROR = 40
 
 
-class UserCode:
+class RclpyDoor:
     """The door of rclpy's nodes, and of all that the job constructs."""
 
     def __init__(self, stacks: Stacks, logs: Logs) -> None:

@@ -16,7 +16,7 @@ from rsltrace.chance.clock import ClockModel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.doors.rclpy.boundary.boundary import Boundary, Surroundings
 from rsltrace.doors.rclpy.boundary.installation import installed
-from rsltrace.doors.rclpy.callback_errors import UserCode
+from rsltrace.doors.rclpy.callback_errors import RclpyDoor
 from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.executors.user_executors import own_executors
 from rsltrace.doors.rclpy.handles.logs import Logs
@@ -29,9 +29,9 @@ from rsltrace.doors.rclpy.stacks.blocking_calls import end_blocked
 from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.exit_handlers import own_exit_handlers
 from rsltrace.doors.rclpy.stacks.forked_child import forked_children_end
+from rsltrace.doors.rclpy.stacks.mains import begin_program, end_programs
 from rsltrace.doors.rclpy.stacks.process_exit import own_process_ends
 from rsltrace.doors.rclpy.stacks.program import Program
-from rsltrace.doors.rclpy.stacks.program_end import begin_program, end_programs
 from rsltrace.doors.rclpy.stacks.signals import own_signal_handlers
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_waiting
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
@@ -68,7 +68,7 @@ class World:
         self.parameters: dict[str, Parameters] = {}
         self._seed = seed
         self._logs = Logs(self.domain, base_dir=base_dir, echo=echo)
-        self.domain.dispatcher.door = UserCode(self.stacks, self._logs)
+        self.domain.dispatcher.door = RclpyDoor(self.stacks, self._logs)
         self._surroundings = Surroundings(self.stacks, self._logs, self.states)
         self._boundary: Boundary
         self._stack = ExitStack()

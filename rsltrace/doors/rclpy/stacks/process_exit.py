@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from greenlet import getcurrent
 
 from rsltrace.doors.rclpy.stacks.blocking_calls import abandon, getpid
-from rsltrace.doors.rclpy.stacks.program_end import end_program
+from rsltrace.doors.rclpy.stacks.mains import end_program
 from rsltrace.doors.rclpy.stacks.runners import RunEnded
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from greenlet import getcurrent, greenlet
 
 from rsltrace.doors.rclpy.stacks.callback_groups import CallbackGroups
 from rsltrace.doors.rclpy.stacks.coroutines import Coroutines
-from rsltrace.doors.rclpy.stacks.ending import Ending
 from rsltrace.doors.rclpy.stacks.program import Program, Programs
 from rsltrace.doors.rclpy.stacks.runners import RunEnded, Runners
 from rsltrace.errors import EXIT_RUN
@@ -47,6 +47,24 @@ class Threads:
     def runs_on(self, stack: greenlet) -> bool:
         """Return whether a stack is that of a thread which user code has started."""
         return stack in self.by_stack
+
+
+@dataclass(slots=True)
+class Ending:
+    """How far the end of a run is. ``closing``: mains are told to end, and do. ``unwinding``:
+    nothing waits any more, blocked calls raise ``RunEnded``. ``stuck`` says who still waited when
+    nothing could happen any more.
+
+    ``grace_ns`` and ``shutdown_ns`` are how long mains and ``destroy_node`` have slept since, while
+    time stands still; ``refused`` counts the waits of those who go on regardless.
+    """
+
+    closing: bool = False
+    unwinding: bool = False
+    stuck: list[str] = field(default_factory=list)
+    grace_ns: int = 0
+    shutdown_ns: int = 0
+    refused: int = 0
 
 
 class Stacks:
