@@ -98,8 +98,9 @@ def test_rerun_tells_them_too(tmp_path: Path) -> None:
 
     a, b = (record(tmp_path, "record", gain, f"{gain}.mcap") for gain in ("1", "2"))
     text = document(rsltrace.diff(a, b))
-    assert "**State of the node after it**\n\n```\ntotal  1.0  |  2.0\n```" in text
-    assert "os.environ['GAIN']  '1'  |  '2'" in text
+    assert "state of the node after it\n  total  1.0  |  2.0" in text
+    at = text.index("! environment: os.environ['GAIN']\n")
+    assert text[at:].splitlines()[1:3] == ["      a '1'", "      b '2'"]
 
 
 def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import event_link, inspect
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
-from rsltrace_viewer.model.inspector.states import (
+from rsltrace_viewer.model.inspector.state_differences import (
     differing_call_lines,
     differing_state_lines,
 )
