@@ -19,6 +19,9 @@ RECORD_BYTES_MAX = CHUNK_BYTES_MAX + (1 << 20)
 SUMMARY_BYTES_MAX = 256 << 20
 """The summary of a trace of a thousand million events has a quarter of this."""
 
+ENTITY_ID_MAX = 1 << 24
+"""Ids count up, but not all that have one are in the trace. A diff makes a table by id."""
+
 FILE_GROWTH_MAX = 1000
 FILE_BYTES_MIN = 1 << 30
 """A compressed bag file may unpack to so many times its size, and always to so much."""

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.limits import RESPONSE_BYTES_MAX
+from rsltrace.mcap.limits import ENTITY_ID_MAX, RESPONSE_BYTES_MAX
 from rsltrace.mcap.place import open_source
 from rsltrace.mcap.records import Header
 from rsltrace.mcap.source import ByteSource
@@ -243,10 +243,10 @@ class Trace:
         entities = {RUN.id: RUN}
         for stamp_ns, _, data in self.messages(TOPIC_ENTITIES):
             entity = unpack_entity(data, stamp_ns)
-            if entity.id > len(entities):  # tables by id would be as large as it says
+            if entity.id > ENTITY_ID_MAX:  # tables by id would be as large as it says
                 raise TraceError(
-                    f"{self.name}: entity {entity.id} follows {len(entities) - 1} others; ids "
-                    "count up, so the trace is damaged or was not made by rsltrace"
+                    f"{self.name}: an entity has the id {entity.id}, and no run has so many; the "
+                    "trace is damaged"
                 )
             entities[entity.id] = entity
         return entities

@@ -19,7 +19,6 @@ KNOWN: dict[str, str] = {
     "texts/*: forged": "item 9",
     "texts/*: unnamed": "item 9",
     "pasted/*: executed": "item 3",
-    "servers/*: secret": "item 8",
     "nodes/log_escapes: raw": "item 4",
     "nodes/raises_escapes: raw": "item 4",
 }

@@ -196,6 +196,19 @@ def test_secrets_of_an_address_are_in_no_error(server: QueryServer, tmp_path: Pa
         assert "://" in error
 
 
+@pytest.mark.parametrize("command", ["info", "cat"])
+def test_an_address_where_a_path_is_wanted(command: str) -> None:
+    from click.testing import CliRunner
+
+    from rsltrace.cli.main import cli
+
+    result = CliRunner().invoke(cli, [command, signed("https://example.org", "a.mcap")])
+    assert result.exit_code == 2
+    said = " ".join(result.output.split())
+    assert "http://example.org/a.mcap?… is an address" in said
+    assert not any(secret in said for secret in SECRETS)
+
+
 @pytest.mark.parametrize(
     ("address", "shown"),
     [
