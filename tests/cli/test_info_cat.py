@@ -434,7 +434,7 @@ def test_output_that_cannot_be_written_is_an_error(run: tuple[Path, Feeder]) -> 
             check=False,
         )
     assert done.returncode == 2
-    assert done.stderr == "rsltrace: error: No space left on device\n"
+    assert done.stderr == "rsltrace: error: No space left on device: standard output\n"
 
 
 def test_a_terminal_without_unicode_shows_escapes(tmp_path: Path) -> None:
