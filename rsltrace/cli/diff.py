@@ -113,6 +113,11 @@ class _Tolerance(_Type):
     help="First read all of both traces and check every checksum and hash.",
 )
 @click.option(
+    "--as-far-as-they-go",
+    is_flag=True,
+    help="It is enough if recordings that are cut agree until there.",
+)
+@click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -132,6 +137,7 @@ def diff(
     relative: tuple[tuple[str, float], ...],
     by: str,
     check: bool,
+    as_far_as_they_go: bool,
     output: Path | None,
 ) -> int:
     """Find where A and B first diverge, and why.
@@ -143,8 +149,9 @@ def diff(
     FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
     topics and a colon. A tolerance never makes two traces identical.
 
-    The exit status is 0 if nothing differs, 1 if the runs diverge, 2 for trouble, 3 if they are
-    equal within tolerance and not identical.
+    The exit status is 0 if nothing differs, 1 if the runs diverge, or one of the files is cut (then
+    nobody knows, unless --as-far-as-they-go is enough), 2 for trouble, 3 if they are equal within
+    tolerance and not identical.
     """
     options = DiffOptions(
         context=context,
@@ -155,6 +162,7 @@ def diff(
         absolute=absolute,
         relative=relative,
         by=by,
+        as_far_as_they_go=as_far_as_they_go,
     )
     return _diff(golden, others, form, options, output, check=check)
 
