@@ -332,7 +332,7 @@ def test_a_trace_is_not_identical_to_its_own_beginning(tmp_path: Path) -> None:
 def test_a_cut_run_still_diverges_where_it_does_something_else(tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     fault = Fault("bit", step(20, 1))
-    Simulation(PLAN, tmp_path / "b.mcap", fault, storage=Storage(50, close=False)).run()
+    Simulation(PLAN, tmp_path / "b.mcap", (fault,), storage=Storage(50, close=False)).run()
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
     assert diff.exit_code == 1
