@@ -364,7 +364,9 @@ def test_a_cut_recording_is_green_nowhere_unless_that_is_enough(
     assert render(enough, "github").startswith("::notice ")
     assert json.loads(render(enough, "json"))["failed"] is False
     assert "1 of 2 runs agrees only as far as the recordings go." in render([diff, enough])
-    assert "agree with runs" in render([enough, enough]) or "agree with bags" in render([enough] * 2)
+    assert "agree with runs" in render([enough, enough]) or "agree with bags" in render(
+        [enough] * 2
+    )
 
 
 @pytest.mark.parametrize("case", list(CASES))

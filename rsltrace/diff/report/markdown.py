@@ -51,7 +51,7 @@ def _heading(diff: Diff | BagDiff) -> str:
     if diff.identical:
         return "identical" if isinstance(diff, Diff) else "equal"
     if isinstance(diff, BagDiff) or diff.agrees_until_cut:
-        return diff.verdict.value
+        return str(diff.verdict.value)
     tolerated = " (equal within tolerance, not identical)" if diff.within_tolerance else ""
     return f"the runs diverge: {diff.verdict.value}{tolerated}"
 
