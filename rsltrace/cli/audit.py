@@ -15,6 +15,7 @@ import click
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.errors import EXIT_USAGE, RsltraceError
 from rsltrace.model.printable import printable
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.audit.model import Audit, Found
@@ -70,15 +71,15 @@ def audit(
 
     found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
     for trouble in result.troubles:
-        click.echo(f"rsltrace: error: {printable(trouble)}", err=True)
+        tell(f"rsltrace: error: {printable(trouble)}")
     for note in result.notes:
-        click.echo(f"rsltrace: note: {printable(note)}", err=True)
+        tell(f"rsltrace: note: {printable(note)}")
     if as_json or form == "json":
-        click.echo(_as_json(result, found))
+        say(_as_json(result, found))
     elif form == "github":
-        click.echo("".join(map(_annotation, found)), nl=False)
+        say("".join(map(_annotation, found)), end="")
     else:
-        click.echo("\n".join([*map(_line, found), _summary(result, found)]))
+        say("\n".join([*map(_line, found), _summary(result, found)]))
     return EXIT_USAGE if result.troubles else 1 if found else 0
 
 

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from rsltrace.terminal import tell
+
 
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
@@ -31,4 +33,4 @@ def export(
     from rsltrace.bag.export import export_bag
 
     count = export_bag(trace, bag, topics=topics or ("*",), exclude=exclude, force=force)
-    click.echo(f"wrote {bag}: {count} messages", err=True)
+    tell(f"wrote {bag}: {count} messages")

@@ -16,6 +16,7 @@ from rsltrace.trace.format import CDR_HEADER
 
 _ENTITY_HEAD = struct.Struct("<IIB")
 _DETAIL_HEAD = struct.Struct("<QI")
+_LOG_HEAD = struct.Struct("<iIB")
 _LENGTH = struct.Struct("<I")
 _KINDS = frozenset(map(int, EntityKind))
 
@@ -78,6 +79,18 @@ def unpack_finding(data: bytes) -> Finding:
         raise TraceError(f"a finding of the trace cannot be read: {error}") from error
 
 
+def log_content(data: bytes) -> bytes:
+    """Return what is hashed of an ``rcl_interfaces/msg/Log``: severity, name and message.
+
+    Of bytes that are none, something else.
+    """
+    try:
+        name, message = _read_bytes(data, 4 + _LOG_HEAD.size, 2)
+        return b"%d\0%s\0%s" % (_LOG_HEAD.unpack_from(data, 4)[2], name, message)
+    except (struct.error, ValueError):
+        return b""
+
+
 def _append_strings(head: bytes, *texts: str) -> bytes:
     data = bytearray(head)
     for text in texts:
@@ -94,6 +107,10 @@ def _check_header(data: bytes) -> None:
 
 
 def _read_strings(data: bytes, offset: int, count: int) -> list[str]:
+    return [text.decode("utf-8") for text in _read_bytes(data, offset, count)]
+
+
+def _read_bytes(data: bytes, offset: int, count: int) -> list[bytes]:
     texts = []
     for _ in range(count):
         offset += -(offset - 4) % 4
@@ -101,6 +118,6 @@ def _read_strings(data: bytes, offset: int, count: int) -> list[str]:
         end = offset + 4 + length
         if length == 0 or end > len(data) or data[end - 1] != 0:
             raise ValueError("a string in it is cut off")
-        texts.append(data[offset + 4 : end - 1].decode("utf-8"))
+        texts.append(data[offset + 4 : end - 1])
         offset = end
     return texts

@@ -357,7 +357,13 @@ class Trace:
 
     def messages(self, topic: str) -> Iterator[tuple[int, int, bytes]]:
         """Yield (stamp in ns, sequence, data) of every message on ``topic``, in file order."""
-        yield from self._payloads.messages(frozenset(self._ids_of_topic.get(topic, ())))
+        channels = frozenset(self._ids_of_topic.get(topic, ()))
+        for _, stamp_ns, sequence, data in self.messages_of(channels):
+            yield stamp_ns, sequence, data
+
+    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
+        """Yield (channel, stamp in ns, sequence, data) of every message of some channels."""
+        yield from self._payloads.messages(channels)
 
     def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
         """Return ``data`` decoded by the schema of a channel (or its id, or its topic).
