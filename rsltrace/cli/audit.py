@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
-from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.errors import EXIT_USAGE
 from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
 
@@ -60,13 +59,7 @@ def audit(
 
     The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
     """
-    try:
-        result = _look(words, launch, skip, overrides)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        traceback.print_exc()  # Python's own exit status for a bug would say: findings
-        return EXIT_USAGE
+    result = _look(words, launch, skip, overrides)
     from rsltrace.audit.model import IS_SAFE
 
     found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]

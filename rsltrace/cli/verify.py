@@ -7,7 +7,6 @@ import shutil
 import signal
 import sys
 import tempfile
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -150,17 +149,11 @@ def verify(
         raise click.UsageError("--only and --output go with --run N")
     given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     job_of(words, launch, skip, overrides)  # what is wrong with it is said once, and here
-    try:
-        with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
-            folder = Path(name)
-            if number is not None:
-                return _one_run(given, folder, number, perturbations, only, output)
-            return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        traceback.print_exc()  # Python's own exit status for a bug would say: the runs differ
-        return EXIT_USAGE
+    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
+        folder = Path(name)
+        if number is not None:
+            return _one_run(given, folder, number, perturbations, only, output)
+        return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
 
 
 def _verify(
