@@ -35,7 +35,7 @@ def unpack_entity(data: bytes, created_ns: int) -> Entity:
         _check_header(data)
         entity_id, node, kind = _ENTITY_HEAD.unpack_from(data, 4)
         name, type_name, detail_text = _read_strings(data, 4 + _ENTITY_HEAD.size, 3)
-        detail = json.loads(detail_text)
+        detail = _json(detail_text)
         if not isinstance(detail, dict):
             raise ValueError("its detail is not a JSON object")
         if kind not in _KINDS:
@@ -43,6 +43,13 @@ def unpack_entity(data: bytes, created_ns: int) -> Entity:
         return Entity(entity_id, node, EntityKind(kind), name, type_name, created_ns, detail)
     except (struct.error, ValueError, RecursionError) as error:
         raise TraceError(f"an entity of the trace cannot be read: {error}") from error
+
+
+def _json(text: str) -> object:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"its detail is no JSON: {error}") from None
 
 
 def pack_detail(event: int, output: int, text: str) -> bytes:

@@ -76,3 +76,23 @@ def test_a_cut_trace_passes(tmp_path: Path) -> None:
     path = tmp_path / "cut.mcap"
     path.write_bytes(SAMPLE.read_bytes()[:-500])
     _checked(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "said"),
+    [(2, b"no JSON", "its detail is no JSON"), (0, b"\xff", "an entity of the trace cannot")],
+)
+def test_what_cannot_be_read_is_told_with_the_file(
+    tmp_path: Path, field: int, text: bytes, said: str
+) -> None:
+    """Two files are open in a diff."""
+    path = _forged(
+        tmp_path,
+        "/rsltrace/entities",
+        lambda data, nth: with_strings(
+            data, "/rsltrace/entities", lambda n, old: text if n == field else old
+        ),
+    )
+    with Trace.open(path) as trace, pytest.raises(TraceError, match=said) as raised:
+        _ = trace.entities
+    assert str(raised.value).startswith(f"{path}: ")
