@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
+from pathlib import Path
 
 import grimp
 import pytest
@@ -75,3 +77,27 @@ def circles() -> set[frozenset[str]]:
 
 def test_no_modules_import_each_other_in_a_circle() -> None:
     assert not circles(), "\n".join(" <-> ".join(sorted(circle)) for circle in circles())
+
+
+_WRITES = re.compile(
+    r"click\.(?:echo|secho)|(?<![\w.])print\(|std(?:out|err)\.write\(|print_exc|print_exception"
+)
+_MAY_WRITE = {"rsltrace/terminal.py"}
+_OF_THE_BUILD = {
+    "rsltrace/job/documents/reference.py",
+    "viewer/rsltrace_viewer/rerun_export/picture.py",
+}
+"""Run by makers of the documents, with texts of our own."""
+
+
+def test_one_place_writes_to_the_terminal() -> None:
+    """Else a name in somebody's trace could set the title of a window, or hide a line."""
+    root = Path(__file__).parents[1]
+    found = {
+        str(path.relative_to(root))
+        for folder in ("rsltrace", "viewer")
+        for path in (root / folder).rglob("*.py")
+        if _WRITES.search(path.read_text(encoding="utf-8"))
+    }
+    assert found <= _MAY_WRITE | _OF_THE_BUILD
+    assert found >= _MAY_WRITE

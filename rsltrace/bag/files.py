@@ -93,7 +93,7 @@ def _open_file(path: Path, files: BagFiles, expected: str | None, *, recover: bo
     if magic.startswith(MCAP_MAGIC):
         storage_id, storage = "mcap", McapFile(readable, recover=recover)
     elif magic.startswith(SQLITE_MAGIC):
-        storage_id, storage = "sqlite3", _sqlite(readable, files, recover=recover)
+        storage_id, storage = "sqlite3", _sqlite(readable, path, files, recover=recover)
     elif magic.startswith(b"#ROSBAG"):
         raise BagError(f"{path}: a ROS 1 bag; convert it with 'rosbags-convert'")
     else:
@@ -110,10 +110,10 @@ def _open_file(path: Path, files: BagFiles, expected: str | None, *, recover: bo
         files.notes.append(f"{path}: the recording was cut off: {storage.cut_off} play")
 
 
-def _sqlite(path: Path, files: BagFiles, *, recover: bool) -> SqliteFile:
-    """Open a database, or what can be read of it."""
+def _sqlite(path: Path, name: Path, files: BagFiles, *, recover: bool) -> SqliteFile:
+    """Open a database, or what can be read of it; ``name`` is what the user calls it."""
     try:
-        return SqliteFile(path)
+        return SqliteFile(path, name)
     except BagError:
         if not recover:
             raise
@@ -122,7 +122,7 @@ def _sqlite(path: Path, files: BagFiles, *, recover: bool) -> SqliteFile:
         found = recover_database(path, target)
         if not found:
             raise
-        storage = SqliteFile(target)
+        storage = SqliteFile(target, name)
         storage.cut_off = found
         return storage
 

@@ -11,6 +11,7 @@ from rsltrace.bag.qos import parse_qos
 from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
 from rsltrace.mcap.limits import METADATA_YAML_BYTES_MAX
+from rsltrace.model.nesting import nested_too_deep
 
 NAME = "metadata.yaml"
 _RECORDING = re.compile(r"\.(mcap|db3)(\.zstd)?$")
@@ -117,7 +118,10 @@ def _load(path: Path) -> Any:
     try:
         if path.stat().st_size > METADATA_YAML_BYTES_MAX:
             raise BagError(f"{path}: larger than any bag's; run 'ros2 bag reindex'")
-        return YAML(typ="safe", pure=True).load(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        if nested_too_deep(text) >= 0:
+            raise BagError(f"{path}: brackets are nested too deeply; run 'ros2 bag reindex'")
+        return YAML(typ="safe", pure=True).load(text)
     except (YAMLError, UnicodeDecodeError, RecursionError) as error:
         raise BagError(f"{path}: not YAML ({error}); run 'ros2 bag reindex'") from None
     except OSError as error:

@@ -10,6 +10,7 @@ from functools import lru_cache
 from typing import Any
 
 from rsltrace.bag.topic import DURATION_INFINITE_NS, BagQos
+from rsltrace.model.nesting import nested_too_deep
 from rsltrace.model.stamp import NS_PER_S
 
 # In the order of the enumerations in rmw/types.h.
@@ -48,6 +49,8 @@ def parse_qos(profiles: object) -> tuple[BagQos, ...]:
 def _parse_text(text: str) -> tuple[BagQos, ...]:
     if not text.strip():
         return ()
+    if nested_too_deep(text) >= 0:
+        raise ValueError("the QoS profiles are nested too deeply")
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

@@ -28,8 +28,10 @@ _REPAIR = "recover it with sqlite3's '.recover', then run 'ros2 bag reindex' on 
 class SqliteFile:
     """One open ``.db3`` file. Raises ``BagError`` when it is no rosbag2 database or damaged."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, name: Path | None = None) -> None:
+        """Open ``path``, a copy of the user's file ``name`` if that is given."""
         self.path = path
+        self.name = name or path
         self.cut_off = ""
         self.with_publish_time = False
         self._check_size()
@@ -72,7 +74,7 @@ class SqliteFile:
                 # sqlite holds any type in any column, and a damaged file does.
                 if type(stamp_ns) is not int or type(data) is not bytes or topic not in wanted:
                     raise BagError(
-                        f"{self.path}: the row at time {stamp_ns!r} is not a message; {_REPAIR}"
+                        f"{self.name}: the row at time {stamp_ns!r} is not a message; {_REPAIR}"
                     )
                 yield stamp_ns, wanted[topic], data
         except _ERRORS as error:
@@ -104,12 +106,12 @@ class SqliteFile:
         if not {"id", "name", "type", "serialization_format"} <= columns or not (
             {"topic_id", "timestamp", "data"} <= stored
         ):
-            raise BagError(f"{self.path}: a database, but not one of rosbag2 (tables are missing)")
+            raise BagError(f"{self.name}: a database, but not one of rosbag2 (tables are missing)")
         counts = dict(self._rows("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id"))
         ((self.start_ns,),) = self._rows("SELECT IFNULL(MIN(timestamp), 0) FROM messages")
         ((self.end_ns,),) = self._rows("SELECT IFNULL(MAX(timestamp), 0) FROM messages")
         if type(self.start_ns) is not int or type(self.end_ns) is not int:
-            raise BagError(f"{self.path}: the column of times holds something else; {_REPAIR}")
+            raise BagError(f"{self.name}: the column of times holds something else; {_REPAIR}")
         self.message_count = sum(counts.values())
 
         qos = "offered_qos_profiles" if "offered_qos_profiles" in columns else "''"
@@ -124,7 +126,7 @@ class SqliteFile:
             try:
                 offered = parse_qos(row[4])
             except ValueError as error:
-                raise BagError(f"{self.path}: topic {row[1]}: {error}") from None
+                raise BagError(f"{self.name}: topic {row[1]}: {error}") from None
             self.topics.append(
                 StoredTopic(
                     id=row[0],
@@ -140,7 +142,7 @@ class SqliteFile:
             )
         if counts:
             raise BagError(
-                f"{self.path}: {sum(counts.values())} messages are of topics that are not listed; "
+                f"{self.name}: {sum(counts.values())} messages are of topics that are not listed; "
                 f"{_REPAIR}"
             )
 
@@ -162,14 +164,14 @@ class SqliteFile:
             raise self._damaged(error) from None
 
     def _damaged(self, error: Exception) -> BagError:
-        return BagError(f"{self.path}: the database cannot be read ({error}); {_REPAIR}")
+        return BagError(f"{self.name}: the database cannot be read ({error}); {_REPAIR}")
 
     def _check_size(self) -> None:
         """Compare the file's size with what its header promises; sqlite would find out late."""
         with self.path.open("rb") as file:
             header = file.read(_HEADER_BYTES)
         if not header.startswith(MAGIC):
-            raise BagError(f"{self.path}: not a sqlite3 database")
+            raise BagError(f"{self.name}: not a sqlite3 database")
         size = self.path.stat().st_size
         page = int.from_bytes(header[16:18], "big")
         pages = int.from_bytes(header[28:32], "big")
@@ -177,6 +179,6 @@ class SqliteFile:
         expected = pages * (65536 if page == 1 else page)
         if len(header) < _HEADER_BYTES or (header[24:28] == header[92:96] and size < expected):
             raise BagError(
-                f"{self.path}: the database was cut off: {size} of {expected} bytes are there; "
+                f"{self.name}: the database was cut off: {size} of {expected} bytes are there; "
                 f"{_REPAIR}"
             )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import traceback
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -13,8 +12,9 @@ from typing import TYPE_CHECKING
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
-from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.errors import EXIT_USAGE
 from rsltrace.model.printable import printable
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.audit.model import Audit, Found
@@ -59,26 +59,20 @@ def audit(
 
     The exit status is 0 if nothing was found, 1 if something was, 2 for trouble.
     """
-    try:
-        result = _look(words, launch, skip, overrides)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        traceback.print_exc()  # Python's own exit status for a bug would say: findings
-        return EXIT_USAGE
+    result = _look(words, launch, skip, overrides)
     from rsltrace.audit.model import IS_SAFE
 
     found = [one for one in result.found if not (unguarded and one.treatment in IS_SAFE)]
     for trouble in result.troubles:
-        click.echo(f"rsltrace: error: {printable(trouble)}", err=True)
+        tell(f"rsltrace: error: {printable(trouble)}")
     for note in result.notes:
-        click.echo(f"rsltrace: note: {printable(note)}", err=True)
+        tell(f"rsltrace: note: {printable(note)}")
     if as_json or form == "json":
-        click.echo(_as_json(result, found))
+        say(_as_json(result, found))
     elif form == "github":
-        click.echo("".join(map(_annotation, found)), nl=False)
+        say("".join(map(_annotation, found)), end="")
     else:
-        click.echo("\n".join([*map(_line, found), _summary(result, found)]))
+        say("\n".join([*map(_line, found), _summary(result, found)]))
     return EXIT_USAGE if result.troubles else 1 if found else 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -19,6 +18,7 @@ from rsltrace.cli.event_json import EventJson
 from rsltrace.cli.event_line import EventLines
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
+from rsltrace.terminal import line_writer, tell
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.times import parse_stamp
@@ -112,10 +112,10 @@ def cat(
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
-        write = sys.stdout.write
+        write = line_writer()
         form = _json_form(opened, payloads) if as_json else EventLines(opened).line
         for event, outputs in islice(_events(opened, choice), limit):
-            write(form(event, outputs) + "\n")
+            write(form(event, outputs))
 
 
 def _json_form(trace: Trace, payloads: bool) -> Callable[[Event, list[Output]], str]:
@@ -177,10 +177,7 @@ def _warn_if_none(found: set[int], what: str, globs: tuple[str, ...], all_: list
     """An empty answer to a mistyped name looks like a run in which nothing happened: say so."""
     if not found:
         names = ", ".join(sorted({e.name for e in all_ if e.name})[:12]) or "none"
-        click.echo(
-            f"rsltrace: no {what} of the trace matches {' or '.join(globs)}; there are: {names}",
-            err=True,
-        )
+        tell(f"rsltrace: no {what} of the trace matches {' or '.join(globs)}; there are: {names}")
 
 
 def _events(trace: Trace, choice: _Choice) -> Iterator[tuple[Event, list[Output]]]:

@@ -16,6 +16,7 @@ from rsltrace.cli.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -70,19 +71,19 @@ def check(
         checked = check_job(loaded, everything=everything)
     except RunError as error:
         if isinstance(error, NodeError) and error.traceback_text:
-            click.echo(error.traceback_text.rstrip(), err=True)
-        click.echo(f"rsltrace: error: {error}", err=True)
+            tell(error.traceback_text.rstrip())
+        tell(f"rsltrace: error: {error}")
         return EXIT_USAGE
     if graph is not None:
         _draw(checked, graph)
     if form == "json":
-        click.echo(json.dumps(_values(checked.job, checked), indent=2))
+        say(json.dumps(_values(checked.job, checked), indent=2))
     else:
         for note in checked.notes:
-            click.echo(f"rsltrace: note: {note}", err=True)
-        click.echo("\n".join(map(printable, _text(checked.job, checked))))
+            tell(f"rsltrace: note: {note}")
+        say("\n".join(map(printable, _text(checked.job, checked))))
         if not checked.problems and launch is None and not overrides:
-            click.echo(f"next: rsltrace record {shlex.join(words)}", err=True)
+            tell(f"next: rsltrace record {shlex.join(words)}")
     return 1 if checked.problems else 0
 
 

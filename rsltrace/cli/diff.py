@@ -13,6 +13,7 @@ import click
 from rsltrace.cli.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.diff.report.line import Line
@@ -110,7 +111,12 @@ class _Tolerance(_Type):
 @click.option(
     "--check",
     is_flag=True,
-    help="First read all of both traces and check every checksum and hash.",
+    help="First read all of both traces; check all checksums, hashes and messages.",
+)
+@click.option(
+    "--as-far-as-they-go",
+    is_flag=True,
+    help="It is enough if recordings that are cut agree until there.",
 )
 @click.option(
     "-o",
@@ -132,6 +138,7 @@ def diff(
     relative: tuple[tuple[str, float], ...],
     by: str,
     check: bool,
+    as_far_as_they_go: bool,
     output: Path | None,
 ) -> int:
     """Find where A and B first diverge, and why.
@@ -143,8 +150,9 @@ def diff(
     FIELD is a glob on field paths (pose.pose.position.x, ranges[17]); it may begin with a glob of
     topics and a colon. A tolerance never makes two traces identical.
 
-    The exit status is 0 if nothing differs, 1 if the runs diverge, 2 for trouble, 3 if they are
-    equal within tolerance and not identical.
+    The exit status is 0 if nothing differs, 1 if the runs diverge, or one of the files is cut (then
+    nobody knows, unless --as-far-as-they-go is enough), 2 for trouble, 3 if they are equal within
+    tolerance and not identical.
     """
     options = DiffOptions(
         context=context,
@@ -155,6 +163,7 @@ def diff(
         absolute=absolute,
         relative=relative,
         by=by,
+        as_far_as_they_go=as_far_as_they_go,
     )
     return _diff(golden, others, form, options, output, check=check)
 
@@ -178,7 +187,7 @@ def _diff(
             if len(others) == 1:
                 raise
             # One bad file among many must not hide what the others say.
-            click.echo(f"rsltrace: error: {error}", err=True)
+            tell(f"rsltrace: error: {error}")
             trouble = True
     if done:
         _print(done, form, options, output)
@@ -201,12 +210,13 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
     from rsltrace.diff.traces.diff import diff_traces
+    from rsltrace.trace.contents import check_contents
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
-        if check_a:
-            trace_a.check()
-        if check:
-            trace_b.check()
+        for trace, wanted in ((trace_a, check_a), (trace_b, check)):
+            if wanted:
+                trace.check()
+                check_contents(trace)
         return diff_traces(trace_a, trace_b, options)
 
 
@@ -231,14 +241,14 @@ def _print(
     one_or_all = diffs[0] if len(diffs) == 1 else diffs
     if output is not None:
         write_text(output, render(one_or_all, form, options))
-        click.echo(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
+        say(_encodable("".join(render(one_or_all, "text", options)).splitlines()[0]))
     elif form != "text":
-        click.echo(render(one_or_all, form, options), nl=False)
+        say(render(one_or_all, form, options), end="")
     elif sys.stdout.isatty():
         width, height = _screen()
         _show(report_lines(one_or_all, options, width=width, height=height))
     else:
-        click.echo(_encodable(render(one_or_all, "text", options)), nl=False)
+        say(_encodable(render(one_or_all, "text", options)), end="")
 
 
 def _screen() -> tuple[int, int]:

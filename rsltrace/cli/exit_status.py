@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.terminal import tell
 
 EXIT_INTERRUPTED = 130
 EXIT_BROKEN_PIPE = 141
@@ -98,7 +99,9 @@ def status_of(command: Callable[[], object]) -> int:
     except RsltraceError as error:
         status = _failed(str(error), error.exit_code)
     except click.ClickException as error:
-        error.show()
+        shown = io.StringIO()
+        error.show(shown)
+        tell(shown.getvalue(), end="")
         status = error.exit_code
     except (KeyboardInterrupt, click.Abort):
         status = EXIT_INTERRUPTED
@@ -106,7 +109,7 @@ def status_of(command: Callable[[], object]) -> int:
         status = status_without_output(error)
     except Exception:
         # Python's own status for a bug would be 1, which says of some commands that runs differ.
-        traceback.print_exc()
+        tell(traceback.format_exc(), end="")
         status = EXIT_USAGE
     status = status if isinstance(status, int) else EXIT_USAGE if status else 0
     try:
@@ -131,7 +134,7 @@ def status_without_output(error: OSError, status: int = 0) -> int:
 
 
 def _failed(message: str, status: int) -> int:
-    click.echo(f"rsltrace: error: {message}", err=True)
+    tell(f"rsltrace: error: {message}")
     return status
 
 

@@ -6,6 +6,11 @@ from pathlib import Path
 
 import click
 
+from rsltrace.model.stamp import format_seconds
+from rsltrace.terminal import tell
+
+EXIT_CUT = 1
+
 
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
@@ -22,13 +27,23 @@ import click
 @click.option("--force", is_flag=True, help="Replace an existing bag.")
 def export(
     trace: Path, bag: Path, topics: tuple[str, ...], exclude: tuple[str, ...], force: bool
-) -> None:
+) -> int:
     """Write the messages of TRACE as a plain rosbag2 bag, without what rsltrace keeps of its own.
 
     Stamps are simulated time. The bag appears when it is complete, or not at all. Messages whose
     payloads the job did not keep (record: in a job) are not in it.
+
+    The exit status is 0 if the bag is all there is, 1 if TRACE is cut (its run was killed): the bag
+    then ends where the trace does.
     """
     from rsltrace.bag.export import export_bag
+    from rsltrace.trace.reader import Trace
 
+    with Trace.open(trace) as opened:
+        whole, events, end = opened.complete, opened.event_count, format_seconds(opened.end_ns)
     count = export_bag(trace, bag, topics=topics or ("*",), exclude=exclude, force=force)
-    click.echo(f"wrote {bag}: {count} messages", err=True)
+    tell(f"wrote {bag}: {count} messages")
+    if whole:
+        return 0
+    tell(f"rsltrace: note: {trace} is cut: the bag ends with it, after {events} events, at {end} s")
+    return EXIT_CUT

@@ -15,6 +15,7 @@ from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.terminal import say
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
@@ -28,7 +29,11 @@ _VALUE_MAX = 100
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 @click.option("--all", "show_all", is_flag=True, help="List every entity (--json always does).")
-@click.option("--check", is_flag=True, help="First read the whole file and check every hash.")
+@click.option(
+    "--check",
+    is_flag=True,
+    help="First read the whole file; check all checksums, hashes and messages.",
+)
 def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     """Show what is in TRACE: its digest, counts, nodes and entities with their rates.
 
@@ -37,12 +42,18 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     was killed is shown as far as it goes.
     """
     with Trace.open(trace) as opened:
-        opened.check() if check else opened.check_settings()
+        if check:
+            from rsltrace.trace.contents import check_contents
+
+            opened.check()
+            check_contents(opened)
+        else:
+            opened.check_settings()
         counts = count(opened)
         if as_json:
-            click.echo(json.dumps(_as_json(opened, counts), indent=2))
+            say(json.dumps(_as_json(opened, counts), indent=2))
         else:
-            click.echo("\n".join(_as_text(opened, counts, show_all=show_all)))
+            say("\n".join(_as_text(opened, counts, show_all=show_all)))
 
 
 def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:

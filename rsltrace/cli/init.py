@@ -12,6 +12,7 @@ import click
 from rsltrace.cli.text_file import undone
 from rsltrace.errors import BagError, OutputError
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
     from rsltrace.job.reading.node_source import Found
@@ -70,7 +71,7 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
 
     if sources:
         load_job(job)  # what was written must be a job
-    click.echo(f"wrote {job}; next: rsltrace check {job}", err=True)
+    tell(f"wrote {job}; next: rsltrace check {job}")
 
 
 def _is_python(source: str) -> bool:

@@ -21,6 +21,7 @@ from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.model.finding import Source
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -136,7 +137,7 @@ def record(
         _report(result, path, told, as_json=as_json)
         if bag is not None:
             count = export_bag(result.path or path, bag, force=force)
-            click.echo(f"wrote {bag}: {count} messages", err=True)
+            tell(f"wrote {bag}: {count} messages")
     except OSError as error:
         status = status_without_output(error, status)
     sys.exit(status)
@@ -156,7 +157,7 @@ def _print_job(job: Job) -> None:
     expanded = expand(job, why_not=why_not)
     for note in expanded.notes:
         _note(note)
-    click.echo(expanded.job.to_yaml(), nl=False)
+    say(expanded.job.to_yaml(), end="")
 
 
 def default_output(job: Path) -> Path:
@@ -181,21 +182,21 @@ def _all_overrides(
 
 
 def _note(text: str) -> None:
-    click.echo(f"rsltrace: note: {text}", err=True)
+    tell(f"rsltrace: note: {text}")
 
 
 def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) -> None:
     error = result.error
     for note in result.notes:
         if note not in told:  # when the run began
-            click.echo(f"note: {note}", err=True)
+            tell(f"note: {note}")
     if error is not None:
         if isinstance(error, NodeError) and error.traceback_text:
-            click.echo(error.traceback_text.rstrip(), err=True)
-        click.echo(f"rsltrace: error: {error}", err=True)
+            tell(error.traceback_text.rstrip())
+        tell(f"rsltrace: error: {error}")
     _warn(result)
     if as_json:
-        click.echo(
+        say(
             json.dumps(
                 {
                     "findings": sum(met.count for met in result.guarded if met.is_finding),
@@ -213,8 +214,8 @@ def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) ->
         )
         return
     kept = f" ({path} is as it was)" if result.path != path else ""
-    click.echo(f"wrote {result.path}{kept}: {result.stop_reason}", err=True)
-    click.echo(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
+    tell(f"wrote {result.path}{kept}: {result.stop_reason}")
+    say(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
 
 
 def _warn(result: RunResult) -> None:
@@ -226,14 +227,14 @@ def _warn(result: RunResult) -> None:
     for met in found:
         key = (met.source.value, f"{met.call} in {met.node or 'the run'}")
         calls[key] = calls.get(key, 0) + met.count
-    click.echo("guard: these calls can make runs differ (see docs/guard.md):", err=True)
+    tell("guard: these calls can make runs differ (see docs/guard.md):")
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
         times = f", {count} times" if count > 1 else ""
-        click.echo(f"  {source}: {printable(call)}{times}", err=True)
+        tell(f"  {source}: {printable(call)}{times}")
     if any(met.source is Source.ADDRESS for met in found) and not has_fixed_addresses():
-        click.echo("  addresses of objects are others in every process here", err=True)
+        tell("  addresses of objects are others in every process here")
     if len(calls) > _SHOWN_MAX:
-        click.echo(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}", err=True)
+        tell(f"  and {len(calls) - _SHOWN_MAX} more: rsltrace info {result.path}")
 
 
 _SHOWN_MAX = 8

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from rsltrace.terminal import say
+
 
 @click.command()
 @click.argument("trace", type=click.Path(path_type=Path))
@@ -52,7 +54,7 @@ def rerun(
     if output is not None:
         done = export(traces, output, force=force)
         if not quiet:
-            click.echo(
+            say(
                 f"wrote {output}: {done.events} events, {done.bytes / 1e6:.1f} MB "
                 f"({done.bytes / max(done.trace_bytes, 1):.1f} x the trace)"
             )

@@ -6,6 +6,8 @@ import json
 
 import click
 
+from rsltrace.terminal import say
+
 
 @click.command()
 def schema() -> None:
@@ -19,4 +21,4 @@ def schema() -> None:
     """
     from rsltrace.job.documents.schema import job_schema
 
-    click.echo(json.dumps(job_schema(), indent=2))
+    say(json.dumps(job_schema(), indent=2))

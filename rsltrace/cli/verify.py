@@ -7,7 +7,6 @@ import shutil
 import signal
 import sys
 import tempfile
-import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ import click
 from rsltrace.campaign.perturb import KINDS
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
 from rsltrace.errors import EXIT_USAGE, RsltraceError
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.campaign.perturb import Recorded, Surroundings
@@ -149,17 +149,11 @@ def verify(
         raise click.UsageError("--only and --output go with --run N")
     given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     job_of(words, launch, skip, overrides)  # what is wrong with it is said once, and here
-    try:
-        with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
-            folder = Path(name)
-            if number is not None:
-                return _one_run(given, folder, number, perturbations, only, output)
-            return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
-    except (RsltraceError, click.ClickException, click.exceptions.Exit, OSError):
-        raise
-    except Exception:
-        traceback.print_exc()  # Python's own exit status for a bug would say: the runs differ
-        return EXIT_USAGE
+    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
+        folder = Path(name)
+        if number is not None:
+            return _one_run(given, folder, number, perturbations, only, output)
+        return _verify(given, folder, runs, jobs, perturbations, timeout, keep, as_json=as_json)
 
 
 def _verify(
@@ -178,7 +172,7 @@ def _verify(
     def on_run(recorded: Recorded) -> None:
         if sys.stderr.isatty():
             around = recorded.surroundings
-            click.echo(f"run {around.number}: digest {recorded.digest or '-'}", err=True)
+            tell(f"run {around.number}: digest {recorded.digest or '-'}")
 
     series = Verification(
         given.arguments(absolute=True),
@@ -199,9 +193,9 @@ def _verify(
 
     again = [_again(given, perturbations, one.surroundings) for one in _two(result)]
     if as_json:
-        click.echo(as_values(result, place, again, kept=keep is not None))
+        say(as_values(result, place, again, kept=keep is not None))
     else:
-        click.echo(as_text(result, place, again, kept=keep is not None), err=bool(result.trouble))
+        (tell if result.trouble else say)(as_text(result, place, again, kept=keep is not None))
     if result.trouble is not None:
         return EXIT_USAGE
     return 0 if result.agrees else 1
@@ -236,12 +230,12 @@ def _one_run(
             raise click.UsageError(f"run {number} does not perturb the {only}")
         around = around.only(only)
     path = (output or Path(f"run-{number}.mcap")).absolute()
-    click.echo(f"run {number}: {around}", err=True)
+    tell(f"run {number}: {around}")
     done = record_in(around, given.arguments(absolute=True), folder, path=path)
-    click.echo(done.errors, nl=False, err=True)
+    tell(done.errors, end="")
     if not done.digest:
         raise RsltraceError(f"run {number}: {done.failure}")
-    click.echo(f"digest {done.digest}  events {done.events}")
+    say(f"digest {done.digest}  events {done.events}")
     return done.exit_code
 
 

@@ -14,6 +14,7 @@ import click
 
 from rsltrace.cli.text_file import write_text
 from rsltrace.errors import OutputError, SetupError, TraceError
+from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
     from rsltrace_viewer.terminal.app import ViewerApp
@@ -179,7 +180,7 @@ def _serve(port: int) -> None:
     arguments = [argument for argument in sys.argv[1:] if argument != "--serve"]
     command = shlex.join([sys.executable, "-m", "rsltrace", *arguments])
     server = LocalServer(command, port)
-    click.echo(f"rsltrace view: {server.address} (Ctrl-C ends it)", err=True)
+    tell(f"rsltrace view: {server.address} (Ctrl-C ends it)")
     try:
         server.serve()
     except OSError as error:

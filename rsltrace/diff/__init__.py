@@ -35,6 +35,7 @@ def diff_files(
     absolute: Tolerances = (),
     relative: Tolerances = (),
     window: int = 2000,
+    as_far_as_they_go: bool = False,
 ) -> Diff:
     """Compare two traces: paths, or addresses such as ``https://…`` given as strings.
 
@@ -44,6 +45,9 @@ def diff_files(
 
     ``ignore`` are globs of fields that are not compared (``header.stamp``, ``/odom:twist``).
     ``absolute`` and ``relative`` give tolerances by such globs: ``{"pose.*": 1e-6}``, or pairs.
+
+    A trace that is cut is never identical to another; with ``as_far_as_they_go`` it passes if it
+    agrees until there.
 
     Returns a ``rsltrace.Diff``; ``identical``, ``verdict`` and ``sentence`` say the most, and
     ``rsltrace.diff.report.render`` makes a report of it. For recordings that are no traces there
@@ -65,6 +69,7 @@ def diff_files(
         absolute=_pairs(absolute),
         relative=_pairs(relative),
         window=window,
+        as_far_as_they_go=as_far_as_they_go,
     )
     with Trace.open(a) as trace_a, Trace.open(b) as trace_b:
         return diff_traces(trace_a, trace_b, chosen)

@@ -8,6 +8,8 @@ from ruamel.yaml import YAML
 from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import YAMLError
 
+from rsltrace.model.nesting import nested_too_deep
+
 
 class _Constructor(SafeConstructor):
     """Reads what ROS's launch writes, too: it has tuples where a file has lists."""
@@ -21,6 +23,8 @@ _Constructor.add_constructor(
 
 def yaml_value(text: str) -> Any:
     """Return what YAML 1.1 (that of ROS) reads, or the text itself where it is not YAML."""
+    if nested_too_deep(text) >= 0:
+        return text
     yaml = YAML(typ="safe", pure=True)
     yaml.Constructor = _Constructor
     yaml.version = (1, 1)

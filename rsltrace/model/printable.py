@@ -7,6 +7,7 @@ import re
 _NOT_PRINTABLE = re.compile(
     r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff\u202a-\u202e\u2066-\u2069]"
 )
+_NOT_IN_LINES = re.compile(f"(?![\n\t]){_NOT_PRINTABLE.pattern}")
 _SHORT = {"\n": r"\n", "\r": r"\r", "\t": r"\t"}
 
 
@@ -16,6 +17,11 @@ def printable(text: str) -> str:
     Names and log texts come from the trace, and a trace may come from anybody.
     """
     return _NOT_PRINTABLE.sub(_escaped, text)
+
+
+def printable_lines(text: str) -> str:
+    """Return ``text`` with what could steer a terminal written as escapes; its lines stay."""
+    return _NOT_IN_LINES.sub(_escaped, text)
 
 
 def shortened(text: str, width: int) -> str:

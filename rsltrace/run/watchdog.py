@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.guard.callers import is_user_file
 from rsltrace.model.stamp import format_seconds
+from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
     from rsltrace.middleware.domain import Domain
@@ -115,8 +116,7 @@ class Watchdog:
 
 def _say(text: str) -> None:
     """Print a note as the command does."""
-    if sys.stderr is not None:
-        print(f"rsltrace: note: {text}", file=sys.stderr, flush=True)
+    tell(f"rsltrace: note: {text}")
 
 
 def _frames(frame: FrameType | None) -> Iterator[FrameType]:

@@ -56,7 +56,7 @@ def assert_matches_golden(
     ``job_or_result`` is a job (or its file, which is then run), the result of ``run_job``, or the
     path of a trace (``.mcap``). With ``update`` (default: whether this is ``pytest
     --rsltrace-update``), the golden trace is written instead wherever it is missing or another
-    one. ``options`` shape the report; no tolerance makes a run match.
+    one. ``options`` shape the report; no tolerance makes a run match, nor does a trace that is cut.
     Returns whether the golden trace was written.
 
     :raises GoldenMismatch: they diverge; the message is the report.

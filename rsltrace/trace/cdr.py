@@ -16,6 +16,7 @@ from rsltrace.trace.format import CDR_HEADER
 
 _ENTITY_HEAD = struct.Struct("<IIB")
 _DETAIL_HEAD = struct.Struct("<QI")
+_LOG_HEAD = struct.Struct("<iIB")
 _LENGTH = struct.Struct("<I")
 _KINDS = frozenset(map(int, EntityKind))
 
@@ -34,7 +35,7 @@ def unpack_entity(data: bytes, created_ns: int) -> Entity:
         _check_header(data)
         entity_id, node, kind = _ENTITY_HEAD.unpack_from(data, 4)
         name, type_name, detail_text = _read_strings(data, 4 + _ENTITY_HEAD.size, 3)
-        detail = json.loads(detail_text)
+        detail = _json(detail_text)
         if not isinstance(detail, dict):
             raise ValueError("its detail is not a JSON object")
         if kind not in _KINDS:
@@ -42,6 +43,13 @@ def unpack_entity(data: bytes, created_ns: int) -> Entity:
         return Entity(entity_id, node, EntityKind(kind), name, type_name, created_ns, detail)
     except (struct.error, ValueError, RecursionError) as error:
         raise TraceError(f"an entity of the trace cannot be read: {error}") from error
+
+
+def _json(text: str) -> object:
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"its detail is no JSON: {error}") from None
 
 
 def pack_detail(event: int, output: int, text: str) -> bytes:
@@ -78,6 +86,18 @@ def unpack_finding(data: bytes) -> Finding:
         raise TraceError(f"a finding of the trace cannot be read: {error}") from error
 
 
+def log_content(data: bytes) -> bytes:
+    """Return what is hashed of an ``rcl_interfaces/msg/Log``: severity, name and message.
+
+    Of bytes that are none, something else.
+    """
+    try:
+        name, message = _read_bytes(data, 4 + _LOG_HEAD.size, 2)
+        return b"%d\0%s\0%s" % (_LOG_HEAD.unpack_from(data, 4)[2], name, message)
+    except (struct.error, ValueError):
+        return b""
+
+
 def _append_strings(head: bytes, *texts: str) -> bytes:
     data = bytearray(head)
     for text in texts:
@@ -94,6 +114,10 @@ def _check_header(data: bytes) -> None:
 
 
 def _read_strings(data: bytes, offset: int, count: int) -> list[str]:
+    return [text.decode("utf-8") for text in _read_bytes(data, offset, count)]
+
+
+def _read_bytes(data: bytes, offset: int, count: int) -> list[bytes]:
     texts = []
     for _ in range(count):
         offset += -(offset - 4) % 4
@@ -101,6 +125,6 @@ def _read_strings(data: bytes, offset: int, count: int) -> list[str]:
         end = offset + 4 + length
         if length == 0 or end > len(data) or data[end - 1] != 0:
             raise ValueError("a string in it is cut off")
-        texts.append(data[offset + 4 : end - 1].decode("utf-8"))
+        texts.append(data[offset + 4 : end - 1])
         offset = end
     return texts

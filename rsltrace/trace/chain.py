@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import xxhash
 
+from rsltrace.model.entity import Entity
 from rsltrace.trace.format import EVENT_DTYPE, EVENT_REST_DTYPE, OUTPUT_HASHED
 
 hash64 = xxhash.xxh3_64_intdigest
@@ -30,6 +31,12 @@ function itself and not a wrapper of it, since the loop calls this several times
 def digest_text(chain_hash: int) -> str:
     """Return a run's digest as people see it: its last chain hash (0: no events) in hex."""
     return f"{chain_hash:016x}"
+
+
+def identity_hash(entity: Entity) -> int:
+    """Return the content hash of the output that made an entity."""
+    identity = f"{entity.node}\0{int(entity.kind)}\0{entity.name}\0{entity.type}"
+    return hash64(identity.encode())
 
 
 def output_hash(packed_outputs: Iterable[bytes]) -> int:

@@ -58,8 +58,9 @@ class PayloadReader:
             raise damaged(self._source, entry.span.offset, "the chunk", "messages are out of order")
         return message.log_time, records[message.start : message.end]
 
-    def messages(self, channel_ids: frozenset[int]) -> Iterator[tuple[int, int, bytes]]:
-        """Yield (stamp in ns, sequence, data) of all messages of some channels, in file order."""
+    def messages(self, channel_ids: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
+        """Yield (channel, stamp in ns, sequence, data) of all messages of some channels, in file
+        order."""
         for entry in self._chunks_with(channel_ids):
             wanted = [c for c in entry.counts if c in channel_ids]
             records = self._read_records(entry.span)
@@ -70,7 +71,8 @@ class PayloadReader:
             ]
             for offset, channel_id in sorted(places):
                 message = self._message_at(entry, records, offset, channel_id)
-                yield message.log_time, message.sequence, records[message.start : message.end]
+                data = records[message.start : message.end]
+                yield channel_id, message.log_time, message.sequence, data
 
     def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
         try:

@@ -7,11 +7,11 @@ in the same way, with ``complete`` false.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -51,6 +51,9 @@ from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoders
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 RUN = Entity(0, 0, EntityKind.SYSTEM, "", "", 0, {})
 """The run itself, in traces that do not describe it: what belongs to no node."""
@@ -242,7 +245,7 @@ class Trace:
         """All entities by id, in creation order. Id 0, the run, is always there."""
         entities = {RUN.id: RUN}
         for stamp_ns, _, data in self.messages(TOPIC_ENTITIES):
-            entity = unpack_entity(data, stamp_ns)
+            entity = self._named(unpack_entity, data, stamp_ns)
             if entity.id > ENTITY_ID_MAX:  # tables by id would be as large as it says
                 raise TraceError(
                     f"{self.name}: an entity has the id {entity.id}, and no run has so many; the "
@@ -306,14 +309,14 @@ class Trace:
         """What the guard found, by event and in order; events without findings are missing."""
         findings: dict[int, list[Finding]] = {}
         for _, _, data in self.messages(TOPIC_FINDINGS):
-            finding = unpack_finding(data)
+            finding = self._named(unpack_finding, data)
             findings.setdefault(finding.event, []).append(finding)
         return findings
 
     @cached_property
     def guarded(self) -> tuple[GuardCount, ...]:
         """How often the guard met each call; empty for a run without guard, or cut off."""
-        return parse_counts(self.metadata(METADATA_GUARD).get("calls", "[]"))
+        return self._named(parse_counts, self.metadata(METADATA_GUARD).get("calls", "[]"))
 
     # Payloads.
 
@@ -353,11 +356,19 @@ class Trace:
     def detail(self, output: Output) -> str | None:
         """Return the text of an output that is no message, or None if it has none."""
         found = self.payload(output)
-        return unpack_detail(found[2])[2] if found and found[1] == TOPIC_DETAILS else None
+        if not found or found[1] != TOPIC_DETAILS:
+            return None
+        return self._named(unpack_detail, found[2])[2]
 
     def messages(self, topic: str) -> Iterator[tuple[int, int, bytes]]:
         """Yield (stamp in ns, sequence, data) of every message on ``topic``, in file order."""
-        yield from self._payloads.messages(frozenset(self._ids_of_topic.get(topic, ())))
+        channels = frozenset(self._ids_of_topic.get(topic, ()))
+        for _, stamp_ns, sequence, data in self.messages_of(channels):
+            yield stamp_ns, sequence, data
+
+    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
+        """Yield (channel, stamp in ns, sequence, data) of every message of some channels."""
+        yield from self._payloads.messages(channels)
 
     def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
         """Return ``data`` decoded by the schema of a channel (or its id, or its topic).
@@ -377,7 +388,18 @@ class Trace:
             from rsltrace.trace.decode import Decoders
 
             self._decoders = Decoders()
-        return self._decoders.of(found).decode(data)
+        decoders = self._decoders
+        try:
+            return decoders.of(found).decode(data)
+        except TraceError as error:
+            raise TraceError(f"{self.name}: {error}") from error
+
+    def _named(self, read: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T:
+        """Read something; errors begin with the name of the file, since two may be open."""
+        try:
+            return read(*args, **more)
+        except TraceError as error:
+            raise TraceError(f"{self.name}: {error}") from error
 
     def _channel(self, topic: str, type_name: str) -> ChannelInfo | None:
         """Return the channel of a topic: the one of that type, where there are several."""

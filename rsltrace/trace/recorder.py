@@ -11,7 +11,7 @@ from collections.abc import Callable
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.model.finding import Finding
-from rsltrace.trace.chain import hash64
+from rsltrace.trace.chain import hash64, identity_hash
 from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
 from rsltrace.trace.writer import TraceWriter
 
@@ -95,8 +95,7 @@ class Recorder:
     def entity(self, entity: Entity) -> None:
         """Write down an entity. Its content is part of the event that created it."""
         self.writer.add_entity(entity)
-        identity = f"{entity.node}\0{int(entity.kind)}\0{entity.name}\0{entity.type}"
-        self.output(OutputKind.ENTITY, entity.id, hash64(identity.encode()))
+        self.output(OutputKind.ENTITY, entity.id, identity_hash(entity))
 
     def end_event(
         self,

@@ -18,7 +18,6 @@ KNOWN: dict[str, str] = {
     "texts/*: unread": "item 9",
     "texts/*: forged": "item 9",
     "texts/*: unnamed": "item 9",
-    "pasted/*: executed": "item 3",
     "nodes/log_escapes: raw": "item 4",
     "nodes/raises_escapes: raw": "item 4",
 }

@@ -117,4 +117,6 @@ def _tail(data: bytes, lines: int = 2) -> str:
 def reading(*words: str, cwd: Path, limits: Limits = Limits(), **more: object) -> Command:  # noqa: B008
     """Return a command that reads: it ends with 0 or 2, or, if it compares, with 1 or 3, too."""
     allowed = COMPARING if words[0] == "diff" else READING
+    if words[0] == "export":
+        allowed |= {DIFFERENT}  # of a trace that is cut
     return Command(tuple(words), allowed, cwd, limits=limits, **more)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -17,6 +18,7 @@ from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
 from rsltrace.errors import TraceError
 from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.writer import TraceWriter
 
 # /source ticks every 10 ms; /left and /right hear it, /sum hears both, /odd has nothing to do with
 # any of it. All remember everything they heard.
@@ -281,26 +283,88 @@ def test_a_run_that_was_told_to_stop_earlier(tmp_path: Path) -> None:
     assert compare(tmp_path, a=short, b=PLAN).verdict is Verdict.RAN_LONGER
 
 
-def test_an_interrupted_run(tmp_path: Path) -> None:
+def _cut(path: Path, size: int) -> Path:
+    path.write_bytes(path.read_bytes()[:size])
+    return path
+
+
+def test_an_interrupted_run_agrees_only_as_far_as_it_goes(tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     Simulation(PLAN, tmp_path / "b.mcap", storage=Storage(50, close=False)).run()
-    data = (tmp_path / "b.mcap").read_bytes()
-    (tmp_path / "b.mcap").write_bytes(data[: len(data) // 2])
+    _cut(tmp_path / "b.mcap", (tmp_path / "b.mcap").stat().st_size // 2)
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.ENDED_EARLY
+    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
     assert not diff.b.complete
     assert diff.b.stop_reason == "interrupted"
     assert diff.agreeing == diff.b.events > 100
+    assert diff.sentence == (
+        f"the two runs agree as far as they go, {diff.b.events} events: the recording of b is cut"
+    )
     assert "the recording of b" in diff.notes[0]
-    assert "was killed" in diff.divergences[0].root_sentence
+    assert (diff.identical, diff.diverged, diff.failed, diff.exit_code) == (False, False, True, 1)
+    accepted = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    assert (accepted.identical, accepted.failed, accepted.exit_code) == (False, False, 0)
 
 
-def test_two_runs_that_were_both_interrupted_are_identical_only_so_far(tmp_path: Path) -> None:
+def test_two_runs_that_were_both_interrupted_are_not_identical(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
         Simulation(PLAN, tmp_path / name, storage=Storage(50, close=False)).run()
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
-    assert diff.verdict is Verdict.IDENTICAL
-    assert diff.sentence.startswith("as far as both recordings go, the two runs are identical")
+    assert diff.verdict is Verdict.AS_FAR_AS_THEY_GO
+    assert diff.sentence.endswith("events: both recordings are cut")
+    assert diff.exit_code == 1
+
+
+def test_a_trace_is_not_identical_to_its_own_beginning(tmp_path: Path) -> None:
+    """Also not to the one that lacks no event, only the end of the file."""
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    data = (tmp_path / "a.mcap").read_bytes()
+    verdicts = set()
+    for size in range(len(data) - 1, 2000, -len(data) // 40):
+        (tmp_path / "b.mcap").write_bytes(data[:size])
+        for a, b in (("a", "b"), ("b", "a"), ("b", "b")):
+            diff = rsltrace.diff(tmp_path / f"{a}.mcap", tmp_path / f"{b}.mcap")
+            verdicts.add(diff.verdict)
+            assert diff.exit_code == 1, size
+    assert verdicts == {Verdict.AS_FAR_AS_THEY_GO}
+
+
+def test_a_cut_run_still_diverges_where_it_does_something_else(tmp_path: Path) -> None:
+    Simulation(PLAN, tmp_path / "a.mcap").run()
+    fault = Fault("bit", step(20, 1))
+    Simulation(PLAN, tmp_path / "b.mcap", (fault,), storage=Storage(50, close=False)).run()
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap", as_far_as_they_go=True)
+    assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
+    assert diff.exit_code == 1
+
+
+def _without_events(path: Path, name: str, stop: str) -> Path:
+    with TraceWriter(path, force=True) as writer:
+        resolved = json.dumps({"stop": stop})
+        writer.add_metadata("rsltrace:job", {"name": name, "resolved": resolved})
+        writer.close(result={"stop_reason": "nothing to do", "exit_code": "0"})
+    return path
+
+
+@pytest.mark.parametrize("size", [None, -200])
+def test_runs_without_an_event_are_not_equal_if_their_jobs_are_not(
+    tmp_path: Path, size: int | None
+) -> None:
+    """Nothing was recorded, so nothing but the jobs can be compared."""
+    a, b, c = (
+        _without_events(tmp_path / f"{name}.mcap", *job)
+        for name, *job in (("a", "x", "1s"), ("b", "y", "2s"), ("c", "x", "1s"))
+    )
+    for path in (a, b, c):
+        _cut(path, size) if size else None
+    for options in ({}, {"as_far_as_they_go": True}):
+        diff = rsltrace.diff(a, b, **options)
+        assert diff.verdict is Verdict.DIFFERENT_JOBS
+        assert diff.exit_code == 1
+        assert '("x", "y")' in diff.sentence
+        same = rsltrace.diff(a, c, **options)
+        assert same.verdict is (Verdict.AS_FAR_AS_THEY_GO if size else Verdict.IDENTICAL)
+        assert same.exit_code == (1 if size else 0)
 
 
 def test_an_exception_in_one_run(tmp_path: Path) -> None:

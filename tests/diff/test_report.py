@@ -277,6 +277,29 @@ def equal_within_tolerance() -> BagDiff:
     )
 
 
+def cut() -> Diff:
+    """Two runs that agree until one recording ends: green nowhere."""
+    sides = (side("run1", "0123456789abcdef"), side("run2", "fedcba9876543210", events=4096))
+    return Diff(
+        sides[0],
+        dataclasses.replace(sides[1], complete=False, stop_reason="interrupted"),
+        Verdict.AS_FAR_AS_THEY_GO,
+        "the two runs agree as far as they go, 4096 events: the recording of b is cut",
+        4096,
+        notes=("the recording of b (runs/run2.mcap) was interrupted: compared is what is there",),
+    )
+
+
+def cut_recording() -> BagDiff:
+    return dataclasses.replace(
+        equal_within_tolerance(),
+        b=dataclasses.replace(recordings().b, complete=False),
+        verdict=BagVerdict.AS_FAR_AS_THEY_GO,
+        sentence="As far as they go, the recordings agree: 690 messages on 1 topic say the same.",
+        topics=(TopicDiff("/odom", "a/msg/B", "a/msg/B", 690, 0, 0, 0, 0),),
+    )
+
+
 CASES: dict[str, Callable[[], Diff | BagDiff]] = {
     "identical": identical,
     "nondeterministic": nondeterministic,
@@ -284,6 +307,8 @@ CASES: dict[str, Callable[[], Diff | BagDiff]] = {
     "tolerated": tolerated,
     "recordings": recordings,
     "equal_within_tolerance": equal_within_tolerance,
+    "cut": cut,
+    "cut_recording": cut_recording,
 }
 SUFFIXES = {
     "text": "txt",
@@ -318,8 +343,30 @@ def test_golden_report_of_everything() -> None:
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_golden_reports_of_several_runs(form: str) -> None:
-    runs: list[Diff | BagDiff] = [nondeterministic(), identical(), missing(), tolerated()]
+    runs: list[Diff | BagDiff] = [nondeterministic(), identical(), missing(), tolerated(), cut()]
     check_golden(f"several.{SUFFIXES[form]}", render(runs, form))
+
+
+@pytest.mark.parametrize("made", [cut, cut_recording])
+def test_a_cut_recording_is_green_nowhere_unless_that_is_enough(
+    made: Callable[[], Diff | BagDiff],
+) -> None:
+    diff = made()
+    assert (diff.identical, diff.failed, diff.exit_code) == (False, True, 1)
+    assert 'failures="1"' in render(diff, "junit")
+    assert render(diff, "github").startswith("::error ")
+    assert "identical" not in render(diff, "markdown")
+    assert json.loads(render(diff, "json"))["verdict"] == "agree-as-far-as-they-go"
+    assert "agree" in render(diff).splitlines()[0]
+    enough = dataclasses.replace(diff, as_far_as_they_go=True)
+    assert (enough.identical, enough.failed, enough.exit_code) == (False, False, 0)
+    assert 'failures="0"' in render(enough, "junit")
+    assert render(enough, "github").startswith("::notice ")
+    assert json.loads(render(enough, "json"))["failed"] is False
+    assert "1 of 2 runs agrees only as far as the recordings go." in render([diff, enough])
+    assert "agree with runs" in render([enough, enough]) or "agree with bags" in render(
+        [enough] * 2
+    )
 
 
 @pytest.mark.parametrize("case", list(CASES))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import shutil
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.diff.causes.record_command import record_command
+from rsltrace.diff.causes.record_command import record_again
 from rsltrace.trace.reader import Trace
 
 JOB = """\
@@ -35,7 +36,7 @@ def test_a_run_is_recorded_again(
     done = rsltrace("record", "job.yaml", "-o", "run.mcap", *given)
     assert done.returncode == 0, done.stderr
     with Trace.open(tmp_path / "run.mcap") as trace:
-        words = shlex.split(record_command(trace))
+        words = shlex.split(record_again(trace).command)
     assert words[:3] == ["rsltrace", "record", str(tmp_path / "job.yaml")], "beside the trace"
     until = ("--until", "2") if "--until" in given else ()
     again = rsltrace(*words[1:], *until, "-o", "again.mcap")
@@ -70,28 +71,126 @@ class _Job:
         self.name, self.job, self.job_text = "run.mcap", {"name": name}, text
 
 
+def _again(name: str, *overrides: str) -> tuple[str, str]:
+    lines = "".join(f"#   with --{override}\n" for override in overrides)
+    text = f"# The effective job of {name}\n{lines}nodes: []\n#   with --set x=1\n"
+    again = record_again(_Job(name, text))  # type: ignore[arg-type]
+    return again.command, " ".join(again.warnings)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with jobs and launch files, one above it and one beside."""
+    folder = tmp_path / "here"
+    for name in ("job.yaml", "my job.yaml", "x.launch.py", "launch/robot.launch.xml"):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("nodes: []\n")
+    (tmp_path / "evil.launch.py").write_text("")
+    (folder / "link.launch.py").symlink_to(tmp_path / "evil.launch.py")
+    monkeypatch.chdir(folder)
+    return folder
+
+
 @pytest.mark.parametrize(
     ("name", "override", "command"),
     [
-        ("", "", ""),
-        ("<python>", "--set x=1", ""),
         (
             "robot.launch.xml",
-            '--set launch.+={"file": "launch/robot.launch.xml", "arguments": {"world": "a lab"}}',
-            "rsltrace record --launch launch/robot.launch.xml 'world:=a lab'",
+            'set launch.+={"file": "launch/robot.launch.xml", "arguments": {"world": "lab"}}',
+            "rsltrace record --launch launch/robot.launch.xml world:=lab",
         ),
         (
             "job.yaml",
-            '--set launch.+={"file": "x.launch.py", "arguments": {}, "skip_unsupported": true}',
+            'set launch.+={"file": "x.launch.py", "arguments": {}, "skip_unsupported": true}',
             "rsltrace record job.yaml --launch x.launch.py --skip-unsupported",
         ),
-        ("job.yaml", "--set launch.+=x.xml", "rsltrace record job.yaml --set launch.+=x.xml"),
-        ("my job.yaml", '--until stop.time="3s"', "rsltrace record 'my job.yaml'"),
+        ("my job.yaml", 'until stop.time="3s"', "rsltrace record 'my job.yaml'"),
+        ("job.yaml", "seed seed=5", "rsltrace record job.yaml --set seed=5"),
+        (
+            "job.yaml",
+            "set nodes.ekf.parameters.rate=20.0",
+            "rsltrace record job.yaml --set nodes.ekf.parameters.rate=20.0",
+        ),
+        (
+            "job.yaml",
+            "set delay.default.uniform={min: 0s, max: 200ms}",
+            "rsltrace record job.yaml --set 'delay.default.uniform={min: 0s, max: 200ms}'",
+        ),
+        (
+            "job.yaml",
+            'set record.topics=["/scan", /tf*]',
+            "rsltrace record job.yaml --set 'record.topics=[\"/scan\", /tf*]'",
+        ),
     ],
 )
-def test_launch_files_and_names(name: str, override: str, command: str) -> None:
-    text = f"# The effective job of {name}\n#   with {override}\nnodes: []\n#   with --set x=1\n"
-    assert record_command(_Job(name, text)) == command  # type: ignore[arg-type]
+def test_options_are_said_again(here: Path, name: str, override: str, command: str) -> None:
+    assert _again(name, override) == (command, "")
+
+
+def test_ros_arguments_are_said_again(here: Path) -> None:
+    words = ("-r", "__ns:=/front", "-p", "ekf:rate:=20.0")
+    given = [f"set ros_arguments.+={json.dumps(word)}" for word in words]
+    command = "rsltrace record job.yaml --ros-args -r __ns:=/front -p ekf:rate:=20.0 --"
+    assert _again("job.yaml", *given) == (command, "")
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        "set nodes=[{main: timeit:main, name: x}]",
+        "set nodes.+={node: canary:hit}",
+        "set nodes.ekf.node=canary:hit",
+        "set nodes.ekf.parameters.model=/elsewhere/evil.pkl",
+        "set nodes.ekf.parameters.hook=canary:hit",
+        "set hooks={after: canary:hit}",
+        "set policy=canary:hit",
+        "set policy={function: canary.hit}",
+        "set search_path=[/elsewhere]",
+        "set delay=[/elsewhere/delays.yaml]",
+        "set launch.+=x.launch.py",
+        'set launch.+={"file": "/elsewhere/evil.launch.py", "arguments": {}}',
+        'set launch.+={"file": "../evil.launch.py", "arguments": {}}',
+        'set launch.+={"file": "link.launch.py", "arguments": {}}',
+        'set launch.+={"file": "gone.launch.py", "arguments": {}}',
+        'set launch.+={"file": "x.launch.py", "arguments": {"map": "$(rm x)"}}',
+        'set launch.+={"file": "x.launch.py", "arguments": {"-o": "x"}}' + "\x1b]0;owned\x07",
+        'set ros_arguments.+="--params-file"',
+        'set ros_arguments.+="x:=1"',
+        "launch evil.launch.py",
+        "output canary",
+        "set seed=5; touch canary",
+        "set seed=" + "1" * 100_000,
+        "set stop.time=" + "[" * 100_000,
+    ],
+)
+def test_what_may_run_code_is_told_and_not_offered(here: Path, override: str) -> None:
+    """A trace may come from anybody, and the line is there to be pasted."""
+    command, warning = _again("job.yaml", override)
+    assert command == ""
+    assert "there is no command to paste" in warning
+    assert "\x1b" not in warning
+    assert len(warning) < 1000
+
+
+@pytest.mark.parametrize("name", ["../job.yaml", "gone.yaml", "--launch=x.launch.py", "é" * 3000])
+def test_a_job_that_is_not_here_is_not_offered(here: Path, name: str) -> None:
+    (here.parent / "job.yaml").write_text("nodes: []\n")
+    command, warning = _again(name)
+    assert command == ""
+    assert "was made elsewhere: its job" in warning
+
+
+def test_another_job_of_that_name_is_told(here: Path) -> None:
+    mine = _Job("job.yaml", "nodes: []\n")
+    assert record_again(mine).warnings == ()  # type: ignore[arg-type]
+    theirs = record_again(_Job("job.yaml", "nodes: [x]\n"))  # type: ignore[arg-type]
+    assert theirs.command == "rsltrace record job.yaml"
+    assert "was made elsewhere, or the job has been changed" in theirs.warnings[0]
+
+
+@pytest.mark.parametrize("name", ["", "<python>"])
+def test_a_job_of_no_file_is_not_recorded_again(name: str) -> None:
+    assert _again(name) == ("", "")
 
 
 def test_a_job_made_in_python_has_no_file_and_no_lines(tmp_path: Path) -> None:

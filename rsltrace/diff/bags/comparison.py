@@ -170,6 +170,8 @@ class _Comparison:
             verdict = BagVerdict.DIFFERENT
         else:
             verdict = BagVerdict.WITHIN_TOLERANCE if tolerated else BagVerdict.EQUAL
+            if not (a.complete and b.complete):
+                verdict = BagVerdict.AS_FAR_AS_THEY_GO
         if self._options.by != BY_STAMP and topics:
             self._note("log times are not compared (--by stamp matches messages by them)")
         for topic in topics:
@@ -190,6 +192,7 @@ class _Comparison:
             first=first,
             next_step=_next_step(a, b, first, self._options),
             notes=tuple(self._notes),
+            as_far_as_they_go=self._options.as_far_as_they_go,
         )
 
 
@@ -256,8 +259,11 @@ def _sentence(
     counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
     if verdict is BagVerdict.EQUAL:
         return f"The recordings are equal: {counted} say the same."
+    tolerated = sum(topic.tolerated for topic in topics)
+    if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
+        how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
+        return f"As far as they go, the recordings agree: {counted} {how}; not both are whole."
     if verdict is BagVerdict.WITHIN_TOLERANCE:
-        tolerated = sum(topic.tolerated for topic in topics)
         return (
             f"The recordings are equal within tolerance, not identical: {tolerated} of {counted} "
             "differ, none by more than is tolerated."

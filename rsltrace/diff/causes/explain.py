@@ -12,7 +12,7 @@ from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.causes.propagation import NODE, FoundDivergence, Origin
-from rsltrace.diff.causes.record_command import record_command
+from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import (
@@ -49,6 +49,8 @@ class Explainer:
     def __post_init__(self) -> None:
         self._viewer_a = EventViews(self.run_a)
         self._viewer_b = EventViews(self.run_b)
+        self.warnings: dict[str, None] = {}
+        """What to know before one runs a ``next_step``."""
 
     def explain(self, found: FoundDivergence) -> Divergence:
         """Return everything about a root, or about a consequence that was asked for."""
@@ -242,7 +244,7 @@ class Explainer:
     def _next_step(self, judgement: Judgement) -> str:
         view = judgement.a or judgement.b
         assert view is not None
-        path_a, path_b = (shlex.quote(run.trace.name) for run in (self.run_a, self.run_b))
+        path_a, path_b = (_word(run.trace.name) for run in (self.run_a, self.run_b))
         verdict = judgement.verdict
         if verdict in (Verdict.ENDED_EARLY, Verdict.RAN_LONGER):
             return f"rsltrace info {path_b if verdict is Verdict.ENDED_EARLY else path_a}"
@@ -251,10 +253,12 @@ class Explainer:
                 return f"rsltrace diff {path_a} {path_b} --all"
             return f"rsltrace view {path_a} {path_b}"
         until = format_seconds(view.stamp_ns)
-        record = record_command(self.run_a.trace)
-        if judgement.root in _AGAIN and record and view.kind is not EventKind.CONSTRUCT:
-            again = f"{record} --until {until} -o again.mcap --force"
-            return f"{again}; rsltrace diff {path_a} again.mcap"
+        if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
+            record = record_again(self.run_a.trace)
+            self.warnings.update(dict.fromkeys(record.warnings))
+            if record.command:
+                again = f"{record.command} --until {until} -o again.mcap --force"
+                return f"{again}; rsltrace diff {path_a} again.mcap"
         path = path_a if judgement.a is not None else path_b
         node = view.entity.node
         choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""
@@ -263,6 +267,11 @@ class Explainer:
         if view.kind is EventKind.CONSTRUCT:
             choice = " --kind construct"
         return f"rsltrace cat {path}{choice} --from {until} --to {until} --json --payloads"
+
+
+def _word(path: str) -> str:
+    """Return a path as a word of a command, never an option."""
+    return shlex.quote(f"./{path}" if path.startswith("-") else path)
 
 
 def _told_to_differ(settings: Sequence[Setting]) -> bool:

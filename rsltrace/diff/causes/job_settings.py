@@ -17,6 +17,7 @@ from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file
 from rsltrace.diff.result.traces import Setting
+from rsltrace.model.nesting import nested_too_deep
 from rsltrace.model.stamp import format_duration
 from rsltrace.trace.reader import Trace
 
@@ -109,6 +110,8 @@ class _JobText:
 
 def _composed(text: str) -> Any:
     """Return the YAML nodes of a job file, or None if it cannot be read."""
+    if nested_too_deep(text) >= 0:
+        return None
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 

@@ -1,20 +1,99 @@
 """The command that records a trace's job once more, with what the command line said of it.
 
 A job that was put together (``--set``, ``--seed``, a launch file, …) begins, in the trace, with
-comments that say of what. Without them the command would record another run.
+comments that say of what. Without them the command would record another run. A trace may come from
+anybody and the command is there to be pasted, so it takes from the trace only what is harmless: a
+job or launch file that is here, and options of a fixed list with numbers, times and names.
 """
 
 from __future__ import annotations
 
 import json
+import os
+import re
 import shlex
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.reader import Trace
 
 _EFFECTIVE = "# The effective job "
 _WITH = "#   with --"
 _LAUNCH = "launch.+="
+_ROS = "ros_arguments.+="
+
+_JOB_NAME = re.compile(r"\w[\w .+-]{0,200}\.(?:ya?ml|json)")
+_LAUNCH_NAME = re.compile(r"\w[\w .+-]{0,200}\.(?:ya?ml|xml|py)")
+_FILE_BYTES_MAX = 4 << 20
+_TEXT_MAX = 200
+_CHANGE_MAX = 1000
+_OPTIONS_MAX = 50
+
+_NUMBER = r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?(?:ns|us|µs|ms|s|min|h|%)?|true|false|null"
+_NAME = r"[~/]?[A-Za-z_][\w/*]*"
+_WORD = r"[A-Za-z_]\w*"
+_KEY = r"[\w/~*-]+"
+
+
+def _of_values(leaf: str) -> re.Pattern[str]:
+    """Return what fits a leaf, or a list or a mapping of such."""
+    leaf = rf"(?:{leaf}|\"(?:{leaf})\")"
+    pair = rf"{_KEY}: {leaf}"
+    items, pairs = (rf"(?:{one}(?:, ?{one})*)?" for one in (leaf, pair))
+    return re.compile(rf"{leaf}|\[{items}\]|\{{{pairs}\}}", re.ASCII)
+
+
+_NUMBERS = _of_values(_NUMBER)
+_NUMBERS_AND_WORDS = _of_values(f"{_NUMBER}|{_WORD}")
+_NUMBERS_AND_NAMES = _of_values(f"{_NUMBER}|{_NAME}")
+_SETTINGS: tuple[tuple[re.Pattern[str], re.Pattern[str]], ...] = tuple(
+    (re.compile(key, re.ASCII), values)
+    for key, values in (
+        (r"seed|min_time_step", _NUMBERS),
+        (rf"(?:delay|execution|clocks)(?:\.{_KEY})*", _NUMBERS),
+        (
+            rf"nodes\.{_KEY}\.(?:parameters|arguments)(?:\.{_KEY})+",
+            _NUMBERS_AND_WORDS,
+        ),
+        (rf"(?:stop|record|policy)(?:\.{_KEY})*", _NUMBERS_AND_NAMES),
+    )
+)
+"""Keys that ``--set`` is offered for, and their values: nothing here names code or a file."""
+
+_ARGUMENT = re.compile(rf"({_KEY}):=({_NUMBER}|{_NAME})", re.ASCII)
+_REMAPPING = re.compile(r"[\w/~:]+:=[\w/~]+", re.ASCII)
+_PARAMETER = re.compile(rf"[\w/~.:]+:=(?:{_NUMBER})", re.ASCII)
+_ROS_OPTIONS = {"-r": _REMAPPING, "--remap": _REMAPPING, "-p": _PARAMETER, "--param": _PARAMETER}
+
+
+@dataclass(frozen=True, slots=True)
+class RecordAgain:
+    """How a trace's job is recorded once more: a command that is safe to paste, or "".
+
+    ``warnings`` say why there is none, or what to know of it.
+    """
+
+    command: str = ""
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(slots=True)
+class _Words:
+    """What the command is made of."""
+
+    job: list[str]
+    launch: list[str] = field(default_factory=list)
+    settings: list[str] = field(default_factory=list)
+    ros: list[str] = field(default_factory=list)
+    foreign: list[str] = field(default_factory=list)
+    """What is not taken over from the trace."""
+
+    def command(self) -> str:
+        """Return the line."""
+        ros = ["--ros-args", *self.ros, "--"] if self.ros else []
+        words = ["rsltrace", "record", *self.job, *self.settings, *self.launch, *ros]
+        return " ".join(shlex.quote(word) for word in words)
 
 
 def is_effective(trace: Trace) -> bool:
@@ -27,46 +106,135 @@ def is_of_file(trace: Trace) -> bool:
     return trace.job.get("name", "") not in ("", "<python>")
 
 
-def record_command(trace: Trace) -> str:
-    """Return ``rsltrace record …`` for the job of ``trace``, "" if it came from no file."""
+def record_again(trace: Trace) -> RecordAgain:
+    """Return ``rsltrace record …`` for the job of ``trace``; nothing if it came from no file."""
     if not is_of_file(trace):
-        return ""
-    words = ["rsltrace", "record", _job_file(trace)]
+        return RecordAgain()
+    name = trace.job["name"]
+    path, is_same = _job_file(trace, name)
+    words = _Words([path])
     if is_effective(trace):
         for line in trace.job_text.splitlines()[1:]:
             if not line.startswith("#"):
                 break
             if line.startswith(_WITH):
-                words = _with(words, line[len(_WITH) :])
-    return " ".join(shlex.quote(word) for word in words)
+                _take(words, line[len(_WITH) :], name)
+    if words.foreign:
+        more = f" and {len(words.foreign) - 3} more" if len(words.foreign) > 3 else ""
+        told = ", ".join(_told(text) for text in words.foreign[:3])
+        return RecordAgain(
+            "",
+            (
+                f"{trace.name} says that it was recorded with {told}{more}: that may run code, so "
+                "there is no command to paste; use it only if you know where the trace is from",
+            ),
+        )
+    if words.job and not path:
+        return RecordAgain(
+            "", (f"{trace.name} was made elsewhere: its job {_told(name)} is not here",)
+        )
+    warning = (
+        f"{path} is not what {trace.name} was recorded with: it was made elsewhere, or the job has "
+        "been changed since"
+    )
+    return RecordAgain(words.command(), () if is_same or not words.job else (warning,))
 
 
-def _job_file(trace: Trace) -> str:
-    """Return the job file: a trace knows its name, and often lies beside it."""
-    name = trace.job["name"]
-    beside = Path(trace.name).parent / name
-    return str(beside) if not Path(name).exists() and beside.is_file() else name
+def _job_file(trace: Trace, name: str) -> tuple[str, bool]:
+    """Return the job file, "" if there is none, and whether it is the one that was recorded.
+
+    A trace knows its name, and often lies beside it.
+    """
+    if not _JOB_NAME.fullmatch(name):
+        return "", False
+    places = (Path(name), Path(trace.name).parent / name)
+    found = [place for place in places if _is_file(place)]
+    if is_effective(trace):  # its text is that of no file
+        return (str(found[0]), True) if found else ("", False)
+    same = next((place for place in found if _reads(place, trace.job_text)), None)
+    if same is not None:
+        return str(same), True
+    return (str(found[0]), False) if found else ("", False)
 
 
-def _with(words: list[str], override: str) -> list[str]:
+def _is_file(path: Path) -> bool:
+    try:
+        return path.is_file()
+    except OSError:  # a name that is too long
+        return False
+
+
+def _reads(path: Path, text: str) -> bool:
+    try:
+        with path.open("rb") as file:
+            return file.read(_FILE_BYTES_MAX).decode("utf-8-sig", "replace") == text
+    except OSError:
+        return False
+
+
+def _take(words: _Words, override: str, name: str) -> None:
+    """Add what the job was put together with: ``set key=value``, as the trace says it."""
     option, _, change = override.partition(" ")
     if option == "until":  # the report has a time of its own
-        return words
-    if change.startswith(_LAUNCH):
-        return _with_launch_file(words, change[len(_LAUNCH) :])
-    return [*words, "--set", change]
+        return
+    key, equals, value = change.partition("=")
+    too_much = len(change) > _CHANGE_MAX or len(words.settings) > _OPTIONS_MAX
+    if too_much or option not in ("set", "seed") or not equals:
+        words.foreign.append(f"--{override}")
+    elif change.startswith(_LAUNCH):
+        _take_launch_file(words, change[len(_LAUNCH) :], name)
+    elif change.startswith(_ROS):
+        _take_ros_argument(words, change[len(_ROS) :])
+    elif any(k.fullmatch(key) and v.fullmatch(value) for k, v in _SETTINGS):
+        words.settings += ["--set", change]
+    else:
+        words.foreign.append(f"--set {change}")
 
 
-def _with_launch_file(words: list[str], spec: str) -> list[str]:
+def _take_launch_file(words: _Words, spec: str, name: str) -> None:
     """Take ``{file: …, arguments: …}`` apart, as ``--launch`` has put it together."""
     try:
         launch = json.loads(spec)
-        arguments = [f"{name}:={value}" for name, value in launch.get("arguments", {}).items()]
+        arguments = [f"{key}:={value}" for key, value in launch.get("arguments", {}).items()]
         file = str(launch["file"])
-    except (ValueError, KeyError, AttributeError, TypeError):  # written by hand, as --set
-        return [*words, "--set", f"{_LAUNCH}{spec}"]
-    rest = words[2:]
-    if rest and rest[0].rpartition("/")[2] == file.rpartition("/")[2]:
-        rest = rest[1:]  # the launch file alone was the job
-    skip = ["--skip-unsupported"] if launch.get("skip_unsupported") else []
-    return ["rsltrace", "record", *rest, "--launch", file, *skip, *arguments]
+    except (ValueError, KeyError, AttributeError, TypeError, RecursionError):
+        words.foreign.append(f"--set {_LAUNCH}{spec}")  # written by hand
+        return
+    fits = all(_ARGUMENT.fullmatch(argument) for argument in arguments)
+    if words.launch or not fits or not _is_below_here(file):
+        words.foreign.append(f"--launch {file} {' '.join(arguments)}".rstrip())
+        return
+    if os.path.basename(file) == name:
+        words.job = []  # the launch file alone was the job
+    skip = ["--skip-unsupported"] if launch.get("skip_unsupported") is True else []
+    words.launch = ["--launch", file, *skip, *arguments]
+
+
+def _is_below_here(file: str) -> bool:
+    """Whether a path leads to a file in the present folder or below, and is written so."""
+    path = Path(file)
+    if path.is_absolute() or ".." in path.parts or not _LAUNCH_NAME.fullmatch(path.name):
+        return False
+    if len(file) > _TEXT_MAX or file.startswith("-") or not file.isprintable():
+        return False
+    return _is_file(path) and path.resolve().is_relative_to(Path.cwd().resolve())
+
+
+def _take_ros_argument(words: _Words, text: str) -> None:
+    """Take over remappings, and parameters that are numbers; options come before their values."""
+    try:
+        word = json.loads(text)
+    except (ValueError, RecursionError):
+        word = None
+    before = words.ros[-1] if len(words.ros) % 2 else ""
+    fits = isinstance(word, str) and (
+        bool(_ROS_OPTIONS[before].fullmatch(word)) if before else word in _ROS_OPTIONS
+    )
+    if fits:
+        words.ros.append(word)
+    else:
+        words.foreign.append(f"--ros-args {text}")
+
+
+def _told(text: str) -> str:
+    return shortened(printable(text), _TEXT_MAX)

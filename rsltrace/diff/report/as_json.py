@@ -32,6 +32,7 @@ def as_json(diff: Diff | BagDiff) -> dict[str, Any]:
     result = {"format": FORMAT, "version": VERSION, "kind": kind, **_fields(diff)}
     result["identical"] = diff.identical
     result["exit_code"] = diff.exit_code
+    result["failed"] = diff.failed
     result["within_tolerance"] = diff.within_tolerance
     if isinstance(diff, Diff):
         result["tolerance"] = None if diff.tolerance is None else as_json(diff.tolerance)

@@ -20,7 +20,6 @@ from rsltrace.diff.report.line import (
 from rsltrace.diff.result.bags import (
     BagDiff,
     BagMessage,
-    BagVerdict,
     LoneTopic,
     MessageDivergence,
     Presence,
@@ -35,7 +34,7 @@ def bag_report(
     diff: BagDiff, options: DiffOptions, width: int = 100, height: int = HEIGHT
 ) -> list[Line]:
     """Return the report of two recordings, at most ``height`` lines unless all is asked for."""
-    good = diff.verdict is not BagVerdict.DIFFERENT
+    good = not diff.failed
     verdict = f"{diff.verdict.value}; messages matched by {diff.by}"
     sides = [_facts(side) for side in (diff.a, diff.b)]
     head = head_lines(diff.sentence, sides, verdict, width, good=good)

@@ -19,7 +19,7 @@ _NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]
 
 def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a JUnit test suite with one test case per comparison."""
-    failures = sum(diff.diverged for diff in diffs)
+    failures = sum(diff.failed for diff in diffs)
     counts = f'tests="{len(diffs)}" failures="{failures}" errors="0" skipped="0"'
     lines = ['<?xml version="1.0" encoding="UTF-8"?>', f"<testsuites {counts}>"]
     lines.append(f'  <testsuite name="rsltrace diff" {counts}>')
@@ -27,7 +27,7 @@ def junit(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         name = _attribute(f"{diff.b.path} agrees with {diff.a.path}")
         lines.append(f'    <testcase classname="rsltrace.diff" name={name}>')
         report = _xml(plain_text(report_lines(diff, options)))
-        if diff.diverged:
+        if diff.failed:
             lines.append(
                 f"      <failure type={_attribute(diff.verdict.value)} "
                 f"message={_attribute(_message(diff))}>{report}</failure>"
@@ -43,9 +43,9 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return workflow commands: an error per comparison that failed, a notice per other one."""
     lines = []
     for diff in diffs:
-        level = "error" if diff.diverged else "notice"
+        level = "error" if diff.failed else "notice"
         title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
-        text = plain_text(report_lines(diff, options)) if diff.diverged else _message(diff)
+        text = plain_text(report_lines(diff, options)) if diff.failed else _message(diff)
         file = command_property(printable(diff.a.path))
         place = f"file={file},title={command_property(printable(title))}"
         lines.append(f"::{level} {place}::{command_data(text)}")

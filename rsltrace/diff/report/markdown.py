@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import distance_text, message_title
 from rsltrace.diff.report.line import plain_text
-from rsltrace.diff.report.several import COLUMNS, how_many_diverge, several_cells
+from rsltrace.diff.report.several import COLUMNS, how_all_agree, how_many_fail, several_cells
 from rsltrace.diff.report.text import report_lines
 from rsltrace.diff.result.bags import BagDiff
 from rsltrace.diff.result.fields import FieldDifference
@@ -37,21 +37,21 @@ def markdown(diff: Diff | BagDiff, options: DiffOptions) -> str:
 
 def several_markdown(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     """Return a table of all runs, and below it those that diverge."""
-    diverged = [diff for diff in diffs if diff.diverged]
-    verdict = how_many_diverge(diffs) if diverged else "all runs agree"
+    failed = [diff for diff in diffs if diff.failed]
+    verdict = how_many_fail(diffs) if failed else how_all_agree(diffs)
     lines = [f"### rsltrace: {verdict}", "", f"Golden: {_code_span(diffs[0].a.path)}", ""]
     lines += _table(COLUMNS, [several_cells(diff) for diff in diffs])
     text = "\n".join(lines) + "\n"
     return text + "".join(
-        "\n" + markdown(diff, options).replace("###", "####", 1) for diff in diverged
+        "\n" + markdown(diff, options).replace("###", "####", 1) for diff in failed
     )
 
 
 def _heading(diff: Diff | BagDiff) -> str:
     if diff.identical:
         return "identical" if isinstance(diff, Diff) else "equal"
-    if isinstance(diff, BagDiff):
-        return diff.verdict.value
+    if isinstance(diff, BagDiff) or diff.agrees_until_cut:
+        return str(diff.verdict.value)
     tolerated = " (equal within tolerance, not identical)" if diff.within_tolerance else ""
     return f"the runs diverge: {diff.verdict.value}{tolerated}"
 

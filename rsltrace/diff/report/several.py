@@ -38,10 +38,21 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
     return path, verdict, str(event.index), format_seconds(event.stamp_ns), event_text(event)
 
 
-def how_many_diverge(diffs: Sequence[Diff | BagDiff]) -> str:
-    """Return ``2 of 3 runs diverge``."""
-    count = sum(diff.diverged for diff in diffs)
-    return f"{count} of {len(diffs)} runs diverge{'s' if count == 1 else ''}"
+def how_many_fail(diffs: Sequence[Diff | BagDiff], golden: str = "") -> str:
+    """Return ``2 of 3 runs diverge from GOLDEN``, and how many are cut."""
+    diverged = sum(diff.diverged for diff in diffs)
+    cut = sum(diff.failed and diff.agrees_until_cut for diff in diffs)
+    said = f"{diverged} of {len(diffs)} runs diverge{'s' if diverged == 1 else ''}"
+    said += f" from {golden}" if golden else ""
+    of = "" if diverged else f" of {len(diffs)} runs"
+    also = f"{cut}{of} agree{'s' if cut == 1 else ''} only as far as the recordings go"
+    return also if not diverged else f"{said}, {also}" if cut else said
+
+
+def how_all_agree(diffs: Sequence[Diff | BagDiff]) -> str:
+    """Return ``all runs agree``, and how many are cut."""
+    cut = sum(diff.agrees_until_cut for diff in diffs)
+    return "all runs agree" + (f", {cut} of them as far as the recordings go" if cut else "")
 
 
 def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
@@ -49,24 +60,25 @@ def several_report(diffs: Sequence[Diff | BagDiff]) -> list[Line]:
 
     Nothing in it is cut: it is made to be read by ``grep`` and ``awk``, too.
     """
-    diverged = sum(diff.diverged for diff in diffs)
+    failed = sum(diff.failed for diff in diffs)
     golden = printable(diffs[0].a.path)
-    if diverged:
-        sentence = f"{how_many_diverge(diffs)} from {golden}."
+    if failed:
+        sentence = f"{how_many_fail(diffs, golden)}."
     else:
         near = sum(diff.within_tolerance for diff in diffs)
         within = f", {near} of them within tolerance" if near else ""
-        sentence = f"All {len(diffs)} runs agree with {golden}{within}."
+        agree = how_all_agree(diffs).replace("all runs agree", f"with {golden}", 1)
+        sentence = f"All {len(diffs)} runs agree {agree}{within}."
     rows: list[list[Piece]] = [[(name, Style.FAINT) for name in COLUMNS]]
     for diff in diffs:
         path, *rest = several_cells(diff)
-        style = Style.BAD if diff.diverged else Style.GOOD
+        style = Style.BAD if diff.failed else Style.GOOD
         rows.append([(path, ""), (rest[0], style), *((text, "") for text in rest[1:])])
-    lines = [line((sentence, Style.BAD if diverged else Style.GOOD)), line()]
+    lines = [line((sentence, Style.BAD if failed else Style.GOOD)), line()]
     lines += in_columns(rows, indent="", widest=60)
-    if failed := [text for diff in diffs if (text := _failure(diff))]:
-        lines += [line(), *(line((text, Style.BAD)) for text in failed)]
-    first = next((diff for diff in diffs if diff.diverged), None)
+    if ended := [text for diff in diffs if (text := _failure(diff))]:
+        lines += [line(), *(line((text, Style.BAD)) for text in ended)]
+    first = next((diff for diff in diffs if diff.failed), None)
     if first is not None:
         command = shlex.join(["rsltrace", "diff", first.a.path, first.b.path])
         lines += [line(), line(("next: ", Style.TITLE), printable(command))]

@@ -41,7 +41,7 @@ def trace_report(
     hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
     # First what else to know of the comparison: that the jobs are different ones, or a file cut.
     before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
-    if not diff.divergences:
+    if not diff.divergences:  # identical, cut, or of different jobs
         return fitted(head, [before, _settings(diff, width)], None)
     # Most runs are identical: their report loads no more than this.
     from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
@@ -74,7 +74,8 @@ def _head(diff: Diff, width: int) -> list[Line]:
         agree = "the first event agrees" if diff.agreeing else "no event before agrees"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
     sides = [_facts(side) for side in (diff.a, diff.b)]
-    lines = head_lines(diff.sentence, sides, verdict, width, good=diff.identical)
+    good = diff.identical or (diff.agrees_until_cut and not diff.failed)
+    lines = head_lines(diff.sentence, sides, verdict, width, good=good)
     return lines + ([] if diff.identical else _tolerance(diff, width))
 
 

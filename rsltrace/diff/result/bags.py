@@ -17,6 +17,8 @@ class BagVerdict(Enum):
 
     EQUAL = "equal"
     WITHIN_TOLERANCE = "equal-within-tolerance"
+    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
+    """One of them is cut, and until there they agree (or are equal within tolerance)."""
     DIFFERENT = "different"
 
 
@@ -111,7 +113,7 @@ class LoneTopic:
 
 @dataclass(frozen=True, slots=True)
 class BagDiff:
-    """The answer for two recordings. ``exit_code``: 0 equal, 1 different, 3 within tolerance.
+    """The answer for two recordings. ``exit_code``: 0 equal, 1 not, 3 within tolerance.
 
     ``topics`` are those that both sides have, in the order of a; ``first`` is the earliest
     divergence of all of them, counted from the start of each recording (with ``--by stamp``: by
@@ -129,6 +131,8 @@ class BagDiff:
     first: MessageDivergence | None = None
     next_step: str = ""
     notes: tuple[str, ...] = ()
+    as_far_as_they_go: bool = False
+    """Whether it is enough that they agree as far as they go."""
 
     @property
     def identical(self) -> bool:
@@ -146,8 +150,24 @@ class BagDiff:
         return self.verdict is BagVerdict.DIFFERENT
 
     @property
+    def agrees_until_cut(self) -> bool:
+        """Whether a recording is cut, and they agree as far as both go."""
+        return self.verdict is BagVerdict.AS_FAR_AS_THEY_GO
+
+    @property
+    def failed(self) -> bool:
+        """Whether a test that compares the recordings fails: they differ, or one is cut."""
+        return self.exit_code == EXIT_DIVERGED
+
+    @property
     def exit_code(self) -> int:
-        """0 equal, 1 different, 3 equal within tolerance; trouble is raised instead."""
-        if self.diverged:
+        """0 equal, 1 different or cut, 3 equal within tolerance; trouble is raised instead."""
+        if self.diverged or (self.agrees_until_cut and not self._is_enough):
             return EXIT_DIVERGED
-        return EXIT_WITHIN_TOLERANCE if self.within_tolerance else 0
+        tolerated = any(topic.tolerated for topic in self.topics)
+        return EXIT_WITHIN_TOLERANCE if tolerated else 0
+
+    @property
+    def _is_enough(self) -> bool:
+        """Whether agreeing as far as they go was asked for, and something agrees."""
+        return self.as_far_as_they_go and any(t.equal or t.tolerated for t in self.topics)

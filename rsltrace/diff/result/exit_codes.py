@@ -1,4 +1,4 @@
-"""The exit status of a comparison: 0 identical, 1 diverged, 3 equal within tolerance."""
+"""The exit status of a comparison: 0 identical, 1 diverged or cut, 3 equal within tolerance."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class Side:
 
 @dataclass(frozen=True, slots=True)
 class Diff:
-    """The answer. ``exit_code``: 0 identical, 1 diverged, 3 equal within tolerance.
+    """The answer. ``exit_code``: 0 identical, 1 not, 3 equal within tolerance.
 
     ``verdict`` and ``sentence`` are those of the first divergence. ``agreeing`` is how many events
     are the same before it. ``settings`` lists what differs in job and environment. ``counts`` and
@@ -84,11 +84,18 @@ class Diff:
     bytes_read: int = 0
     notes: tuple[str, ...] = field(default=())
     tolerance: BagDiff | None = None
+    as_far_as_they_go: bool = False
+    """Whether it is enough that they agree as far as they go."""
 
     @property
     def identical(self) -> bool:
         """Whether the two runs did the same."""
         return self.verdict is Verdict.IDENTICAL
+
+    @property
+    def agrees_until_cut(self) -> bool:
+        """Whether a recording is cut, and the runs agree as far as both go."""
+        return self.verdict is Verdict.AS_FAR_AS_THEY_GO
 
     @property
     def within_tolerance(self) -> bool:
@@ -98,11 +105,21 @@ class Diff:
     @property
     def diverged(self) -> bool:
         """Whether the runs did not do the same, and not even within tolerance."""
+        return not (self.identical or self.agrees_until_cut or self.within_tolerance)
+
+    @property
+    def failed(self) -> bool:
+        """Whether a test that compares the runs fails: they diverge, or one is cut."""
         return self.exit_code == EXIT_DIVERGED
 
     @property
     def exit_code(self) -> int:
-        """0 identical, 1 diverged, 3 equal within tolerance; trouble is raised instead."""
+        """0 identical, 1 diverged or cut, 3 equal within tolerance; trouble is raised instead.
+
+        Where one recording has no event at all there is nothing that agrees, whatever was asked.
+        """
         if self.identical:
             return 0
+        if self.agrees_until_cut:
+            return 0 if self.as_far_as_they_go and self.agreeing else EXIT_DIVERGED
         return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED

@@ -9,6 +9,10 @@ class Verdict(Enum):
     """Why two runs diverge. The set is closed; ``Diff.sentence`` puts it in words."""
 
     IDENTICAL = "identical"
+    AS_FAR_AS_THEY_GO = "agree-as-far-as-they-go"
+    """One of the recordings is cut, and until there they agree: nobody knows what came after."""
+    DIFFERENT_JOBS = "different-jobs"
+    """One of the runs has no event to compare, and their jobs or graphs are others."""
     SAME_INPUT_DIFFERENT_OUTPUT = "same-input-different-output"
     DIFFERENT_INPUT = "different-input"
     SCHEDULE = "schedule"

@@ -151,7 +151,9 @@ class _Comparison:
             hint = "" if self._options.everything else "; --all shows them"
             self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
         explainer = self._explainer(propagation.found)
-        return [explainer.explain(found) for found in chosen[:most]]
+        divergences = [explainer.explain(found) for found in chosen[:most]]
+        self._notes += explainer.warnings
+        return divergences
 
     def _asked(self) -> str:
         return ", ".join((*self._options.nodes, *self._options.topics))

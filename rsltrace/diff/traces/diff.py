@@ -12,7 +12,7 @@ from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Verdict
-from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.diff.traces.sides import side
 from rsltrace.trace.reader import Trace
 
 
@@ -21,31 +21,38 @@ def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
 
     Raises TraceError where a part that has to be read is damaged.
     """
+    options = options or DiffOptions()
     start = first_difference(a, b)
-    if start is None:
+    if start is None and a.complete and b.complete and a.event_count:
         return _identical(a, b)
     # Most runs are compared in the hope that they are identical: those load no more than this.
+    from rsltrace.diff.traces.cut_runs import agree_until_cut, of_different_jobs
+
+    if not (a.event_count and b.event_count) and (found := of_different_jobs(a, b)) is not None:
+        return found
+    if any(not t.complete and start in (None, t.event_count) for t in (a, b)):
+        return agree_until_cut(a, b, options)
+    if start is None:
+        return _identical(a, b)
     from rsltrace.diff.traces.comparison import compare
 
-    return compare(a, b, start, options or DiffOptions())
+    return compare(a, b, start, options)
 
 
 def _identical(a: Trace, b: Trace) -> Diff:
     notes = []
     for what in ("stop_reason", "exit_code"):
         ended_a, ended_b = a.result.get(what), b.result.get(what)
-        if a.complete and b.complete and ended_a != ended_b:
+        if ended_a != ended_b:
             notes.append(f"{what.replace('_', ' ')}: {ended_a} in a, {ended_b} in b")
     events = a.event_count
-    # Of two files without an end nobody knows what the runs did after it.
-    as_far = "" if a.complete or b.complete else "as far as both recordings go, "
     return Diff(
         a=side(a),
         b=side(b),
         verdict=Verdict.IDENTICAL,
-        sentence=f"{as_far}the two runs are identical: {events} events, digest {a.digest}",
+        sentence=f"the two runs are identical: {events} events, digest {a.digest}",
         agreeing=events,
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,
-        notes=(*interruptions(a, b), *notes),
+        notes=tuple(notes),
     )

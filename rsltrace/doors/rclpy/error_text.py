@@ -8,6 +8,7 @@ import sys
 from typing import NoReturn
 
 from rsltrace.middleware.failure import text_of, user_traceback
+from rsltrace.terminal import tell
 
 
 def exit_status(error: SystemExit) -> int:
@@ -20,9 +21,9 @@ def exit_status(error: SystemExit) -> int:
 def end_child(error: BaseException) -> NoReturn:
     """End a process that a callback forked and left by an exception: the run is its parent's."""
     if not isinstance(error, SystemExit):
-        print(user_traceback(error), end="", file=sys.stderr)
+        tell(user_traceback(error), end="")
     elif error.code is not None and not isinstance(error.code, int):
-        print(text_of(error), file=sys.stderr)
+        tell(text_of(error))
     with contextlib.suppress(Exception):
         sys.stdout.flush()
         sys.stderr.flush()

@@ -17,12 +17,13 @@ from ruamel.yaml.reader import ReaderError
 
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import ExactFloat
+from rsltrace.model.nesting import NESTING_MAX, nested_too_deep
 
 VALUES_MAX = 100_000
 """Aliases can make a small file mean an enormous one; no job needs this many values."""
 
-NESTING_MAX = 100
-_BRACKETS = re.compile(r"[][{}]")
+REPEATED_MAX = 10_000
+"""Values and keys that aliases and ``<<`` repeat: what is written once costs the most then."""
 
 SHOWN_COLUMNS = 100
 
@@ -147,14 +148,10 @@ def parse_yaml(
 
 def _check_nesting(text: str, name: str) -> None:
     """Refuse at once what would keep the parser busy for long: its time grows with the square."""
-    depth = 0
-    for found in _BRACKETS.finditer(text):
-        depth = depth + 1 if found[0] in "[{" else max(depth - 1, 0)
-        if depth > NESTING_MAX:
-            line = text.count("\n", 0, found.start()) + 1
-            raise JobError(
-                f"brackets are nested more than {NESTING_MAX} deep", where=f"{name}:{line}"
-            )
+    at = nested_too_deep(text)
+    if at >= 0:
+        line = text.count("\n", 0, at) + 1
+        raise JobError(f"brackets are nested more than {NESTING_MAX} deep", where=f"{name}:{line}")
 
 
 def bare_value(text: str) -> object:
@@ -173,6 +170,8 @@ class _Builder:
         self.source = source
         self.open: set[int] = set()
         self.count = 0
+        self.repeated = 0
+        self.seen: set[int] = set()
 
     def build(self, node: Node, key: Node | None = None) -> Item:
         place = Place(self.source, _mark(node))
@@ -180,6 +179,9 @@ class _Builder:
         self.count += 1
         if self.count > VALUES_MAX:
             raise place.error(f"more than {VALUES_MAX} values once aliases are followed")
+        if id(node) in self.seen:
+            self._repeat(node)
+        self.seen.add(id(node))
         if isinstance(node, ScalarNode):
             if key_place is not None and not _is_written(node):
                 # The mark of a value that is not there lies wherever the next token begins.
@@ -199,6 +201,12 @@ class _Builder:
             raise self._unknown_tag(node)
         self.open.discard(id(node))
         return Item(inner, place, key_place)
+
+    def _repeat(self, node: Node) -> None:
+        self.repeated += 1
+        if self.repeated > REPEATED_MAX:
+            message = f"aliases and '<<' repeat more than {REPEATED_MAX} values"
+            raise self.source.error(message, _mark(node))
 
     def _pairs(self, node: MappingNode) -> dict[object, tuple[ScalarNode, Node]]:
         """Return the keys of a mapping, then those that ``<<`` merges in and it lacks itself."""
@@ -220,7 +228,9 @@ class _Builder:
             if not isinstance(mapping, MappingNode) or id(mapping) in self.open:
                 raise self.source.error("'<<' takes other mappings only", _mark(mapping))
             self.open.add(id(mapping))
+            self._repeat(mapping)
             for key, pair in self._pairs(mapping).items():
+                self._repeat(mapping)
                 pairs.setdefault(key, pair)
             self.open.discard(id(mapping))
         return pairs

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import BagError, SetupError
 from rsltrace.job import BagSpec, Job, locate
+from rsltrace.job.values.names import check_topic
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
@@ -171,10 +172,18 @@ def start_ns_of(job: Job, bags: list[BagInput]) -> int:
 
 
 def check_bag_types(job: Job, bags: list[BagInput]) -> None:
-    """Raise BagError if a recorded topic has a type that is not installed."""
+    """Raise BagError if a recorded topic has a type that is not installed, or no name for ROS."""
     for index, entry in enumerate(bags):
         where = f"{locate(job, ('bags', index, 'path'))}: {entry.spec.path}"
         for topic in entry.bag.topics:
+            name = entry.name_of(topic)
+            try:
+                check_topic(name if name.startswith("/") else f"/{name}")
+            except ValueError as error:
+                raise BagError(
+                    f"{where}: a topic cannot be played: {error}; give it another name "
+                    "(remappings), or leave it out (exclude)"
+                ) from None
             check_type(where, topic)
 
 

@@ -39,6 +39,7 @@ class Comparison:
         self.run_a = a
         self.run_b = b
         self.diff: Diff | None = None
+        self._whole = a.trace.complete and b.trace.complete
         first = first_difference(a.trace, b.trace)
         self.agreeing = a.count if first is None else first
         self.done = first is None
@@ -149,8 +150,8 @@ class Comparison:
 
     @property
     def identical(self) -> bool:
-        """Whether the runs did the same."""
-        return self._first_place is None
+        """Whether the runs did the same (of recordings that are cut nobody knows)."""
+        return self._first_place is None and self._whole
 
     @property
     def first_place(self) -> int | None:
@@ -159,10 +160,11 @@ class Comparison:
 
     def verdict(self) -> str:
         """Return in one sentence how the runs compare."""
-        if self._first_place is None:
+        if self.identical:
             return f"= identical: all {self.run_a.count:,} events are the same"
         if self.diff is not None:
-            return f"≠ {self.diff.verdict.value}: {self.diff.sentence}"
+            sign = "~" if self.diff.agrees_until_cut else "≠"
+            return f"{sign} {self.diff.verdict.value}: {self.diff.sentence}"
         return f"≠ the runs agree for {self.agreeing:,} events; looking for the cause …"
 
     def divergence_in(self, window: Window) -> int | None:

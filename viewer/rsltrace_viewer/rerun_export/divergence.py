@@ -94,7 +94,7 @@ def _agreement(
     state = rr.StateChange.descriptor_state()
     here = _either(first.a, first.b) if first is not None else None
     stamps, events, states = [start_ns], [0], [_AGREE]
-    if here is not None or not diff.identical:
+    if here is not None or diff.diverged:
         end_ns = min(diff.a.end_ns, diff.b.end_ns)
         stamps.append(here.stamp_ns if here is not None else end_ns)
         events.append(here.index if here is not None else diff.agreeing)

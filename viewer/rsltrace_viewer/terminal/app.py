@@ -222,7 +222,7 @@ class ViewerApp(Stepping):
         if comparison is None:
             self._say("this is one trace; rsltrace view A B compares two")
         elif comparison.diff is None:
-            self._say("the runs are identical" if comparison.identical else "still looking …")
+            self._say(comparison.verdict() if comparison.identical else "still looking …")
         else:
             from rsltrace_viewer.terminal.screens.report import ReportScreen
 

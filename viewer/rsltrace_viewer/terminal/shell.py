@@ -18,6 +18,7 @@ from textual.geometry import Size
 from textual.worker import get_current_worker
 
 from rsltrace.errors import RsltraceError
+from rsltrace.model.printable import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
@@ -72,6 +73,10 @@ class Shell(App[None]):
         self._status = ""
         self.following = False
         self.theme = "textual-light" if light else "textual-dark"
+
+    def notify(self, message: str, **more: Any) -> None:
+        """Show a message in a corner: what is in it may come from a file."""
+        super().notify(printable(message), markup=False, **more)
 
     # Setting up.
 

@@ -13,6 +13,8 @@ from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_seconds
+from rsltrace.terminal import tell
+from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import TOPIC_ROSOUT
 
@@ -72,6 +74,8 @@ class Logs:
         from builtin_interfaces.msg import Time
         from rcl_interfaces.msg import Log
 
+        if not message.isascii():  # what no message can hold is shown and sent as an escape
+            message = message.encode(errors="backslashreplace").decode()
         if " at 0x" in message:
             text_with_address(message)
         now_ns = self._domain.loop.now_ns
@@ -92,14 +96,14 @@ class Logs:
             function=function,
             line=line,
         )
-        content = f"{severity}\0{name}\0{message}".encode(errors="surrogateescape")
-        rosout.send(rosout._serialize(record), hash64(content))
+        data = rosout._serialize(record)
+        rosout.send(data, hash64(log_content(data)))
 
     def _print(self, severity: int, now_ns: int, name: str, message: str) -> None:
         """Show a record; who cannot be told any more (``2>&1 | head``) changes nothing in a run."""
         label = _SEVERITY.get(severity, str(severity))
         try:
-            sys.stderr.write(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}\n")
+            tell(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}")
         except (OSError, ValueError, AttributeError):  # gone, closed, or never there
             self._echo = False
 

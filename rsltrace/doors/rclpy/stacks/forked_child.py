@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING
 
+from rsltrace.terminal import tell
+
 if TYPE_CHECKING:
     from rsltrace.doors.rclpy.stacks.stacks import Stacks
 
@@ -40,11 +42,9 @@ def _end(stacks: Stacks) -> None:
     who = stacks.event.handle.describe() if stacks.event.handle is not None else "a node"
     with suppress(Exception):
         sys.stdout.flush()
-        print(
+        tell(
             f"rsltrace: note: a process that {who} forked came back into the run, and was ended; "
-            "the run is its parent's",
-            file=sys.stderr,
-            flush=True,
+            "the run is its parent's"
         )
     os._exit(1)
 

@@ -169,7 +169,7 @@ class PlotScreen(Screen[None]):
             try:
                 fields = fields_of(self._session.a, choice)
             except TraceError as error:
-                self.app.notify(str(error), severity="error", markup=False)
+                self.app.notify(str(error), severity="error")
                 return
             if fields:
                 self._topic = choice

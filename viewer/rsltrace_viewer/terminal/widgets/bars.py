@@ -6,6 +6,7 @@ from textual import events
 from textual.content import Content
 from textual.widgets import Static
 
+from rsltrace.model.printable import printable
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 
@@ -22,6 +23,7 @@ class HeaderBar(Static):
     ) -> None:
         """Show a title, facts about it, and the verdict on two runs in at most ``lines``, on a
         screen of ``width`` cells."""
+        title, facts, verdict = map(printable, (title, facts, verdict))
         width = max(width - 2, 1)
         title = fit(title, min(width, cells(title)))
         rest = f"  {facts}"
@@ -51,6 +53,7 @@ class FooterBar(Static):
 
     def show(self, *, two: bool, searching: str, status: str) -> None:
         """Show the keys, and a status at the right."""
+        status = printable(status)
         width = self.size.width - 2
         room = width - (cells(status) + 2 if status else 0)
         parts: list[Content | tuple[str, str] | str] = []

@@ -13,6 +13,7 @@ from textual.message import Message
 from textual.suggester import Suggester
 from textual.widgets import Input, Static
 
+from rsltrace.model.printable import printable
 from rsltrace_viewer.model.cells import cells
 
 _SHOWN_COMPLETIONS = 8
@@ -159,7 +160,7 @@ class Prompt(Vertical):
                 return
         shown = [_tail(choice) for choice in choices if choice != value][:_SHOWN_COMPLETIONS]
         more = "  …" if len(choices) > _SHOWN_COMPLETIONS else ""
-        hint.update(Content("  ".join(shown) + more if shown else question.hint))
+        hint.update(Content(printable("  ".join(shown)) + more if shown else question.hint))
 
     def _complain(self, error: ValueError) -> None:
         hint = self.query_one("#hint", Static)
@@ -173,7 +174,7 @@ class Prompt(Vertical):
                 pointer = " " * offset + "^" * max(end - start, 1) + " "
             else:
                 pointer = f"at character {start + 1}: "
-        hint.update(Content(f"{pointer}{error}"))
+        hint.update(Content(printable(f"{pointer}{error}")))
 
     def _close(self, text: str | None) -> None:
         question, self._question = self._question, None

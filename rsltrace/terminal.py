@@ -1,0 +1,32 @@
+"""The one place that writes to the terminal: what could steer it is shown as escapes.
+
+Texts come from traces, bags, jobs, servers and nodes, which may be anybody's. An escape sequence in
+a name must not set a window's title, hide a line or turn text around. Lines stay lines.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+from rsltrace.model.printable import printable_lines
+
+
+def say(text: str = "", *, end: str = "\n") -> None:
+    """Write an answer to stdout. Raises OSError if it cannot be written."""
+    if sys.stdout is not None:
+        sys.stdout.write(printable_lines(f"{text}{end}"))
+        sys.stdout.flush()
+
+
+def tell(text: str, *, end: str = "\n") -> None:
+    """Write what is not the answer (errors, notes, progress) to stderr."""
+    if sys.stderr is not None:
+        sys.stderr.write(printable_lines(f"{text}{end}"))
+        sys.stderr.flush()
+
+
+def line_writer() -> Callable[[str], object]:
+    """Return what writes a line of many to stdout, without pushing each of them through."""
+    write = sys.stdout.write
+    return lambda line: write(printable_lines(f"{line}\n"))

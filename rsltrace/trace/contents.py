@@ -1,0 +1,137 @@
+"""Checking that messages and entities are those that the hashes of the events stand for.
+
+The chain covers them by the content hashes of outputs. Readers do not compute these anew: that
+takes reading all of the file, and a file that was damaged has checksums that do not fit.
+"""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
+from rsltrace.trace.cdr import log_content
+from rsltrace.trace.chain import hash64, identity_hash
+from rsltrace.trace.format import PREFIX_OWN, PREFIX_REQUEST, PREFIX_RESPONSE, TOPIC_ROSOUT
+from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.reader import Trace
+
+_WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
+
+
+@dataclass(slots=True)
+class _Messages:
+    """The messages of a channel, in order: content hashes (as a log record, too) and times."""
+
+    hashes: array[int] = field(default_factory=lambda: array("Q"))
+    as_logs: array[int] = field(default_factory=lambda: array("Q"))
+    stamps: array[int] = field(default_factory=lambda: array("Q"))
+    told: int = 0
+    """How many of them outputs speak of."""
+
+
+def check_contents(trace: Trace) -> None:
+    """Raise TraceError at a message or entity that no event has, or that an event had otherwise.
+
+    Reads all messages; takes 16 bytes of memory for each. Texts of details, findings and states
+    are for people, and covered by nothing.
+    """
+    messages = _hashed(trace)
+    entities: set[int] = set()
+    for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
+        if not len(outputs):
+            continue
+        stamps = events["stamp"][outputs["event"] - events["index"][0]]
+        pairs = np.stack((outputs["kind"], outputs["entity"]), axis=1)
+        for kind, entity in np.unique(pairs, axis=0).tolist():
+            chosen = (outputs["kind"] == kind) & (outputs["entity"] == entity)
+            if kind == OutputKind.ENTITY:
+                _check_entity(trace, outputs[chosen])
+                entities.add(entity)
+            elif kind in _WITH_MESSAGE:
+                kept = chosen & (outputs["sequence"] != NO_SEQUENCE)
+                if kept.any():
+                    _check_messages(trace, messages, outputs[kept], stamps[kept])
+    if not trace.complete:
+        return  # what events that were never written had to do with may be there
+    for channel_id, found in messages.items():
+        if found.told != len(found.hashes):
+            raise _changed(
+                trace,
+                f"{len(found.hashes)} messages on {trace.channels[channel_id].topic} are there, "
+                f"and its events speak of {found.told}",
+            )
+    if extra := trace.entities.keys() - entities - {0}:
+        raise _changed(trace, f"no event has made its entity {min(extra)}")
+
+
+def _hashed(trace: Trace) -> dict[int, _Messages]:
+    """Read all messages once."""
+    channels = {i: channel for i, channel in trace.channels.items() if _has_content(channel)}
+    found = {i: _Messages() for i in channels}
+    for channel_id, stamp_ns, sequence, data in trace.messages_of(frozenset(channels)):
+        of_channel = found[channel_id]
+        if sequence != len(of_channel.hashes):
+            topic = channels[channel_id].topic
+            raise _changed(trace, f"message {sequence} on {topic} is out of order")
+        of_channel.hashes.append(hash64(data))
+        of_channel.stamps.append(stamp_ns)
+        if channels[channel_id].topic == TOPIC_ROSOUT:
+            of_channel.as_logs.append(hash64(log_content(data)))
+    return found
+
+
+def _has_content(channel: ChannelInfo) -> bool:
+    services = channel.topic.startswith((PREFIX_REQUEST, PREFIX_RESPONSE))
+    return services or not channel.topic.startswith(PREFIX_OWN)
+
+
+def _check_messages(
+    trace: Trace,
+    messages: dict[int, _Messages],
+    outputs: npt.NDArray[np.void],
+    stamps: npt.NDArray[np.uint64],
+) -> None:
+    """Check the messages of outputs of one kind and entity."""
+    event, _, entity, kind, sequence = outputs[0].item()
+    output = Output(event, entity, OutputKind(kind), 0, sequence)
+    channel = trace.channel_of(output)
+    found = messages.get(channel.id) if channel is not None else None
+    name = trace.entity(entity).name
+    if channel is None or found is None or channel.topic != _topic_of(output, name):
+        raise _changed(trace, f"event {event} sent messages on {name}, which has no channel")
+    numbers = outputs["sequence"].astype(np.int64)
+    if int(numbers.max()) >= len(found.hashes):
+        raise _changed(trace, f"message {int(numbers.max())} on {channel.topic} is missing")
+    hashes = found.as_logs if output.kind is OutputKind.LOG else found.hashes
+    wrong = np.frombuffer(hashes, dtype=np.uint64)[numbers] != outputs["hash"]
+    wrong |= np.frombuffer(found.stamps, dtype=np.uint64)[numbers] != stamps
+    if wrong.any():
+        at = int(np.argmax(wrong))
+        raise _changed(
+            trace,
+            f"message {int(numbers[at])} on {channel.topic} is not the one that event "
+            f"{int(outputs['event'][at])} sent",
+        )
+    found.told += len(numbers)
+
+
+def _topic_of(output: Output, name: str) -> str:
+    if output.kind is OutputKind.LOG:
+        return TOPIC_ROSOUT
+    prefixes = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPONSE}
+    return prefixes.get(output.kind, "") + name
+
+
+def _check_entity(trace: Trace, outputs: npt.NDArray[np.void]) -> None:
+    event, content_hash, entity, _, _ = outputs[-1].item()
+    if content_hash != identity_hash(trace.entity(entity)):
+        raise _changed(trace, f"entity {entity} is not the one that event {event} made")
+
+
+def _changed(trace: Trace, what: str) -> TraceError:
+    return TraceError(f"{trace.name}: {what}; the trace was changed after it was recorded")

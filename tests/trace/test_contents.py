@@ -1,0 +1,98 @@
+"""``--check`` finds what was changed under right checksums: messages and entities have hashes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsltrace.errors import TraceError
+from rsltrace.trace.contents import check_contents
+from rsltrace.trace.reader import Trace
+from tests.attack import mcap_parts
+from tests.attack.families.texts import with_strings
+
+SAMPLES = Path(__file__).parents[2] / "sample_traces"
+SAMPLE = SAMPLES / "nondeterministic_callback" / "a.mcap"
+
+Change = Callable[[bytes, int], bytes]
+
+
+def _forged(folder: Path, topic: str, change: Change) -> Path:
+    parts = mcap_parts.take_apart(SAMPLE.read_bytes())
+    mcap_parts.change_messages(parts, topic, change)
+    path = folder / "forged.mcap"
+    path.write_bytes(mcap_parts.put_together(parts))
+    return path
+
+
+def _renamed(old: bytes, new: bytes) -> Change:
+    return lambda data, nth: with_strings(
+        data, "/rsltrace/entities", lambda n, text: new if text == old else text
+    )
+
+
+def _checked(path: Path) -> None:
+    with Trace.open(path) as trace:
+        trace.check()
+        check_contents(trace)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(SAMPLES.glob("*/*.mcap")), ids=lambda path: path.parent.name
+)
+def test_what_was_recorded_passes(path: Path) -> None:
+    _checked(path)
+
+
+@pytest.mark.parametrize(
+    ("topic", "change", "said"),
+    [
+        ("/push", lambda data, nth: data[:-1] + bytes([data[-1] ^ 1]), "message 0 on /push is not"),
+        ("/scan", lambda data, nth: data[:-4] if nth == 3 else data, "whole message"),
+        ("/scan", lambda data, nth: data[::-1], "message 0 on /scan is not the one that event 3"),
+        ("/rsltrace/entities", _renamed(b"/push", b"/pull"), "/pull|entity"),
+        ("/rsltrace/entities", _renamed(b"/obstacle_filter", b"/obstacle_fister"), "entity"),
+    ],
+)
+def test_what_was_changed_under_right_checksums_does_not(
+    tmp_path: Path, topic: str, change: Change, said: str
+) -> None:
+    path = _forged(tmp_path, topic, change)
+    with Trace.open(path) as trace, Trace.open(SAMPLE) as sample:
+        assert trace.digest == sample.digest, "the chain says nothing of it"
+    with pytest.raises(TraceError, match=said) as raised:
+        _checked(path)
+    assert str(path) in str(raised.value)
+    assert "after it was recorded" in str(raised.value) or "damaged" in str(raised.value)
+
+
+def test_forging_nothing_passes(tmp_path: Path) -> None:
+    _checked(_forged(tmp_path, "/push", lambda data, nth: data))
+
+
+def test_a_cut_trace_passes(tmp_path: Path) -> None:
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(SAMPLE.read_bytes()[:-500])
+    _checked(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "text", "said"),
+    [(2, b"no JSON", "its detail is no JSON"), (0, b"\xff", "an entity of the trace cannot")],
+)
+def test_what_cannot_be_read_is_told_with_the_file(
+    tmp_path: Path, field: int, text: bytes, said: str
+) -> None:
+    """Two files are open in a diff."""
+    path = _forged(
+        tmp_path,
+        "/rsltrace/entities",
+        lambda data, nth: with_strings(
+            data, "/rsltrace/entities", lambda n, old: text if n == field else old
+        ),
+    )
+    with Trace.open(path) as trace, pytest.raises(TraceError, match=said) as raised:
+        _ = trace.entities
+    assert str(raised.value).startswith(f"{path}: ")
