@@ -55,5 +55,7 @@ class EntityBook:
     def look_again(self, node: Any) -> None:
         """Write down in this event what of ``node`` has waited for an owner."""
         if self.unowned:  # a timer made long before its node is spun is written down now
-            self.pending += [one for one in self.unowned if getattr(one, "node", None) is node]
-            self.unowned = [one for one in self.unowned if one not in self.pending]
+            waiting, self.unowned = self.unowned, []
+            for one in waiting:
+                owned = getattr(one, "node", None) is node
+                (self.pending if owned else self.unowned).append(one)

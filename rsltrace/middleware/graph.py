@@ -24,6 +24,7 @@ class Graph:
 
     def __init__(self) -> None:
         self.nodes: list[Participant] = []
+        self._named: dict[str, list[Participant]] = {}
         self._publishers: dict[str, list[Publisher]] = {}
         self._subscriptions: dict[str, list[Subscription]] = {}
         self._clients: dict[str, list[Client]] = {}
@@ -31,10 +32,11 @@ class Graph:
 
     def node_named(self, fully_qualified_name: str) -> Participant | None:
         """Return the node of that name, or None."""
-        for node in self.nodes:
-            if node.fully_qualified_name == fully_qualified_name:
-                return node
-        return None
+        return next(iter(self.nodes_named(fully_qualified_name)), None)
+
+    def nodes_named(self, fully_qualified_name: str) -> list[Participant]:
+        """Return the nodes of that name, in creation order."""
+        return self._named.get(fully_qualified_name, [])
 
     def publishers(self, topic: str) -> list[Publisher]:
         """Return the publishers of a topic in creation order."""
@@ -61,6 +63,7 @@ class Graph:
     def add_node(self, node: Participant) -> None:
         """Make a participant known."""
         self.nodes.append(node)
+        self._named.setdefault(node.fully_qualified_name, []).append(node)
         node.graph = self
 
     def add_publisher(self, publisher: Publisher) -> None:
@@ -110,6 +113,7 @@ class Graph:
             self._services[member.service].remove(member)
         elif isinstance(member, Participant):
             self.nodes.remove(member)
+            self._named[member.fully_qualified_name].remove(member)
 
     def settled_request(self, topic: str, requested: Qos) -> Qos:
         """Return what a new subscription's QoS comes to, given the publishers that are there."""
@@ -129,17 +133,14 @@ class Graph:
         publisher.send_history(subscription)
 
     def _check_type(self, endpoint: Publisher | Subscription) -> None:
-        others: list[Publisher | Subscription] = [
-            *self.publishers(endpoint.topic),
-            *self.subscriptions(endpoint.topic),
-        ]
-        for other in others:
-            if other.type_name != endpoint.type_name:
-                raise UnsupportedError(
-                    f"topic {endpoint.topic} has two types: {other.describe()} is "
-                    f"{other.type_name}, {endpoint.describe()} is {endpoint.type_name}. They "
-                    "would never hear each other; rename or remap one of them"
-                )
+        there = self.publishers(endpoint.topic) or self.subscriptions(endpoint.topic)
+        if there and there[0].type_name != endpoint.type_name:  # all that are there have one type
+            other = there[0]
+            raise UnsupportedError(
+                f"topic {endpoint.topic} has two types: {other.describe()} is "
+                f"{other.type_name}, {endpoint.describe()} is {endpoint.type_name}. They "
+                "would never hear each other; rename or remap one of them"
+            )
 
     # -- queries ---------------------------------------------------------------------------------
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from bisect import insort
 from collections import deque
 from typing import Any
 
@@ -105,11 +106,10 @@ class Publisher(DomainEntity):
         """Send to this subscription, too; fan-out is in the creation order of subscriptions."""
         if self.links is None and subscription.timed:
             self.links = [self._link_to(other) for other in self.subscriptions]
-        self.subscriptions.append(subscription)
-        self.subscriptions.sort(key=lambda other: other.entity_id)
+        insort(self.subscriptions, subscription, key=lambda other: other.entity_id)
         if self.links is not None:
-            self.links.append(self._link_to(subscription))
-            self.links.sort(key=lambda link: link.subscription.entity_id)
+            link = self._link_to(subscription)
+            insort(self.links, link, key=lambda link: link.subscription.entity_id)
 
     def _link_to(self, subscription: Subscription) -> Link:
         """Make the link to a subscription, with the model that the job has for it."""

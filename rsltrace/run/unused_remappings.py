@@ -13,7 +13,7 @@ from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.census import Asker, Census
-from rsltrace.run.plans.entries import entry_key
+from rsltrace.run.plans.entries import entry_keys
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))
 """Launch files remap these for every node (to give robots trees of their own), used or not."""
@@ -34,9 +34,11 @@ def unused_remappings(job: Job, census: Census) -> Iterator[str]:
     """
     everybody: list[Asker] = []
     given: dict[tuple[str, str], tuple[str, list[Asker]]] = {}
-    for index, spec in enumerate(job.nodes):
-        key = entry_key(spec, job.nodes[:index])
-        own = [asker for asker in census.asked if asker.entry_key == key]
+    asked_by: dict[str, list[Asker]] = {}
+    for asker in census.asked:
+        asked_by.setdefault(asker.entry_key, []).append(asker)
+    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+        own = asked_by.get(key, [])
         everybody += own  # nodes of hooks, of callbacks and the bag player get no arguments
         for old, new in spec.remappings.items() if own else ():
             loc: Loc = ("nodes", index, "remappings", old)

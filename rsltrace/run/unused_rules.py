@@ -18,7 +18,7 @@ from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.census import Census
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
-from rsltrace.run.plans.entries import entry_key
+from rsltrace.run.plans.entries import entry_keys
 from rsltrace.run.unused_remappings import has_remappings, unused_remappings
 
 
@@ -76,9 +76,11 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
     """
     entries = []
     used_alike: set[tuple[str, str]] = set()
-    for index, spec in enumerate(job.nodes):
-        key = entry_key(spec, job.nodes[:index])
-        made = {node: found for node, found in nodes.items() if found.entry_key == key}
+    made_by: dict[str, dict[str, Parameters]] = {}
+    for node, found in nodes.items():
+        made_by.setdefault(found.entry_key, {})[node] = found
+    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+        made = made_by.get(key, {})
         entries.append((index, spec, made))
         if spec.origin:
             declared_ones = {name for found in made.values() for name in found.declared}

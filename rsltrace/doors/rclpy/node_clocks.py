@@ -46,6 +46,5 @@ class NodeClocks:
         return clock.shows(now_ns)
 
     def _note(self, node: str, by_ns: int) -> None:
-        for handle in self._domain.graph.nodes:
-            if handle.fully_qualified_name == node:
-                self._domain.dispatcher.draw(handle.entity_id, encode_clock(by_ns))
+        for handle in self._domain.graph.nodes_named(node):
+            self._domain.dispatcher.draw(handle.entity_id, encode_clock(by_ns))

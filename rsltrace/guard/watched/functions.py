@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from types import BuiltinFunctionType
+from types import BuiltinFunctionType, FrameType
 from typing import Any
 
 from rsltrace.guard.addresses import is_by_address
@@ -28,6 +28,8 @@ from rsltrace.model.finding import Mode, Source
 
 _NOT_NEWS = {"logging", "threading", *READERS_OF_CODE}
 """Modules that look at such things for records of their own."""
+
+_PATHS = ("genericpath", "posixpath")
 
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"
@@ -61,10 +63,12 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         if guard is None:
             return real(*arguments, **options)
         frame = sys._getframe(1)
-        if source is not Source.THREAD and frame.f_globals.get("__name__") in _NOT_NEWS:
+        if source is not Source.THREAD and _for(frame) in _NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
         if source is Source.FILE:
+            if user_frame(frame, guard.packages) is None:
+                return real(*arguments, **options)  # ROS and Python, for themselves
             if is_installed(arguments[0] if arguments else options.get("path")):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
@@ -81,6 +85,15 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         return value
 
     return call
+
+
+def _for(frame: FrameType) -> str | None:
+    """Return the module that wants to know, which may ask by way of ``os.path``."""
+    name = frame.f_globals.get("__name__")
+    while name in _PATHS and frame.f_back is not None:
+        frame = frame.f_back
+        name = frame.f_globals.get("__name__")
+    return name
 
 
 def _told(value: Any) -> str:

@@ -6,6 +6,7 @@ import codecs
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from pathlib import Path
 
 from pydantic import ValidationError
@@ -197,6 +198,12 @@ def _place(job: Job, loc: tuple[str | int, ...]) -> Place | None:
         return place_at(job.composed.root, loc)
     if job.given_text is None:
         return None
-    root = parse_yaml(job.given_text, job.source_name).root
+    return place_at(_root_of(job.given_text, job.source_name), loc)
+
+
+@lru_cache(maxsize=1)
+def _root_of(text: str, name: str) -> Item:
+    """Return the values of a job's text; every entry of a job asks for its place in it."""
+    root = parse_yaml(text, name).root
     assert root is not None, "the text has been a job"
-    return place_at(root, loc)
+    return root

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from inspect import Parameter
@@ -26,7 +27,7 @@ def node_entries(job: Job) -> list[Entry]:
     entries = []
     mains = Mains()
     for_all = _arguments_for_all(job)
-    for index, spec in enumerate(job.nodes):
+    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         loc = ("nodes", index, spec.kind)
         where = spec.origin or locate(job, loc)
         argv = None
@@ -57,7 +58,7 @@ def node_entries(job: Job) -> list[Entry]:
                 arguments,
                 argv=argv,
                 log_exceptions=spec.on_exception == "log",
-                key=entry_key(spec, job.nodes[:index]),
+                key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
             )
         )
@@ -109,22 +110,25 @@ def _shown(job: Job, loc: Loc, message: str) -> JobError:
         return error
 
 
-def entry_key(spec: NodeSpec, before: Sequence[NodeSpec]) -> str:
-    """Return a name for an entry that other entries (of other classes) do not change."""
-
-    def own(other: NodeSpec) -> tuple[str, str | None, str | None]:
-        return other.target, other.namespace, other.name
-
-    same = sum(1 for other in before if own(other) == own(spec))
-    name = " ".join(part for part in own(spec) if part)
-    return f"{name} #{same + 1}" if same else name
+def entry_keys(nodes: Sequence[NodeSpec]) -> list[str]:
+    """Return a name for each entry that other entries (of other classes) do not change."""
+    met: Counter[tuple[str, str | None, str | None]] = Counter()
+    keys = []
+    for spec in nodes:
+        own = spec.target, spec.namespace, spec.name
+        met[own] += 1
+        name = " ".join(part for part in own if part)
+        keys.append(f"{name} #{met[own]}" if met[own] > 1 else name)
+    return keys
 
 
 def say_where(job: Job, entry: Entry, error: RunError | None) -> None:
     """Add to the error of a constructor the line of the job at which the parameter stands that it
     refused, or the node, if there are several that are made in the same way."""
-    for index, spec in enumerate(job.nodes):
-        if error is None or entry_key(spec, job.nodes[:index]) != entry.key:
+    if error is None:
+        return
+    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+        if key != entry.key:
             continue
         name = parameter_in(error.__cause__)
         if name in spec.parameters:

@@ -16,6 +16,7 @@ from rsltrace.doors.rclpy.actions.client import ActionClientHandle
 from rsltrace.doors.rclpy.actions.goal_handle import GoalHandle
 from rsltrace.doors.rclpy.actions.server import ActionServerHandle
 from rsltrace.doors.rclpy.boundary.boundary import Boundary
+from rsltrace.doors.rclpy.boundary.log_callers import quick_log_callers
 from rsltrace.doors.rclpy.boundary.release import check_release
 from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.doors.rclpy.handles.context import ContextHandle
@@ -97,7 +98,8 @@ def installed() -> Iterator[Boundary]:
     ours = boundary()
     _exchange(ours.real, ours)
     try:
-        yield ours
+        with quick_log_callers():
+            yield ours
     finally:
         _exchange(ours, ours.real)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 from rclpy.executors import Executor
@@ -10,7 +11,7 @@ from rsltrace.doors.rclpy.executors.user_executors import is_bookkeeping
 from rsltrace.doors.rclpy.handles.waitables import (
     activate_node,
     deactivate_node,
-    sync_waitables,
+    sync_woken,
 )
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
 from rsltrace.doors.rclpy.stacks.coroutines import Resume
@@ -59,8 +60,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
 
     def wake(self) -> None:
         """Look for waitables that have come or gone: the loop sees all other changes at once."""
-        for node in self._sim_nodes:
-            sync_waitables(node.handle)
+        sync_woken(self._sim_nodes, sys._getframe(1))
 
     def spin_until_future_complete(self, future: Any, timeout_sec: float | None = None) -> None:
         """Wait in simulated time until the future is done; others run meanwhile."""

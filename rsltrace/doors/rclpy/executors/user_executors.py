@@ -6,6 +6,7 @@ What is exchanged is few and the same in all versions: how an executor learns of
 
 from __future__ import annotations
 
+import sys
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +15,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from rsltrace.doors.rclpy.executors.pump import pump_of
-from rsltrace.doors.rclpy.handles.waitables import sync_waitables
+from rsltrace.doors.rclpy.handles.waitables import sync_woken
 from rsltrace.doors.rclpy.stacks.blocking_calls import lose_patience
 from rsltrace.doors.rclpy.stacks.coroutines import Resume
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
@@ -94,8 +95,7 @@ def _methods(
 
     def wake(self: Any) -> None:
         pump = pump_of(stacks, self)
-        for node in pump.nodes:
-            sync_waitables(node.handle)
+        sync_woken(pump.nodes, sys._getframe(1))
         pump.wake()
 
     def shutdown(self: Any, timeout_sec: float | None = None) -> bool:

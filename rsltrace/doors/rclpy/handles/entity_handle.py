@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from rsltrace.doors.rclpy.handles.destroyable import Destroyable
@@ -30,6 +30,8 @@ class EntityHandle(Destroyable, DomainEntity):
     begins_active = False
     stacks: Stacks
     wrapper: Any = None
+    _listed: tuple[Any, Any] | None = None
+    """Node and wrapper, if somebody else has met them while looking for its own."""
 
     destroy = DomainEntity.destroy
 
@@ -46,12 +48,27 @@ class EntityHandle(Destroyable, DomainEntity):
     def find_wrapper(self) -> Any:
         """Return the rclpy object around this handle, or None if its node is not being run."""
         if self.wrapper is None:
-            for node in self._candidates():
-                for wrapper in getattr(node.wrapper, self.lists):
-                    if wrapper.handle is self:
-                        self.begin(wrapper, node)
-                        return wrapper
+            found = self._listed
+            if found is None or self.destroyed or found[0].wrapper is None:
+                found = self._look()
+            if found is not None:
+                node, wrapper = found
+                self.begin(wrapper, node)
         return self.wrapper
+
+    def _look(self) -> tuple[Any, Any] | None:
+        """Look for node and wrapper, and tell the others of that list what theirs are: a node may
+        have thousands of timers."""
+        for node in self._candidates():
+            mine = None
+            for wrapper in getattr(node.wrapper, self.lists):
+                handle = wrapper.handle
+                handle._listed = node, wrapper
+                if handle is self:
+                    mine = wrapper
+            if mine is not None:
+                return node, mine
+        return None
 
     def begin(self, wrapper: Any, node: Any) -> None:
         """Start to run: owner and callback are known now."""
@@ -65,16 +82,22 @@ class EntityHandle(Destroyable, DomainEntity):
 
     def deactivate(self) -> None:
         """Stop running: the node was taken from its executor."""
-        self.wrapper = None
+        self.wrapper = self._listed = None
         self.active = False
 
-    def _candidates(self) -> list[Any]:
+    def _candidates(self) -> Iterator[Any]:
+        """Yield the nodes that may list it, those that are likely to first."""
         if self.node is not None:
-            return [self.node] if self.node.wrapper is not None else []
+            if self.node.wrapper is not None:
+                yield self.node
+            return
         nodes = self.stacks.domain.graph.nodes
         hint = self.stacks.event.node
-        ordered = [n for n in nodes if n is hint] + [n for n in nodes if n is not hint]
-        return [n for n in ordered if isinstance(n, NodeHandle) and n.wrapper is not None]
+        if isinstance(hint, NodeHandle) and hint.wrapper is not None and not hint.destroyed:
+            yield hint
+        for node in nodes:
+            if node is not hint and isinstance(node, NodeHandle) and node.wrapper is not None:
+                yield node
 
     def mailbox_keeps(self) -> bool:
         """Leave it to the node's executor, if that is one of the user's own, to run the callback

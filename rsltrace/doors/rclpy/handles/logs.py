@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,14 @@ class Logs:
         self._base_dir = base_dir
         self._echo = echo
         self._nodes: dict[str, NodeHandle] = {}
+        self._files: dict[str, str] = {}
+
+    @cached_property
+    def _record(self) -> Any:
+        """The message that every record is sent as."""
+        from rcl_interfaces.msg import Log
+
+        return Log()
 
     def attach(self, node: NodeHandle, qos: Any = None) -> None:
         """Give a node its /rosout publisher, with the usual QoS profile unless it says another."""
@@ -71,9 +80,6 @@ class Logs:
         self, severity: int, name: str, message: str, function: str, file: str, line: int
     ) -> None:
         """Take one record. Severity, name and message are hashed: line numbers are not news."""
-        from builtin_interfaces.msg import Time
-        from rcl_interfaces.msg import Log
-
         if not message.isascii():  # what no message can hold is shown and sent as an escape
             message = message.encode(errors="backslashreplace").decode()
         if " at 0x" in message:
@@ -86,16 +92,13 @@ class Logs:
         rosout = getattr(node, "rosout", None)
         if rosout is None or rosout.destroyed:
             return
-        sec, nanosec = divmod(now_ns, NS_PER_S)
-        record: Any = Log(
-            stamp=Time(sec=sec, nanosec=nanosec),
-            level=severity,
-            name=name,
-            msg=message,
-            file=self._portable(file),
-            function=function,
-            line=line,
-        )
+        # The serializer checks each field, so that the setters need not.
+        record = self._record
+        stamp = record._stamp
+        stamp._sec, stamp._nanosec = divmod(now_ns, NS_PER_S)
+        record._level, record._name, record._msg = severity, name, message
+        record._file = self._files.get(file) or self._portable(file)
+        record._function, record._line = function, line
         data = rosout._serialize(record)
         rosout.send(data, hash64(log_content(data)))
 
@@ -112,5 +115,8 @@ class Logs:
         path = Path(file)
         for base in (self._base_dir, Path(sys.prefix)):
             if path.is_relative_to(base):
-                return str(path.relative_to(base))
-        return path.name
+                path = path.relative_to(base)
+                break
+        else:
+            path = Path(path.name)
+        return self._files.setdefault(file, str(path))

@@ -258,9 +258,7 @@ def _is_taken(stacks: Stacks, name: str) -> bool:
 
     In a program's hands a node may be left behind: its context is shut down, or nobody spins it.
     """
-    for node in stacks.domain.graph.nodes:
-        if node.fully_qualified_name != name:
-            continue
+    for node in stacks.domain.graph.nodes_named(name):
         if not isinstance(node, NodeHandle):
             return True
         if node.context.ok() and (node.wrapper is not None or stacks.programs.is_hosted):
