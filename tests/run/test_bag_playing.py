@@ -81,7 +81,8 @@ def play(tmp_path: Path) -> Any:
         path.write_text(text, encoding="utf-8")
         go.notes = []  # type: ignore[attr-defined]
         observer = Observer(note=go.notes.append)  # type: ignore[attr-defined]
-        return run(load_job(path), tmp_path / "run.mcap", force=True, observer=observer)
+        (tmp_path / "run.mcap").unlink(missing_ok=True)
+        return run(load_job(path), tmp_path / "run.mcap", observer=observer)
 
     return go
 
