@@ -86,14 +86,18 @@ def unpack_finding(data: bytes) -> Finding:
         raise TraceError(f"a finding of the trace cannot be read: {error}") from error
 
 
-def log_content(data: bytes) -> bytes:
+def log_content(data: bytes, stamp_ns: int | None = None) -> bytes:
     """Return what is hashed of an ``rcl_interfaces/msg/Log``: severity, name and message.
 
-    Of bytes that are none, something else.
+    Of bytes that are none, or not one of time ``stamp_ns``, something else.
     """
     try:
+        _check_header(data)
+        sec, nanosec, severity = _LOG_HEAD.unpack_from(data, 4)
+        if stamp_ns is not None and sec * 10**9 + nanosec != stamp_ns:
+            return b""
         name, message = _read_bytes(data, 4 + _LOG_HEAD.size, 2)
-        return b"%d\0%s\0%s" % (_LOG_HEAD.unpack_from(data, 4)[2], name, message)
+        return b"%d\0%s\0%s" % (severity, name, message)
     except (struct.error, ValueError):
         return b""
 

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64, identity_hash
@@ -81,7 +82,7 @@ def _hashed(trace: Trace) -> dict[int, _Messages]:
         of_channel.hashes.append(hash64(data))
         of_channel.stamps.append(stamp_ns)
         if channels[channel_id].topic == TOPIC_ROSOUT:
-            of_channel.as_logs.append(hash64(log_content(data)))
+            of_channel.as_logs.append(hash64(log_content(data, stamp_ns)))
     return found
 
 
@@ -101,9 +102,12 @@ def _check_messages(
     output = Output(event, entity, OutputKind(kind), 0, sequence)
     channel = trace.channel_of(output)
     found = messages.get(channel.id) if channel is not None else None
-    name = trace.entity(entity).name
-    if channel is None or found is None or channel.topic != _topic_of(output, name):
-        raise _changed(trace, f"event {event} sent messages on {name}, which has no channel")
+    sender = trace.entity(entity)
+    topic, type_name = _topic_of(output, sender)
+    if channel is None or found is None or (channel.topic, channel.type) != (topic, type_name):
+        raise _changed(
+            trace, f"event {event} sent messages on {topic} ({type_name}), which has no channel"
+        )
     numbers = outputs["sequence"].astype(np.int64)
     if int(numbers.max()) >= len(found.hashes):
         raise _changed(trace, f"message {int(numbers.max())} on {channel.topic} is missing")
@@ -120,11 +124,15 @@ def _check_messages(
     found.told += len(numbers)
 
 
-def _topic_of(output: Output, name: str) -> str:
+def _topic_of(output: Output, sender: Entity) -> tuple[str, str]:
+    """Return the topic and the type of what was sent."""
     if output.kind is OutputKind.LOG:
-        return TOPIC_ROSOUT
-    prefixes = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPONSE}
-    return prefixes.get(output.kind, "") + name
+        return TOPIC_ROSOUT, "rcl_interfaces/msg/Log"
+    if output.kind is OutputKind.REQUEST:
+        return PREFIX_REQUEST + sender.name, f"{sender.type}_Request"
+    if output.kind is OutputKind.RESPONSE:
+        return PREFIX_RESPONSE + sender.name, f"{sender.type}_Response"
+    return sender.name, sender.type
 
 
 def _check_entity(trace: Trace, outputs: npt.NDArray[np.void]) -> None:

@@ -24,7 +24,6 @@ class Wrong(str, Enum):
     EXECUTED = "executed"  # the canary: code ran that must not
     SECRET = "secret"  # a password or signature on stdout or stderr
     ANSWER = "answer"  # something was told that is not so
-    UNREAD = "unread"  # "identical" of a forged file: its hashes are right, its payloads are not
     FORGED = "forged"  # the same, although --check says that it has read everything
     BROKEN = "broken"  # the attack itself failed
     LOST = "lost"  # what was said to be kept is not there

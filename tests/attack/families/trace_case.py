@@ -84,10 +84,13 @@ def _judge_identical(
     wrong = Wrong.ANSWER
     if differs:
         text = "called identical, though it is cut or another run"
+    elif "--check" not in ran.command.words:
+        # It answers from the chain hashes, and reads no messages: docs/trust.md says so.
+        return []
     elif hostile is not None and original is not None and hostile != original:
         text = "called identical, though its messages are others"
-        wrong = Wrong.FORGED if "--check" in ran.command.words else Wrong.UNREAD
-    elif hostile is None and "--check" in ran.command.words:
+        wrong = Wrong.FORGED
+    elif hostile is None:
         text = "called identical with --check, though the mcap package refuses the file"
         wrong = Wrong.FORGED
     else:
