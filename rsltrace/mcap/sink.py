@@ -83,20 +83,26 @@ class Sink:
         """Whether the file was closed."""
         return self._descriptor.number < 0
 
-    def write(self, data: bytes) -> None:
-        """Append ``data``. Raises OSError; ``offset`` then counts what reached the file.
+    def write(self, *parts: bytes) -> None:
+        """Append ``parts``, which need not be joined before: they may be large.
+
+        Raises OSError; ``offset`` then counts what reached the file.
 
         :raises OutputError: if the file is not as it was left.
         """
         self._check()
-        self.crc = zlib.crc32(data, self.crc)
-        rest = memoryview(data)
         number = self._descriptor.number
+        for part in parts:
+            self.crc = zlib.crc32(part, self.crc)
+        rest = [memoryview(part) for part in parts if part]
         while rest:
             # A disk that fills up takes a part first and refuses the rest at the next call.
-            count = os.pwrite(number, rest, self.offset)
+            count = os.pwritev(number, rest, self.offset)
             self.offset += count
-            rest = rest[count:]
+            while rest and count >= len(rest[0]):
+                count -= len(rest.pop(0))
+            if rest:
+                rest[0] = rest[0][count:]
         self._written_ns = os.fstat(number).st_mtime_ns
 
     def finish(self, *, replace: bool = True) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 from binascii import crc32
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -21,6 +22,7 @@ from rsltrace.mcap.sink import Sink
 from rsltrace.mcap.summary_writer import SummaryBuilder, record_bytes
 
 CHANNELS_MAX = 2**16 - 1
+_U64 = struct.Struct("<Q")
 _ZSTD_LEVEL = 1
 """Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
 
@@ -140,24 +142,27 @@ class McapWriter:
         data = body.records
         if self._compression:
             data = (self._row_compressor if body.rows else self._compressor).compress(data)
-        record = record_bytes(
+        head = record_bytes(
             Chunk(
                 compression=self._compression,
-                data=data,
+                data=b"",
                 message_end_time=body.end_ns,
                 message_start_time=body.start_ns,
                 uncompressed_crc=crc32(body.records),
                 uncompressed_size=len(body.records),
             )
         )
-        offset, length = self._sink.offset, len(record)
-        self._write(record + b"".join(index for _, _, index in body.indexes))
+        # The data are written as they are, not copied behind their head first.
+        size = len(data)
+        head = head[:1] + _U64.pack(len(head) - 9 + size) + head[9:-8] + _U64.pack(size)
+        offset, length = self._sink.offset, len(head) + size
+        self._write(head, data, b"".join(index for _, _, index in body.indexes))
         self._summary.add_chunk(
             body,
             offset=offset,
             length=length,
             compression=self._compression,
-            compressed_size=len(data),
+            compressed_size=size,
         )
         return offset, length
 
@@ -192,11 +197,11 @@ class McapWriter:
                 "what was written before is readable up to its last whole segment"
             )
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, *parts: bytes) -> None:
         if self._failure is not None:
             raise self._failure  # after a gap in the file, nothing more may follow
         try:
-            self._sink.write(data)
+            self._sink.write(*parts)
         except OSError as error:
             raise self._failed(error) from error
         except OutputError as error:

@@ -456,7 +456,7 @@ def breaks_os_write(node):
     def fails(*args, **options):
         raise OSError(5, "broken")
 
-    os.write = os.pwrite = os.fsync = os.replace = os.rename = fails
+    os.write = os.pwrite = os.pwritev = os.fsync = os.replace = os.rename = fails
 
 
 def breaks_modules(node):

@@ -61,8 +61,7 @@ class EntityHandle(Destroyable, DomainEntity):
         have thousands of timers."""
         for node in self._candidates():
             mine = None
-            for wrapper in getattr(node.wrapper, self.lists):
-                handle = wrapper.handle
+            for handle, wrapper in self._listed_by(node):
                 handle._listed = node, wrapper
                 if handle is self:
                     mine = wrapper
@@ -84,6 +83,11 @@ class EntityHandle(Destroyable, DomainEntity):
         """Stop running: the node was taken from its executor."""
         self.wrapper = self._listed = None
         self.active = False
+
+    def _listed_by(self, node: NodeHandle) -> Iterator[tuple[Any, Any]]:
+        """Yield the handles of its kind that a node lists, each with its wrapper."""
+        for wrapper in getattr(node.wrapper, self.lists):
+            yield wrapper.handle, wrapper
 
     def _candidates(self) -> Iterator[Any]:
         """Yield the nodes that may list it, those that are likely to first."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
@@ -60,12 +62,11 @@ class EventHandle(EntityHandle):
         self._cause = (NO_EVENT, 0)
         parent.events.listeners[self._name] = self
 
-    def find_wrapper(self) -> Any:
-        if self.wrapper is None and self.node is not None and self.node.wrapper is not None:
-            for waitable in self.node.wrapper.waitables:
-                if getattr(waitable, "_EventHandler__event", None) is self:
-                    self.begin(waitable, self.node)
-        return self.wrapper
+    def _listed_by(self, node: NodeHandle) -> Iterator[tuple[Any, Any]]:
+        for waitable in node.wrapper.waitables:
+            handle = getattr(waitable, "_EventHandler__event", None)
+            if handle is not None:
+                yield handle, waitable
 
     def activate(self) -> None:
         self.trigger()

@@ -118,13 +118,17 @@ class UserWaitable:
 
 def sync_waitables(node: NodeHandle) -> None:
     """Run the waitables that a node's user has added, and no longer those taken away."""
-    present = [] if node.wrapper is None else list(node.wrapper.waitables)
-    if len(present) == node.waitable_count:
+    present: Any = ()
+    if node.wrapper is not None:
+        # Each subscription and publisher may have one: with many, even to list them takes long.
+        present = getattr(node.wrapper, "_Node__waitables", None)
+        present = list(node.wrapper.waitables) if present is None else present
+    before, node.waitable_count = node.waitable_count, len(present)
+    if before == len(present):
         return  # rclpy asks after each change
-    node.waitable_count = len(present)
     for waitable in [known for known in node.user_waitables if known not in present]:
         node.user_waitables.pop(waitable).close()
-    for waitable in present:
+    for waitable in present[0 if node.user_waitables else before :]:  # new ones are at the end
         if waitable not in node.user_waitables and _is_users(waitable):
             node.user_waitables[waitable] = UserWaitable(node, waitable)
 

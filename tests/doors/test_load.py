@@ -1,0 +1,89 @@
+"""Much of everything: a unit costs the same work, however many there are. Calls are counted."""
+
+from __future__ import annotations
+
+import cProfile
+import pstats
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rclpy.node import Node
+
+from rsltrace import Job, NodeSpec, Simulation, StopSpec
+
+pytestmark = pytest.mark.ros
+
+SIZES = (50, 150, 350)
+"""The second step is twice as large as the first."""
+
+
+def many_nodes(count: int) -> list[Node]:
+    return [Node(f"node_{index}") for index in range(count)]
+
+
+def many_timers(count: int) -> Node:
+    node = Node("ticking")
+    for index in range(count):
+        node.create_timer(0.5 + index * 1e-6, lambda: None)
+    return node
+
+
+def one_topic(count: int) -> list[Node]:
+    """One publisher and many subscriptions, in nodes of their own."""
+    from std_msgs.msg import UInt64
+
+    talker, listener = Node("talker"), Node("listener")
+    talker.create_publisher(UInt64, "count", 1)
+    for _ in range(count):
+        listener.create_subscription(UInt64, "count", lambda message: None, 1)
+    return [talker, listener]
+
+
+def work_of(job: Any, output: Path) -> int:
+    """Return how many calls a recorded run makes."""
+    profile = cProfile.Profile()
+    profile.enable()
+    with Simulation(job, output, force=True) as simulation:
+        simulation.run()
+    profile.disable()
+    return int(pstats.Stats(profile).total_calls)  # type: ignore[attr-defined]
+
+
+def growth(work: Callable[[int], int]) -> float:
+    """Return how much more work twice as many further units take; 2 if it is linear."""
+    work(1)  # loads modules, generates codecs
+    few, some, many = (work(size) for size in SIZES)
+    return (many - some) / (some - few)
+
+
+@pytest.mark.parametrize("make", [many_nodes, many_timers, one_topic])
+def test_work_grows_with_what_there_is(make: Callable[[int], Any], tmp_path: Path) -> None:
+    def work(count: int) -> int:
+        nodes = [NodeSpec(node=partial(make, count))]
+        return work_of(Job(nodes=nodes, stop=StopSpec(duration=1.0)), tmp_path / "run.mcap")
+
+    assert growth(work) < 2.2
+
+
+def test_the_work_of_a_job_file_grows_with_its_entries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "one_of_many.py").write_text(
+        "from rclpy.node import Node\nclass One(Node):\n"
+        "    def __init__(self):\n        super().__init__('one')\n"
+    )
+
+    def work(count: int) -> int:
+        path = tmp_path / "job.yaml"
+        lines = [
+            f"  - {{node: one_of_many:One, name: n{i}, parameters: {{use_sim_time: false}}}}\n"
+            for i in range(count)
+        ]
+        path.write_text(f"nodes:\n{''.join(lines)}stop: {{duration: 1ms}}\n")
+        return work_of(path, tmp_path / "run.mcap")
+
+    assert growth(work) < 2.2
