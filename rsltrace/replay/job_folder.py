@@ -24,16 +24,25 @@ def job_in_trace(trace: Trace, folder: Path) -> Job:
         resolved = json.loads(trace.job.get("resolved") or "null")
         if not isinstance(resolved, dict):
             raise ReplayError(f"{trace.name} does not hold the job that was run: nothing to replay")
+        _let_follow(trace, resolved, folder)
         return job_from_resolved(
             resolved, name=job_name(trace), text=trace.job_text, folder=folder.absolute()
         )
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ReplayError(f"the job in {trace.name} cannot be read: {error}") from error
     except JobError as error:
-        recorded, here = trace.environment.get("rsltrace", "?"), "this version"
         raise ReplayError(
-            f"the job in {trace.name} (of rsltrace {recorded}) is none of {here}: {error}"
+            f"the job in {trace.name} cannot be run in {folder}: {error}; the folder of the job "
+            "file is named with --job-folder DIR"
         ) from error
+
+
+def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
+    """Let a job that followed a recording which is gone follow the trace: it has that order."""
+    policy = resolved.get("policy")
+    recorded = policy.get("recorded") if isinstance(policy, dict) else None
+    if isinstance(recorded, str) and not (folder / recorded).is_file():
+        policy["recorded"] = str(Path(trace.name).resolve())
 
 
 def job_name(trace: Trace) -> str:

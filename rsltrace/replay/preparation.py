@@ -68,33 +68,15 @@ def prepared(
             distrust = why_not_trusted(trace, job, folder, named=job_folder is not None)
         else:
             folder, distrust = job.base_dir, ""
-        _check_bags(job)
         yield Preparation(
             trace,
-            _with_its_order(job, trace),
+            job,
             folder,
             code_of(job, trace.metadata(METADATA_SOURCES)),
             tuple(_changes(trace)),
             distrust,
             tuple(_notes(trace)),
         )
-
-
-def _with_its_order(job: Job, trace: Trace) -> Job:
-    """Let a job that followed a recording which is gone follow the trace: it has that order."""
-    policy = job.policy
-    if policy is None or policy.recorded is None or job.resolve(policy.recorded).exists():
-        return job
-    return job.replace(policy={"recorded": str(Path(trace.name).resolve())})
-
-
-def _check_bags(job: Job) -> None:
-    for bag in job.bags:
-        if not job.resolve(bag.path).exists():
-            raise ReplayError(
-                f"the bag {bag.path} of the job is not in {job.base_dir}: put it there, or name "
-                "the folder of the job with --job-folder DIR"
-            )
 
 
 def _changes(trace: Trace) -> Iterator[Change]:

@@ -85,6 +85,10 @@ class Verification:
         if self.verified == self._limit:
             assert self._at_limit is not None
             self.is_last = self._at_limit.reason == self._trace.result.get("stop_reason")
+            if self.is_last and self._limit < self._trace.event_count:
+                # It was between two steps, perhaps, and time had moved on.
+                loop = self._session.loop
+                loop.now_ns = max(loop.now_ns, self._trace.event(self._limit).stamp_ns)
             self._end(self._at_limit, go_on=self.is_last)
 
     @property
