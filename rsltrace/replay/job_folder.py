@@ -21,9 +21,7 @@ def job_in_trace(trace: Trace, folder: Path) -> Job:
     :raises ReplayError: if the trace holds none, or one of another version.
     """
     try:
-        resolved = json.loads(trace.job.get("resolved") or "null")
-        if not isinstance(resolved, dict):
-            raise ReplayError(f"{trace.name} does not hold the job that was run: nothing to replay")
+        resolved = _resolved(trace)
         _let_follow(trace, resolved, folder)
         return job_from_resolved(
             resolved, name=job_name(trace), text=trace.job_text, folder=folder.absolute()
@@ -35,6 +33,16 @@ def job_in_trace(trace: Trace, folder: Path) -> Job:
             f"the job in {trace.name} cannot be run in {folder}: {error}; the folder of the job "
             "file is named with --job-folder DIR"
         ) from error
+
+
+def _resolved(trace: Trace) -> dict[str, Any]:
+    try:
+        resolved = json.loads(trace.job.get("resolved") or "null")
+    except (ValueError, RecursionError) as error:
+        raise ReplayError(f"the job in {trace.name} cannot be read: {error}") from error
+    if not isinstance(resolved, dict):
+        raise ReplayError(f"{trace.name} does not hold the job that was run: nothing to replay")
+    return resolved
 
 
 def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
@@ -95,8 +103,7 @@ def _found(trace: Trace, folder: Path, wanted: Sequence[str]) -> tuple[bool, boo
 
 
 def _search(trace: Trace, folder: Path) -> list[str]:
-    resolved: Any = json.loads(trace.job.get("resolved") or "null")
-    listed = resolved.get("search_path") if isinstance(resolved, dict) else None
+    listed = _resolved(trace).get("search_path")
     return [str(folder / str(path)) for path in (listed if isinstance(listed, list) else ["."])]
 
 

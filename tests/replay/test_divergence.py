@@ -29,6 +29,8 @@ def mutations() -> Iterator[tuple[str, str]]:
 
 
 MUTATIONS = dict(mutations())
+WITHOUT_EFFECT = ()
+"""Depths of queues that never fill, and the default of a parameter that the job gives."""
 
 
 def test_there_is_something_to_change() -> None:
@@ -45,7 +47,8 @@ def test_a_changed_constant_is_found_where_diff_finds_it(
     whole = rsltrace.diff(trace, tmp_path / "changed.mcap")
     output = tmp_path / "replay.mcap"
     result = rsltrace.replay(trace, trust=True, output=output)
-    if whole.identical:  # the declared default of a parameter that the job gives
+    assert whole.identical == (what in WITHOUT_EFFECT)
+    if whole.identical:
         assert result.is_whole
         return
     assert result.diverged
@@ -56,15 +59,6 @@ def test_a_changed_constant_is_found_where_diff_finds_it(
     with Trace.open(output) as replayed, Trace.open(tmp_path / "changed.mcap") as changed:
         assert replayed.event_count == result.verified + 1, "nothing ran after it"
         assert replayed.event(result.verified) == changed.event(result.verified)
-
-
-def test_most_changes_matter(recorded: Callable[..., Path], tmp_path: Path) -> None:
-    """Were they without effect, the test above would say nothing."""
-    trace, diverged = recorded(), 0
-    for code in MUTATIONS.values():
-        (tmp_path / "nodes_of_replay.py").write_text(code)
-        diverged += rsltrace.replay(trace, trust=True).diverged
-    assert diverged >= len(MUTATIONS) - 3
 
 
 def test_what_follows_a_divergence_does_not_run(
@@ -78,7 +72,8 @@ def test_what_follows_a_divergence_does_not_run(
     (tmp_path / "nodes_of_replay.py").write_text(
         changed.replace(
             "        self.state = 0.75",
-            f"        if message.data > 90: open({str(received)!r}, 'w')\n        self.state = 0.75",
+            f"        if message.data > 90: open({str(received)!r}, 'w')\n"
+            "        self.state = 0.75",
         )
     )
     result = rsltrace.replay(trace, trust=True)

@@ -69,7 +69,7 @@ def main():
     import rclpy
     from std_srvs.srv import Trigger
     rclpy.init()
-    Node('waiting').create_client(Trigger, 'nobody').wait_for_service()
+    Node('waiting').create_client(Trigger, 'nobody').call(Trigger.Request())
 """
 
 
@@ -82,9 +82,7 @@ def main():
     ],
     ids=["a node raises", "a node exits", "a deadlock"],
 )
-def test_a_run_that_failed_fails_again(
-    recorded: Callable[..., Path], job: str, code: str
-) -> None:
+def test_a_run_that_failed_fails_again(recorded: Callable[..., Path], job: str, code: str) -> None:
     trace = recorded(job, code)
     with Trace.open(trace) as opened:
         assert opened.result["exit_code"] != "0"

@@ -111,9 +111,7 @@ def test_a_recorded_order_is_in_the_trace_itself(tmp_path: Path) -> None:
     assert result.is_whole
 
 
-@pytest.mark.skipif(
-    importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs"
-)
+@pytest.mark.skipif(importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs")
 def test_actions_and_lifecycles(tmp_path: Path) -> None:
     programs = ("fibonacci_server", "fibonacci_client", "camera", "camera_manager")
     nodes = "".join(f"  - {{main: demo_interactions.{name}:main}}\n" for name in programs)
@@ -132,7 +130,9 @@ def test_bags(recorded: Callable[..., Path], tmp_path: Path) -> None:
     bag = recorded("nodes: [{node: nodes_of_replay:Filter}]\nbags: [bag]\n", name="from_bag.mcap")
     replayed(bag)
     shutil.move(tmp_path / "bag", tmp_path / "elsewhere")
-    with pytest.raises(rsltrace.RsltraceError, match="bags.0..path: .bag.: there is no such bag; .* --job-folder"):
+    with pytest.raises(
+        rsltrace.RsltraceError, match=r"bags.0..path: .bag.: there is no such bag; .* --job-folder"
+    ):
         rsltrace.replay(bag, trust=True)
 
 
@@ -198,9 +198,7 @@ def test_a_job_made_in_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             self.create_timer(0.1, lambda: self.get_logger().info("tick"))
 
     monkeypatch.chdir(tmp_path)
-    job = rsltrace.Job(
-        nodes=[rsltrace.NodeSpec(node=Local)], stop=rsltrace.StopSpec(duration="1s")
-    )
+    job = rsltrace.Job(nodes=[rsltrace.NodeSpec(node=Local)], stop=rsltrace.StopSpec(duration="1s"))
     rsltrace.record(job, "run.mcap")
     with pytest.raises(rsltrace.RsltraceError, match="Local"):
         rsltrace.replay("run.mcap", trust=True)
