@@ -48,8 +48,9 @@ def _resolved(trace: Trace) -> dict[str, Any]:
 def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
     """Let a job that followed a recording which is gone follow the trace: it has that order."""
     policy = resolved.get("policy")
-    recorded = policy.get("recorded") if isinstance(policy, dict) else None
-    if isinstance(recorded, str) and not (folder / recorded).is_file():
+    if not isinstance(policy, dict) or not isinstance(policy.get("recorded"), str):
+        return
+    if not (folder / policy["recorded"]).is_file():
         policy["recorded"] = str(Path(trace.name).resolve())
 
 

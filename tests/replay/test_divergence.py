@@ -29,7 +29,7 @@ def mutations() -> Iterator[tuple[str, str]]:
 
 
 MUTATIONS = dict(mutations())
-WITHOUT_EFFECT = ()
+WITHOUT_EFFECT = ("10", "1.5")
 """Depths of queues that never fill, and the default of a parameter that the job gives."""
 
 
@@ -47,7 +47,7 @@ def test_a_changed_constant_is_found_where_diff_finds_it(
     whole = rsltrace.diff(trace, tmp_path / "changed.mcap")
     output = tmp_path / "replay.mcap"
     result = rsltrace.replay(trace, trust=True, output=output)
-    assert whole.identical == (what in WITHOUT_EFFECT)
+    assert whole.identical == (what.partition(": ")[2] in WITHOUT_EFFECT)
     if whole.identical:
         assert result.is_whole
         return
