@@ -35,6 +35,8 @@ if TYPE_CHECKING:
         TopicStop,
         load_job,
     )
+    from rsltrace.replay import replay_trace as replay
+    from rsltrace.replay.result import ReplayResult
     from rsltrace.run import RunResult, Simulation, record
     from rsltrace.trace.reader import Trace
 
@@ -48,6 +50,7 @@ _HOMES = {
     "LaunchSpec": "rsltrace.job",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
+    "ReplayResult": "rsltrace.replay.result",
     "RsltraceError": "rsltrace.errors",
     "RunResult": "rsltrace.run",
     "Simulation": "rsltrace.run",
@@ -70,6 +73,7 @@ __all__ = [
     "LaunchSpec",
     "NodeSpec",
     "RecordSpec",
+    "ReplayResult",
     "RsltraceError",
     "RunResult",
     "Simulation",
@@ -82,14 +86,15 @@ __all__ = [
     "diff_bags",
     "load_job",
     "record",
+    "replay",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "diff":
+    if name in ("diff", "replay"):
         import importlib
 
-        return importlib.import_module("rsltrace.diff")  # a package that can be called
+        return importlib.import_module(f"rsltrace.{name}")  # a package that can be called
     try:
         home = _HOMES[name]
     except KeyError:

@@ -5,7 +5,8 @@
     ├── SetupError                   2  the machine lacks something: rclpy, an interface package
     ├── BagError                     2  a bag cannot be read or played
     ├── TraceError                   2  a trace cannot be read or compared
-    │   └── TraceFormatError         2  not a trace, or one of another format version
+    │   ├── TraceFormatError         2  not a trace, or one of another format version
+    │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
     ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
     └── RunError                     3  the run itself went wrong; the trace up to there is complete
         ├── NodeError                3  a node's constructor or callback raised
@@ -64,6 +65,10 @@ class TraceError(RsltraceError):
 
 class TraceFormatError(TraceError):
     """The file is not an rsltrace trace, or is one of a format this version cannot read."""
+
+
+class ReplayError(TraceError):
+    """A trace cannot be replayed: what it needs is not here, or nobody has said to trust it."""
 
 
 class OutputError(RsltraceError):

@@ -190,7 +190,7 @@ def _diff(
             tell(f"rsltrace: error: {error}")
             trouble = True
     if done:
-        _print(done, form, options, output)
+        print_diffs(done, form, options, output)
     from rsltrace.diff.result.exit_codes import exit_code_of_several
 
     return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
@@ -233,9 +233,10 @@ def _opened(place: str) -> Trace:
         ) from error
 
 
-def _print(
+def print_diffs(
     diffs: Sequence[Diff | BagDiff], form: str, options: DiffOptions, output: Path | None
 ) -> None:
+    """Print diffs in a form; on a terminal, text has its size and colours."""
     from rsltrace.diff.report import render, report_lines
 
     one_or_all = diffs[0] if len(diffs) == 1 else diffs

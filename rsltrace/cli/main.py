@@ -19,6 +19,7 @@ from rsltrace.guard.pin import pin_recording
 
 _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
+    "replay": "Run the job of a trace again, and check every event on the way.",
     "init": "Write a commented first job, from bags and nodes.",
     "verify": "Record a job many times in unlike surroundings and compare.",
     "audit": "Look into nodes' sources for what could make runs differ.",
@@ -91,6 +92,7 @@ def cli() -> None:
       rsltrace cat run.mcap | less            read every callback
       rsltrace view run.mcap                  step through it
       rsltrace diff run1.mcap run2.mcap       see where two runs diverge, and why
+      rsltrace replay run.mcap                run it again, stop where it diverges
 
     "rsltrace COMMAND --help" explains a command.
     """

@@ -116,7 +116,7 @@ def record(
     if sys.__stderr__ is not None and not faulthandler.is_enabled():
         with suppress(OSError, ValueError):  # a stderr that is no file
             faulthandler.enable(sys.__stderr__)
-    with _interruptible() as on_interrupt, _progress(quiet=quiet or as_json) as on_progress:
+    with interruptible() as on_interrupt, progress(quiet=quiet or as_json) as on_progress:
 
         def begins(stop: Callable[[Stop], None]) -> None:
             if not (loaded.stop.model_fields_set or loaded.bags):
@@ -241,7 +241,7 @@ _SHOWN_MAX = 8
 
 
 @contextmanager
-def _interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
+def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
     """Turn the first SIGINT, SIGTERM or SIGHUP into a proper end of the run; a second one
     interrupts whatever callback is stuck."""
     from rsltrace.loop.stop import Stop
@@ -276,7 +276,9 @@ _ENDS = {
 
 
 @contextmanager
-def _progress(*, quiet: bool) -> Iterator[Callable[[int, int | None, int], None] | None]:
+def progress(
+    *, quiet: bool, what: str = "recording"
+) -> Iterator[Callable[[int, int | None, int], None] | None]:
     """Show a progress bar on a terminal, nothing elsewhere."""
     if quiet or sys.stderr is None or not sys.stderr.isatty():
         yield None
@@ -285,7 +287,7 @@ def _progress(*, quiet: bool) -> Iterator[Callable[[int, int | None, int], None]
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
-        TextColumn("recording"),
+        TextColumn(what),
         BarColumn(),
         TextColumn("{task.fields[sim]} s simulated, {task.fields[events]} events"),
         TimeElapsedColumn(),

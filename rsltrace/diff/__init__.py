@@ -10,10 +10,10 @@ loads nothing but names.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
-from types import ModuleType
 from typing import TYPE_CHECKING
+
+from rsltrace.callable_package import make_callable
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -83,18 +83,4 @@ def _pairs(tolerances: Tolerances) -> tuple[tuple[str, float], ...]:
     return tuple(tolerances.items() if isinstance(tolerances, Mapping) else tolerances)
 
 
-def __getattr__(name: str) -> object:
-    if name == "__signature__":  # what help and notebooks show of something that can be called
-        import inspect
-
-        return inspect.signature(diff_files)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-class _CallablePackage(ModuleType):
-    """So that ``rsltrace.diff`` is one thing, whether a function or a package is meant."""
-
-    __call__ = staticmethod(diff_files)
-
-
-sys.modules[__name__].__class__ = _CallablePackage
+make_callable(__name__, diff_files)

@@ -41,7 +41,7 @@ _before = ""
 
 def pin_recording(words: Sequence[str]) -> None:
     """Pin the process if a command line (without the program's name) is one that runs nodes."""
-    if list(words[:1]) == ["record"] and not _NOTHING_TO_PIN.intersection(words):
+    if words[:1] and words[0] in ("record", "replay") and not _NOTHING_TO_PIN.intersection(words):
         pin()
 
 

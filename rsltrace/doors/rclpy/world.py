@@ -160,6 +160,10 @@ class World:
             # What a callback sends leaves when it is over: that takes links.
             self.use_network(NetworkPlan())
 
+    def echo_logs(self, echo: bool) -> None:
+        """Print log records on stderr from now on, or no longer."""
+        self._logs.echo = echo
+
     # -- the stages of a run ---------------------------------------------------------------------
 
     def construct(self, entry: Entry) -> bool:

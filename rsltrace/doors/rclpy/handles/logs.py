@@ -47,7 +47,7 @@ class Logs:
     def __init__(self, domain: Domain, *, base_dir: Path, echo: bool) -> None:
         self._domain = domain
         self._base_dir = base_dir
-        self._echo = echo
+        self.echo = echo
         self._nodes: dict[str, NodeHandle] = {}
         self._files: dict[str, str] = {}
 
@@ -86,7 +86,7 @@ class Logs:
             text_with_address(message)
         now_ns = self._domain.loop.now_ns
         severity = int(severity)
-        if self._echo:
+        if self.echo:
             self._print(severity, now_ns, name, message)
         node = self._nodes.get(name) or self._domain.event.node
         rosout = getattr(node, "rosout", None)
@@ -108,7 +108,7 @@ class Logs:
         try:
             tell(f"[{label}] [{format_seconds(now_ns)}] [{name}]: {message}")
         except (OSError, ValueError, AttributeError):  # gone, closed, or never there
-            self._echo = False
+            self.echo = False
 
     def _portable(self, file: str) -> str:
         """Return a source path that is the same wherever the job's folder lies."""

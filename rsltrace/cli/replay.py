@@ -1,0 +1,252 @@
+"""``rsltrace replay``: run the job of a trace again, and check every event on the way."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.cli.diff import print_diffs
+from rsltrace.cli.exit_status import reopen_standard_streams, status_without_output
+from rsltrace.cli.record import interruptible, progress
+from rsltrace.diff.options import DiffOptions
+from rsltrace.errors import NodeError, ReplayError
+from rsltrace.guard.pin import unpin
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.replay.preparation import Preparation
+    from rsltrace.replay.result import ReplayResult
+
+_SHOWN_MAX = 12
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.option(
+    "--until",
+    metavar="INDEX|TIME",
+    help="Stop after this event (812) or simulated time (60s, 2.5), with success.",
+)
+@click.option(
+    "--from",
+    "first",
+    metavar="INDEX|TIME",
+    help="Verify what comes before quietly: progress and the nodes' log records begin here.",
+)
+@click.option(
+    "-o", "--output", type=click.Path(path_type=Path), help="Keep the replay's own trace there."
+)
+@click.option("--force", is_flag=True, help="Replace an existing trace (never TRACE itself).")
+@click.option(
+    "--job-folder",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="The folder of the job file (default: that of the trace, or the present one).",
+)
+@click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
+@click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
+@click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
+def replay(
+    trace: Path,
+    until: str | None,
+    first: str | None,
+    output: Path | None,
+    force: bool,
+    job_folder: Path | None,
+    trust: bool,
+    as_json: bool,
+    no_pin: bool,
+    quiet: bool,
+) -> int:
+    """Run the job in TRACE again and compare every event with TRACE as it ends.
+
+    Job, launch arguments, parameters, seeds, order and recorded values from outside are those in
+    TRACE; its nodes, bags and files are those that are here now. The first event that is not as
+    recorded ends the run, and is reported as by "rsltrace diff".
+
+    This runs code: what, from where, and what of it has changed since, is told before it begins.
+    Unless the job file in the present folder (or in --job-folder) names the same code, it takes a
+    yes on the terminal, or --trust.
+
+    The exit status is 0 if every event was as recorded (of a run that failed: the failure, too), 1
+    if the replay diverged, 2 for trouble, 130, 143 or 129 if it was interrupted.
+    """
+    from rsltrace.replay.preparation import count_to, prepared
+
+    with prepared(trace, job_folder) as plan:
+        if no_pin or not plan.job.guard.pins:
+            unpin()
+        count = None if until is None else count_to(plan.trace, until)
+        begin = 0 if first is None else count_to(plan.trace, first) - 1
+        if not as_json:
+            for line in _told(plan):
+                click.echo(line, err=True)
+        _agree(plan, trust=trust)
+        result = _replayed(plan, count, max(begin, 0), output, force=force, quiet=quiet or as_json)
+        reopen_standard_streams()
+        status = result.exit_code
+        try:
+            if as_json:
+                click.echo(json.dumps(_values(result, plan)))
+            else:
+                _print(result)
+        except OSError as error:
+            status = status_without_output(error, status)
+    return status
+
+
+def _agree(plan: Preparation, *, trust: bool) -> None:
+    """Have somebody agree to run what a trace names, where that is not plain.
+
+    :raises ReplayError: if nobody does.
+    """
+    if not plan.distrust or trust:
+        return
+    name = printable(plan.trace.name)
+    why = printable(plan.distrust)
+    if sys.stdin is None or not (sys.stdin.isatty() and sys.stderr.isatty()):
+        raise ReplayError(
+            f"{name} would run code, and {why}: nothing was run; --trust runs it, if you know "
+            "where the trace comes from"
+        )
+    click.echo(f"{name} would run this code, and {why}.", err=True)
+    if not click.confirm("Run it?", default=False, err=True):
+        raise ReplayError("nothing was run")
+
+
+def _replayed(
+    plan: Preparation,
+    until: int | None,
+    first: int,
+    output: Path | None,
+    *,
+    force: bool,
+    quiet: bool,
+) -> ReplayResult:
+    from rsltrace.replay.replaying import replay_prepared
+    from rsltrace.run import Observer
+
+    with interruptible() as on_interrupt, progress(quiet=quiet, what="replaying") as show:
+        return replay_prepared(
+            plan,
+            until=until,
+            first=first,
+            output=output,
+            force=force,
+            echo=not quiet,
+            observer=Observer(progress=_from(first, show), interrupt=on_interrupt),
+        )
+
+
+_Show = Callable[[int, int | None, int], None]
+
+
+def _from(first: int, show: _Show | None) -> _Show | None:
+    """Return what shows progress from an event on."""
+    if show is None or not first:
+        return show
+
+    def later(now_ns: int, end_ns: int | None, events: int) -> None:
+        if events >= first:
+            show(now_ns, end_ns, events)
+
+    return later
+
+
+# -- what is told --------------------------------------------------------------------------------
+
+
+def _told(plan: Preparation) -> Iterator[str]:
+    """Yield what will run, from where, and what is not as it was."""
+    trace = plan.trace
+    job = trace.job.get("name", "") or "a job"
+    yield printable(
+        f"replaying {trace.name}: {trace.event_count} events of {job} in {plan.folder}, with the "
+        "code of"
+    )
+    code = [(one.name, str(_near(one.file)) if one.file else "-", one.change) for one in plan.code]
+    width = min(max((len(name) for name, _, _ in code), default=0), 40)
+    for name, file, change in code[:_SHOWN_MAX]:
+        yield printable(f"  {name:<{width}}  {file}{f'  ({change})' if change else ''}")
+    if len(code) > _SHOWN_MAX:
+        changed = [name for name, _, change in code[_SHOWN_MAX:] if change]
+        more = f" (changed or not here: {', '.join(changed[:_SHOWN_MAX])})" if changed else ""
+        yield printable(f"  and {len(code) - _SHOWN_MAX} more{more}")
+    if plan.job.bags:
+        yield printable(f"and the bags {', '.join(bag.path for bag in plan.job.bags)}")
+    if plan.changes:
+        changes = (f"{c.name} {c.recorded or '-'} -> {c.present or '-'}" for c in plan.changes)
+        yield printable(f"not as it was recorded: {', '.join(changes)}")
+
+
+def _near(file: Path) -> Path:
+    """Return a file as seen from here, if it is below the present folder."""
+    return file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file
+
+
+def _print(result: ReplayResult) -> None:
+    error = result.error
+    if error is not None:
+        if result.diverged and isinstance(error, NodeError) and error.traceback_text:
+            click.echo(error.traceback_text.rstrip(), err=True)
+        as_recorded = "" if result.diverged else ", as recorded"
+        click.echo(f"rsltrace: the run failed{as_recorded}: {error}", err=True)
+    for note in result.notes:
+        click.echo(f"note: {note}", err=True)
+    if result.path is not None:
+        click.echo(f"wrote {result.path}", err=True)
+    if result.diff is not None:
+        print_diffs([result.diff], "text", DiffOptions(), None)
+        click.echo(f"\nnext: {_next(result)}")
+        return
+    click.echo(result.sentence)
+    click.echo(
+        f"digest {result.digest}  events {result.verified}  sim {format_seconds(result.end_ns)}"
+    )
+
+
+def _next(result: ReplayResult) -> str:
+    if result.path is not None:
+        return shlex.join(["rsltrace", "view", result.trace, str(result.path)])
+    again = ["rsltrace", "replay", result.trace, "-o", "replay.mcap"]
+    view = ["rsltrace", "view", result.trace, "replay.mcap"]
+    return printable(f"{shlex.join(again)}; {shlex.join(view)}")
+
+
+def _values(result: ReplayResult, plan: Preparation) -> dict[str, Any]:
+    difference = None
+    if result.diff is not None:
+        from rsltrace.diff.report import render
+
+        difference = json.loads(render(result.diff, "json"))
+    return {
+        "trace": result.trace,
+        "verified": result.verified,
+        "events": result.events,
+        "digest": result.digest,
+        "end_ns": result.end_ns,
+        "ended": result.ended,
+        "is_whole": result.is_whole,
+        "diverged_at": result.verified if result.diverged else None,
+        "exit_code": result.exit_code,
+        "error": None if result.error is None else str(result.error),
+        "path": None if result.path is None else str(result.path),
+        "notes": list(result.notes),
+        "code": [
+            {"name": one.name, "file": str(one.file) if one.file else None, "change": one.change}
+            for one in plan.code
+        ],
+        "changes": [
+            {"name": one.name, "recorded": one.recorded, "present": one.present}
+            for one in plan.changes
+        ],
+        "diff": difference,
+    }

@@ -1,0 +1,67 @@
+"""Running a trace again: the same job, every event checked against the trace as it ends.
+
+>>> import rsltrace
+>>> result = rsltrace.replay("run.mcap")                  # doctest: +SKIP
+>>> result.sentence                                       # doctest: +SKIP
+
+This package is also that function, as ``rsltrace.diff`` is. Importing it loads nothing but names.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rsltrace.callable_package import make_callable
+
+if TYPE_CHECKING:
+    from rsltrace.job import Job
+    from rsltrace.replay.result import ReplayResult
+
+
+def replay_trace(
+    trace: str | Path,
+    *,
+    until: int | str | None = None,
+    output: str | Path | None = None,
+    force: bool = False,
+    job: Job | None = None,
+    job_folder: str | Path | None = None,
+    trust: bool = False,
+    echo: bool = False,
+) -> ReplayResult:
+    """Run the job of a trace again, and stop at the first event that is not as recorded.
+
+    ``until`` is the last event to verify, by its index (an int, or digits), or a simulated time as
+    text (``"2.5"`` seconds, ``"60s"``). ``output`` takes the replay's own trace, ``force`` replaces
+    one that is there. ``job_folder`` is the folder of the job's file; without it, that of the trace
+    and the present one are tried. ``job`` is the job itself, of one made in Python that cannot be
+    loaded from its text. ``echo`` prints the nodes' log records on stderr.
+
+    This runs the code that the trace names. Unless the job file in the present folder (or in
+    ``job_folder``) says the same, that takes ``trust=True``.
+
+    Returns a ``rsltrace.ReplayResult``. A run that fails as the recorded one did is verified.
+
+    :raises ReplayError: the trace cannot be replayed here, or is not trusted.
+    :raises TraceError: it is missing or damaged.
+    :raises JobError, SetupError, BagError, OutputError: its job cannot run, or not be written.
+    """
+    from rsltrace.errors import ReplayError
+    from rsltrace.replay.preparation import count_to, prepared
+    from rsltrace.replay.replaying import replay_prepared
+
+    folder = None if job_folder is None else Path(job_folder)
+    with prepared(trace, folder, job) as plan:
+        if plan.distrust and not trust:
+            raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
+        return replay_prepared(
+            plan,
+            until=None if until is None else count_to(plan.trace, until),
+            output=None if output is None else Path(output),
+            force=force,
+            echo=echo,
+        )
+
+
+make_callable(__name__, replay_trace)

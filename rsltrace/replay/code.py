@@ -1,0 +1,121 @@
+"""Whose code a job would run, and from which files: found without importing any of it."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from typing import Any
+
+from rsltrace.errors import JobError
+from rsltrace.job import Job
+from rsltrace.job.values.target import target_text
+from rsltrace.run.plans.executables import source_of
+
+_OF_FILES = "file:"
+
+
+@dataclass(frozen=True, slots=True)
+class Code:
+    """A module (or script, or data file) of a job, and what has become of it since the recording.
+
+    ``file`` is None where there is none. ``recorded`` and ``present`` are the first 16 hex digits
+    of the file's SHA-256, empty where unknown: of what is installed, a trace holds the version.
+    """
+
+    name: str
+    file: Path | None
+    recorded: str
+    present: str
+
+    @property
+    def change(self) -> str:
+        """What has changed since, empty if nothing has as far as is known."""
+        if self.file is None:
+            return "is not here"
+        return "has changed" if self.recorded and self.recorded != self.present else ""
+
+
+def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
+    """Return the code of a job; ``sources`` are the hashes that a trace has of it."""
+    folders = [str(job.resolve(folder)) for folder in job.search_path]
+    named = dict.fromkeys(name for name in sources if not name.startswith(_OF_FILES))
+    found = {name: file_of(name, folders) for name in named}
+    for name, file in _named_by(job, folders):
+        found.setdefault(name, file)
+    for _, path in job.model_files():
+        found[f"{_OF_FILES}{path}"] = job.resolve(path)
+    return tuple(_code(name, file, sources.get(name, "")) for name, file in found.items())
+
+
+def _code(name: str, file: Path | None, recorded: str) -> Code:
+    there = file is not None and file.is_file()  # no device, no pipe
+    present = ""
+    if there and recorded:
+        assert file is not None
+        with suppress(OSError):
+            present = hashlib.sha256(file.read_bytes()).hexdigest()[:16]
+    return Code(name.removeprefix(_OF_FILES), file if there else None, recorded, present)
+
+
+def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
+    """Yield what a job names itself, rather than what that imports."""
+    targets: list[Any] = [job.hooks.before, job.hooks.after, job.stop.function]
+    targets.append(None if job.policy is None else job.policy.function)
+    targets += [spec.node or spec.main for spec in job.nodes]
+    for target in targets:
+        if target is not None:
+            module = target_text(target).partition(":")[0]
+            yield module, file_of(module, folders)
+    for spec in job.nodes:
+        if spec.executable is not None:
+            yield from _executable(spec.executable, folders)
+    for launch in job.launch:
+        yield launch.file, job.resolve(launch.file)
+
+
+def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path | None]]:
+    try:
+        found = source_of(name, where="")
+    except JobError:
+        yield name, None
+        return
+    if isinstance(found, Path):
+        yield name, found
+    else:
+        module = found.partition(":")[0]
+        yield module, file_of(module, folders)
+
+
+def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
+    """Return the file that a module would be loaded from: of ``folders``, or, if it may be an
+    ``installed`` one, then of Python's own path."""
+    path: Sequence[str] | None = [*folders, *sys.path] if installed else folders
+    spec: ModuleSpec | None = None
+    parts = module.split(".")
+    for depth, part in enumerate(parts, 1):
+        if path is None or not part.isidentifier():
+            return None
+        full = ".".join(parts[:depth])
+        spec = PathFinder.find_spec(full, path)
+        if spec is None and installed:
+            spec = _found_otherwise(full)
+        if spec is None:
+            return None
+        path = spec.submodule_search_locations
+    if spec is None or not spec.origin or not spec.has_location:
+        return None
+    return Path(spec.origin)
+
+
+def _found_otherwise(module: str) -> ModuleSpec | None:
+    """Ask the finders of packages that are installed in place, which know files of their own."""
+    for finder in sys.meta_path:
+        if finder is not PathFinder and "editable" in f"{finder!r}".lower():
+            with suppress(Exception):
+                return finder.find_spec(module, None)
+    return None

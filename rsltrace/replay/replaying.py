@@ -1,0 +1,142 @@
+"""Running a trace's job again and checking every event on the way."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.diff import diff_traces
+from rsltrace.replay.preparation import Preparation
+from rsltrace.replay.result import ReplayResult
+from rsltrace.replay.verification import Verification
+from rsltrace.run import Observer, RunResult
+from rsltrace.run.process import kept_process
+from rsltrace.run.session import Session
+from rsltrace.trace.chain import digest_text
+from rsltrace.trace.reader import Trace
+
+THE_REPLAY = "the replay"
+_CONTEXT = 5
+
+
+def replay_prepared(
+    plan: Preparation,
+    *,
+    until: int | None = None,
+    first: int = 0,
+    output: Path | None = None,
+    force: bool = False,
+    echo: bool = False,
+    observer: Observer | None = None,
+) -> ReplayResult:
+    """Run a job as its trace says, ``until`` so many events are verified (None: to the end).
+
+    This runs user code: see ``trust``. ``echo`` prints what the nodes log from event number
+    ``first`` on.
+
+    :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
+    """
+
+    def on_first(session: Session) -> None:
+        session.world.echo_logs(echo)
+
+    verification = Verification(plan.trace, until, first=first, on_first=on_first)
+    with _place(output) as path:
+        run = _run(plan, verification, path, force=force, observer=observer)
+        compared = _diverged(plan.trace, verification)
+        place = run.path or path
+        difference = _difference(plan.trace, place, kept=output is not None) if compared else None
+    return _result(plan, verification, run, difference, None if output is None else place)
+
+
+@contextmanager
+def _place(output: Path | None) -> Iterator[Path]:
+    """Give a place for the replay's trace: what is not asked for is gone afterwards."""
+    if output is not None:
+        yield output
+        return
+    with tempfile.TemporaryDirectory(prefix="rsltrace-replay-") as folder:
+        yield Path(folder, "replay.mcap")
+
+
+def _run(
+    plan: Preparation,
+    verification: Verification,
+    path: Path,
+    *,
+    force: bool,
+    observer: Observer | None,
+) -> RunResult:
+    recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
+    with (
+        kept_process(),
+        Session(plan.job, path, force=force, observer=observer, replay=recorded) as session,
+    ):
+        verification.attach(session)
+        session.begin()
+        if not session.ended:
+            session.go_on()
+        return session.finish()
+
+
+def _diverged(trace: Trace, verification: Verification) -> bool:
+    """Say whether a run that is over did something else, or ended where the trace goes on."""
+    if verification.diverged:
+        return True
+    ended_by_us = verification.stop is not None or verification.interrupted
+    return not ended_by_us and verification.verified < trace.event_count
+
+
+def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
+    """Return the diff of the trace and the replay, which ends with the event that differs."""
+    with Trace.open(place) as replayed:
+        found = diff_traces(trace, replayed, DiffOptions(context=_CONTEXT, window=1))
+    name = str(place) if kept else THE_REPLAY
+    return replace(
+        found,
+        b=replace(found.b, path=name),
+        counts=(),
+        resync_index=None,
+        notes=tuple(note for note in found.notes if not note.startswith("b ")),
+        divergences=tuple(replace(one, next_step="", reaches=()) for one in found.divergences[:1]),
+    )
+
+
+def _result(
+    plan: Preparation,
+    verification: Verification,
+    run: RunResult,
+    difference: Diff | None,
+    path: Path | None,
+) -> ReplayResult:
+    trace = plan.trace
+    notes = [*plan.notes, *run.notes]
+    whole = trace.complete and verification.verified == trace.event_count
+    recorded = trace.result.get("stop_reason", "")
+    if verification.is_last and not whole:
+        notes.append(
+            "what the nodes did when their run was ended from outside is not the same "
+            f"(event {verification.verified})"
+        )
+    elif whole and run.stop_reason != recorded:
+        notes.append(f"the recorded run ended with {recorded!r}, this one with {run.stop_reason!r}")
+    return ReplayResult(
+        trace=trace.name,
+        verified=verification.verified,
+        events=trace.event_count,
+        digest=digest_text(verification.chain_hash),
+        end_ns=verification.end_ns,
+        ended=run.stop_reason,
+        is_whole=whole and difference is None,
+        path=path,
+        diff=difference,
+        error=run.error,
+        notes=tuple(dict.fromkeys(notes)),
+        interrupted=verification.interrupted,
+    )

@@ -1,0 +1,91 @@
+"""Whether to run what a trace names. A trace may come from anybody, and its job may name any code.
+
+``record`` runs what a job file says that somebody chose to run. A replay runs what a *trace* says,
+and a trace looks like data. So it runs without being asked only where it does no more than
+``record`` of the job file in the present folder would do: the same nodes with the same parameters,
+arguments, launch files, hooks and bags. What only says when, in which order and for how long they
+run may differ.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from rsltrace.errors import JobError
+from rsltrace.job import Job, job_from_text, load_job
+from rsltrace.launch import expand, ros_launch
+from rsltrace.model.finding import Mode
+from rsltrace.replay.job_folder import job_name
+from rsltrace.run.plans.executables import why_not
+from rsltrace.trace.reader import Trace
+
+_LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
+_RUNS_OR_READS = (
+    "nodes",
+    "hooks",
+    "search_path",
+    "ros_arguments",
+    "bags",
+    "guard",
+    "delay",
+    "progress",
+    "clocks",
+)
+"""Keys of a job with which somebody could make nodes do what they do not do otherwise."""
+
+
+def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str:
+    """Return why a trace runs only if somebody says so, empty if it may.
+
+    ``named``: the job's folder has been named by whoever runs it. Nothing is run to find out.
+    """
+    name = job_name(trace)
+    if not named and folder.resolve() != Path.cwd():
+        return f"its job lies in {folder}, which is not the present folder"
+    if not name:
+        return "its job was made in Python, so there is no job file here that says the same"
+    try:
+        own = _own_job(folder / name)
+    except (JobError, OSError, RecursionError):
+        own = None
+    if own is None:
+        return f"there is no {name} in {folder} to compare its job with without running code"
+    differing = _differing(own, job)
+    if differing:
+        return f"its job differs from {folder / name} in {', '.join(differing)}"
+    if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
+        return "it holds answers from outside (of files, sockets, …) that the nodes would be given"
+    return ""
+
+
+def _own_job(file: Path) -> Job | None:
+    """Return the job of a job file or launch file, None if that takes running a program."""
+    if file.name.endswith(_LAUNCH):
+        spec = json.dumps({"file": file.name, "arguments": {}})
+        job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
+    elif file.suffix in (".yaml", ".yml", ".json"):
+        job = load_job(file)
+    else:
+        return None
+    for launch in job.launch:
+        # ROS's own launch runs what a launch file tells it to.
+        if not launch.file.endswith(_LAUNCH) or ros_launch.can_read(job.resolve(launch.file)):
+            return None
+    return expand(job, why_not=why_not).job
+
+
+def _differing(own: Job, job: Job) -> list[str]:
+    a, b = _values(own), _values(job)
+    return [key for key in a if a[key] != b[key]]
+
+
+def _values(job: Job) -> dict[str, Any]:
+    resolved = json.loads(json.dumps(job.resolved()))
+    values = {key: resolved[key] for key in _RUNS_OR_READS}
+    values["guard"] = {key: value for key, value in values["guard"].items() if key != "pin"}
+    policy = resolved["policy"] or {}
+    values["stop.function"] = resolved["stop"]["function"]
+    values["policy"] = policy.get("function"), policy.get("recorded")
+    return values

@@ -1,0 +1,147 @@
+"""Comparing a run with a trace, event by event, as the events end.
+
+A chain hash stands for an event and all before it, so one number per event is compared. The first
+that differs ends the run there: what the event has sent waits in queues that nobody reads any more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rsltrace.loop.stop import Stop
+from rsltrace.model.event import EventKind
+
+if TYPE_CHECKING:
+    from rsltrace.run.session import Session
+    from rsltrace.trace.reader import Trace
+
+DIVERGED = Stop("the replay stopped at the first event that differs", 1)
+_INTERRUPTIONS = {129: "hung up", 130: "interrupted", 143: "terminated"}
+_BY_DRIVER = "the driver of the simulation"
+
+
+class Verification:
+    """What a run has to do, and how far it has done so.
+
+    ``until`` is how many events to verify, None for all. ``verified`` events were as recorded;
+    ``diverged`` says that the next one was not. ``stop`` is with what the verification has ended
+    the run, if it has. ``on_first`` is called before event number ``first``.
+    """
+
+    def __init__(
+        self,
+        trace: Trace,
+        until: int | None = None,
+        *,
+        first: int = 0,
+        on_first: Callable[[Session], None] | None = None,
+    ) -> None:
+        self.verified = 0
+        self.chain_hash = 0
+        self.end_ns = trace.start_ns
+        self.diverged = False
+        self.stop: Stop | None = None
+        self.is_last = False
+        """Whether the run was ended where the trace's was, by somebody outside of the job."""
+        self._trace = trace
+        self._limit, self._at_limit = _limit(trace, until)
+        self._on_first = on_first
+        self._first = first if on_first is not None else -1
+        self._next_mark = self._limit if self._first < 1 else self._first
+        self._expected = self._hashes()
+        self._session: Session
+        self._end_event: Any
+
+    def attach(self, session: Session) -> None:
+        """Compare the events of an open session from now on."""
+        recorder = session.world.domain.dispatcher.recorder
+        assert recorder is not None, "a replay is recorded"
+        self._session, self._recorder, self._end_event = session, recorder, recorder.end_event
+        recorder.end_event = self._compared  # type: ignore[method-assign, assignment]
+        if self._first == 0 and self._on_first is not None:
+            self._on_first(self._session)
+
+    def _compared(self, stamp_ns: int, *event: int) -> None:
+        """Stand in for ``Recorder.end_event``: end the event, then see whether it was right."""
+        self._end_event(stamp_ns, *event)
+        chain_hash = self._recorder.chain_hash
+        if chain_hash == next(self._expected, None):
+            self.chain_hash = chain_hash
+            self.end_ns = stamp_ns
+            self.verified = verified = self.verified + 1
+            if verified == self._next_mark:
+                self._at_mark()
+        else:
+            self.diverged = not (self.is_last or self.interrupted)
+            self._end(DIVERGED)
+
+    def _at_mark(self) -> None:
+        if self.verified == self._first and self._on_first is not None:
+            self._on_first(self._session)
+            self._next_mark = self._limit
+        if self.verified == self._limit:
+            assert self._at_limit is not None
+            self.is_last = self._at_limit.reason == self._trace.result.get("stop_reason")
+            if self.is_last and self._limit < self._trace.event_count:
+                # It was between two steps, perhaps, and time had moved on.
+                loop = self._session.loop
+                loop.now_ns = max(loop.now_ns, self._trace.event(self._limit).stamp_ns)
+            self._end(self._at_limit, go_on=self.is_last)
+
+    @property
+    def interrupted(self) -> int:
+        """The exit status of a replay that somebody has interrupted, else 0."""
+        stopped = self._session.loop.stopped
+        if stopped is None or stopped is self.stop:
+            return 0
+        return stopped.exit_code if _INTERRUPTIONS.get(stopped.exit_code) == stopped.reason else 0
+
+    def _end(self, stop: Stop, *, go_on: bool = False) -> None:
+        """End the run. How its nodes then end is compared only if the trace has it: ``go_on``."""
+        if self.stop is None:
+            self.stop = stop
+            self._session.loop.stop(stop)
+        if not go_on:  # what follows is no part of the run: its nodes are told to end
+            self._session.world.domain.dispatcher.recorder = None
+
+    def _hashes(self) -> Iterator[int]:
+        for rows in self._trace.events():
+            yield from rows["chain_hash"].tolist()
+
+
+def _limit(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
+    """Return after how many events a replay ends by itself (-1: it does not), and why."""
+    count, found = trace.event_count, []
+    if until is not None and until < count:
+        found.append((until, Stop("as far as asked for")))
+    if (outside := _first_outside(trace, until)) is not None:
+        why = f"event {outside} was done by {_BY_DRIVER}, and no trace says how to do it again"
+        found.append((outside, Stop(why)))
+    if not trace.complete:
+        found.append((count, Stop("the trace was cut off there")))
+    elif (stop := _from_outside(trace)) is not None:
+        found.append((trace.ended_after or count, stop))
+    return min(found, key=lambda one: one[0], default=(-1, None))
+
+
+def _from_outside(trace: Trace) -> Stop | None:
+    """Return how somebody outside of the job ended the trace's run, if that is how it ended."""
+    reason, code = trace.result.get("stop_reason", ""), trace.result.get("exit_code", "")
+    if reason in _INTERRUPTIONS.values() and code in map(str, _INTERRUPTIONS):
+        return Stop(reason, int(code))
+    if reason.endswith(f"by {_BY_DRIVER}") or reason.startswith(_BY_DRIVER):
+        return Stop(reason, int(code) if code.isdecimal() else 0)
+    return None
+
+
+def _first_outside(trace: Trace, until: int | None) -> int | None:
+    """Return the first event that whoever drove a ``Simulation`` did."""
+    first = 0
+    for rows in trace.events(0, until):
+        if len(found := np.flatnonzero(rows["kind"] == EventKind.OUTSIDE)):
+            return first + int(found[0])
+        first += len(rows)
+    return None
