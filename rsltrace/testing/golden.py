@@ -113,6 +113,8 @@ def _write(run: Path, golden: Path) -> bool:
     from rsltrace.trace.reader import Trace
 
     with Trace.open(run) as actual:
+        if not actual.complete:
+            raise TraceError(f"{run} is cut: its run was killed, so it is no golden trace")
         digest = actual.digest
     try:
         with Trace.open(golden) as expected:

@@ -18,16 +18,20 @@ def whole_and_cut(path: Path, cut: Path, steps: int) -> list[int]:
         whole = list(bag.messages())
     data = path.read_bytes()
     counts = []
+    errors: list[str] = []
     for step in range(steps):
         cut.write_bytes(data[: len(data) * step // steps])
         try:
             with open_bag(cut, recover=True) as bag:
                 messages = list(bag.messages())
                 assert bag.notes, "what is missing is said"
-        except BagError:
+        except BagError as error:
             messages = []
+            errors.append(str(error))
         assert messages == whole[: len(messages)]
         counts.append(len(messages))
+    wrong = [error for error in errors if not error.startswith(f"{cut}: ")]
+    assert not wrong, "the user's file is named, not a copy of it"
     assert counts == sorted(counts), "more of the file never gives less"
     return counts
 

@@ -60,6 +60,18 @@ def test_the_report_is_the_message(tmp_path: Path) -> None:
     assert isinstance(caught.value, AssertionError)
 
 
+def test_a_cut_trace_matches_nothing_and_becomes_no_golden_one(tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(A.read_bytes()[:-300])
+    for run, golden in ((cut, A), (A, cut), (cut, cut)):
+        with pytest.raises(GoldenMismatch, match="agree as far as they go"):
+            assert_matches_golden(run, golden)
+    golden = tmp_path / "golden.mcap"
+    with pytest.raises(TraceError, match="is cut: its run was killed"):
+        assert_matches_golden(cut, golden, update=True)
+    assert not golden.exists()
+
+
 def test_update_writes_only_what_is_another_run(tmp_path: Path) -> None:
     golden = tmp_path / "new" / "golden.mcap"
     with pytest.raises(TraceError, match="there is no golden trace"):
