@@ -19,6 +19,7 @@ from rsltrace.errors import NodeError, ReplayError
 from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
+from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.replay.preparation import Preparation
@@ -88,14 +89,14 @@ def replay(
         begin = 0 if first is None else count_to(plan.trace, first) - 1
         if not as_json:
             for line in _told(plan):
-                click.echo(line, err=True)
+                tell(line)
         _agree(plan, trust=trust)
         result = _replayed(plan, count, max(begin, 0), output, force=force, quiet=quiet or as_json)
         reopen_standard_streams()
         status = result.exit_code
         try:
             if as_json:
-                click.echo(json.dumps(_values(result, plan)))
+                say(json.dumps(_values(result, plan)))
             else:
                 _print(result)
         except OSError as error:
@@ -117,7 +118,7 @@ def _agree(plan: Preparation, *, trust: bool) -> None:
             f"{name} would run code, and {why}: nothing was run; --trust runs it, if you know "
             "where the trace comes from"
         )
-    click.echo(f"{name} would run this code, and {why}.", err=True)
+    tell(f"{name} would run this code, and {why}.")
     if not click.confirm("Run it?", default=False, err=True):
         raise ReplayError("nothing was run")
 
@@ -196,21 +197,19 @@ def _print(result: ReplayResult) -> None:
     error = result.error
     if error is not None:
         if result.diverged and isinstance(error, NodeError) and error.traceback_text:
-            click.echo(error.traceback_text.rstrip(), err=True)
+            tell(error.traceback_text.rstrip())
         as_recorded = "" if result.diverged else ", as recorded"
-        click.echo(f"rsltrace: the run failed{as_recorded}: {error}", err=True)
+        tell(f"rsltrace: the run failed{as_recorded}: {error}")
     for note in result.notes:
-        click.echo(f"note: {note}", err=True)
+        tell(f"note: {note}")
     if result.path is not None:
-        click.echo(f"wrote {result.path}", err=True)
+        tell(f"wrote {result.path}")
     if result.diff is not None:
         print_diffs([result.diff], "text", DiffOptions(), None)
-        click.echo(f"\nnext: {_next(result)}")
+        say(f"\nnext: {_next(result)}")
         return
-    click.echo(result.sentence)
-    click.echo(
-        f"digest {result.digest}  events {result.verified}  sim {format_seconds(result.end_ns)}"
-    )
+    say(result.sentence)
+    say(f"digest {result.digest}  events {result.verified}  sim {format_seconds(result.end_ns)}")
 
 
 def _next(result: ReplayResult) -> str:
