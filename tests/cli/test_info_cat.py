@@ -32,6 +32,7 @@ from rsltrace.cli.text import table
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.model.printable import printable
+from rsltrace.trace.cdr import log_content
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -312,7 +313,7 @@ def hostile(path: Path) -> Path:
         log = log_message(0, 30, "n", escape)
         # A schema that does not fit: the log's text cannot be shown, the event can.
         channel = feeder.writer.add_channel("/rosout", "x/msg/Bad", "nonsense[")
-        feeder.output(OutputKind.LOG, rosout, log, feeder.payload(channel, 0, log))
+        feeder.output(OutputKind.LOG, rosout, log_content(log), feeder.payload(channel, 0, log))
         feeder.output(OutputKind.LOG, rosout, b"not kept")
         feeder.output(OutputKind.MESSAGE, topic, b"not kept")
         feeder.output(OutputKind.MESSAGE, 4_000_000_000, b"of nobody", NO_SEQUENCE)

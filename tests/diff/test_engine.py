@@ -94,7 +94,9 @@ def test_a_changed_output(tmp_path: Path) -> None:
     assert {view.entity.node for view in first.same_node_a} == {"/left"}
     assert [view.index for view in first.same_node_a] == [step(n, 1) for n in range(15, 20)]
     assert [(r.topic, r.after_ns) for r in first.reaches] == [("/l", 0), ("/s", 0)]
-    assert first.next_step.startswith("rsltrace record job.yaml --until 0.200000000 ")
+    # The job is not here: only what reads the trace is offered.
+    assert first.next_step.startswith("rsltrace cat ")
+    assert "--from 0.200000000 --to 0.200000000" in first.next_step
 
 
 def test_counts_per_entity(tmp_path: Path) -> None:
@@ -486,7 +488,7 @@ def test_options_in_the_shapes_that_come_to_mind(tmp_path: Path) -> None:
     pairs = compare(tmp_path, fault, topics=["/l"], absolute=[("data", 1.0)], ignore="none")
     mapping = compare(tmp_path, fault, topics="/l", absolute={"data": 1.0}, ignore=("none",))
     assert pairs == mapping
-    assert pairs.notes == ()
+    assert [note.partition(": ")[2] for note in pairs.notes] == ["its job job.yaml is not here"]
 
 
 def test_options_that_make_no_sense(tmp_path: Path) -> None:

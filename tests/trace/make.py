@@ -23,6 +23,7 @@ from rsltrace.model.event import (
     Output,
     OutputKind,
 )
+from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64, output_hash
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
@@ -304,7 +305,9 @@ def _feed(feeder: Feeder, events: int) -> None:
             feeder.output(OutputKind.REQUEST, client, request, sequence)
         if step % 7 == 0:
             log = log_message(stamp_ns, 20, "listener", f"received {value}")
-            feeder.output(OutputKind.LOG, rosout, log, feeder.payload(log_channel, stamp_ns, log))
+            feeder.output(
+                OutputKind.LOG, rosout, log_content(log), feeder.payload(log_channel, stamp_ns, log)
+            )
         received = feeder.event(
             EventKind.SUBSCRIPTION,
             subscription,
