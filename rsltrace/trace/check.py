@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.records import Damaged
+from rsltrace.mcap.records import MAGIC, Damaged
 from rsltrace.mcap.source import ByteSource
 from rsltrace.mcap.summary import check_data
+from rsltrace.mcap.walk import walk_records
 from rsltrace.trace.chain import hash64, verify_chain
 from rsltrace.trace.format import OUTPUT_DTYPE, OUTPUT_HASHED
 from rsltrace.trace.pieces import damaged
@@ -23,6 +24,18 @@ def check_data_section(source: ByteSource, summary_start: int) -> None:
     """Raise TraceError unless the bytes before the summary have the checksum given there."""
     try:
         check_data(source, summary_start)
+    except Damaged as error:
+        raise damaged(source, 0, "the data section", error) from error
+
+
+def check_records(source: ByteSource, summary_start: int) -> None:
+    """Raise TraceError unless the records before the summary follow each other without a gap.
+
+    A checksum may have been made for bytes that are no MCAP file.
+    """
+    try:
+        for _ in walk_records(source, len(MAGIC), summary_start):
+            pass
     except Damaged as error:
         raise damaged(source, 0, "the data section", error) from error
 

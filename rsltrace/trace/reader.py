@@ -27,7 +27,7 @@ from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.model.finding import Finding, GuardCount
 from rsltrace.trace.cdr import unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
-from rsltrace.trace.check import check_data_section, check_hashes
+from rsltrace.trace.check import check_data_section, check_hashes, check_records
 from rsltrace.trace.format import (
     ATTACHMENT_JOB,
     METADATA_ENVIRONMENT,
@@ -222,6 +222,8 @@ class Trace:
         An interrupted trace has no checksum over the file; its hashes are checked all the same.
         """
         self._check_data()
+        if self._index.summary_start:
+            check_records(self._source, self._index.summary_start)
         check_hashes(self._source, self._segments)
 
     def check_settings(self) -> None:
