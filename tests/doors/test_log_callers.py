@@ -56,6 +56,8 @@ def speak(logger):
             logger.info("wrong", nonsense=True)
         except TypeError as error:
             logger.info(str(error))
+    logger.info(b"bytes")
+    logger.info(None)
     rclpy.logging.get_logger("child").info("another logger")
 '''
 NODE = """
@@ -150,7 +152,7 @@ def test_rclpy_is_as_it_was_after_a_run(simulate: Any) -> None:
     assert rcutils_logger.CallerId is before
 
 
-@pytest.mark.parametrize("message", [["a list"], 3, None])
+@pytest.mark.parametrize("message", [["a list"], 3])
 def test_what_is_no_text_is_refused(simulate: Any, message: object) -> None:
     from rclpy.node import Node
 
@@ -161,7 +163,7 @@ def test_what_is_no_text_is_refused(simulate: Any, message: object) -> None:
             super().__init__("odd")
             try:
                 self.get_logger().info(message)
-            except (TypeError, ValueError, AssertionError) as error:
+            except TypeError as error:
                 refused.append(error)
 
     assert simulate(Odd, duration=0.1).logs() == []

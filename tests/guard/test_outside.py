@@ -80,6 +80,23 @@ def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
         assert {f.mode for found in trace.findings.values() for f in found} == {Mode.RECORD}
 
 
+def test_who_reads_code_asks_nothing_of_the_file_system(
+    go: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Python's and ROS's own modules look at source files, which is no finding; users are told."""
+    asks = (
+        "inspect.getsourcefile(type(self)); traceback.extract_stack(); self.get_logger().info('x')"
+    )
+    imports = "import inspect, os, traceback"
+    found: list[list[str]] = []
+    for number, code in enumerate((asks, "os.path.exists(__file__)")):
+        go(node_code(code, imports=imports), "{file: warn}", f"code{number}")
+        with Trace.open(tmp_path / f"code{number}.mcap") as trace:
+            found.append([f.call for each in trace.findings.values() for f in each])
+    assert found[0] == []
+    assert [call.partition("(")[0] for call in found[1]] == ["os.stat"] * len(found[1]) != []
+
+
 def test_files_and_environment_are_given_again(
     go: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

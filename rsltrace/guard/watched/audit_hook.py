@@ -28,6 +28,8 @@ _INSTALLED = (
     "/dev/tty",
 )
 READERS_OF_CODE = {"linecache", "tokenize", "inspect", "traceback", "zipimport", "pkgutil"}
+_BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
+"""By way of which others ask the file system."""
 
 _PROCESSES = {
     "subprocess.Popen": "subprocess.Popen",
@@ -98,7 +100,7 @@ _Wanted = tuple[Source, str, object] | None
 
 def _opened(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     path, mode, flags = arguments
-    if isinstance(path, int) or frame.f_globals.get("__name__") in READERS_OF_CODE:
+    if isinstance(path, int) or asking_module(frame) in READERS_OF_CODE:
         return None
     name = os.fsdecode(path)
     if name in ("/dev/urandom", "/dev/random"):
@@ -109,6 +111,15 @@ def _opened(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     if writing:
         return Source.FILE, f"open({name!r}, {mode or 'w'!r})", "written"
     return Source.FILE, f"open({name!r})", _content(name)
+
+
+def asking_module(frame: FrameType) -> str | None:
+    """Return the name of the module that asks the file system, be it by way of ``os.path``."""
+    name = frame.f_globals.get("__name__")
+    while name in _BETWEEN and frame.f_back is not None:
+        frame = frame.f_back
+        name = frame.f_globals.get("__name__")
+    return name
 
 
 def _content(name: str) -> str:

@@ -15,21 +15,24 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from types import BuiltinFunctionType, FrameType
+from types import BuiltinFunctionType
 from typing import Any
 
 from rsltrace.guard.addresses import is_by_address
 from rsltrace.guard.callers import user_frame
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.guard.watched.audit_hook import READERS_OF_CODE, is_installed, report_audit_events
+from rsltrace.guard.watched.audit_hook import (
+    READERS_OF_CODE,
+    asking_module,
+    is_installed,
+    report_audit_events,
+)
 from rsltrace.guard.watched.environment import environment_watched
 from rsltrace.model.finding import Mode, Source
 
 _NOT_NEWS = {"logging", "threading", *READERS_OF_CODE}
 """Modules that look at such things for records of their own."""
-
-_PATHS = ("genericpath", "posixpath")
 
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"
@@ -63,7 +66,7 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         if guard is None:
             return real(*arguments, **options)
         frame = sys._getframe(1)
-        if source is not Source.THREAD and _for(frame) in _NOT_NEWS:
+        if source is not Source.THREAD and asking_module(frame) in _NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
         if source is Source.FILE:
@@ -85,15 +88,6 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         return value
 
     return call
-
-
-def _for(frame: FrameType) -> str | None:
-    """Return the module that wants to know, which may ask by way of ``os.path``."""
-    name = frame.f_globals.get("__name__")
-    while name in _PATHS and frame.f_back is not None:
-        frame = frame.f_back
-        name = frame.f_globals.get("__name__")
-    return name
 
 
 def _told(value: Any) -> str:

@@ -77,9 +77,11 @@ class Logs:
         return node is not None
 
     def log(
-        self, severity: int, name: str, message: str, function: str, file: str, line: int
+        self, severity: int, name: str, message: Any, function: str, file: str, line: int
     ) -> None:
         """Take one record. Severity, name and message are hashed: line numbers are not news."""
+        if type(message) is not str:
+            message = _text(message)
         if not message.isascii():  # what no message can hold is shown and sent as an escape
             message = message.encode(errors="backslashreplace").decode()
         if " at 0x" in message:
@@ -120,3 +122,17 @@ class Logs:
         else:
             path = Path(path.name)
         return self._files.setdefault(file, str(path))
+
+
+def _text(message: object) -> str:
+    """Return what rclpy's extension makes of a message that is no text.
+
+    :raises TypeError: if it refuses it, too.
+    """
+    if isinstance(message, str):  # of a class of the user's
+        return str.__str__(message)
+    if message is None:
+        return "(null)"
+    if isinstance(message, bytes):
+        return message.decode(errors="backslashreplace")
+    raise TypeError(f"a log message is a str, not a {type(message).__qualname__}")
