@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.contents import check_contents
@@ -96,3 +99,24 @@ def test_what_cannot_be_read_is_told_with_the_file(
     with Trace.open(path) as trace, pytest.raises(TraceError, match=said) as raised:
         _ = trace.entities
     assert str(raised.value).startswith(f"{path}: ")
+
+
+def test_a_record_that_lies_about_its_length_under_right_checksums_is_found(
+    tmp_path: Path,
+) -> None:
+    """Reading goes by the summary and never meets it; other tools walk the file and do."""
+    with SAMPLE.open("rb") as file:
+        data = bytearray(file.read())
+    end = struct.unpack_from("<Q", data, len(data) - 8 - 20)[0]  # the footer: where the summary is
+    at = 8
+    while data[at] != Opcode.MESSAGE_INDEX:
+        at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
+    struct.pack_into("<Q", data, at + 1, 1 << 40)
+    struct.pack_into("<I", data, end - 4, zlib.crc32(data[: end - 13]))
+    path = tmp_path / "lies.mcap"
+    path.write_bytes(data)
+    with (
+        Trace.open(path) as trace,
+        pytest.raises(TraceError, match=f"record at byte {at} runs past the end"),
+    ):
+        trace.check()
