@@ -3,7 +3,8 @@
 #   make test   lint, types, architecture and tests
 # What takes long or needs a quiet machine has targets of its own, which CI runs, too:
 #   make test-native   comparisons with rclpy's own executors over DDS, in real time
-#   make test-long     long campaigns, and everything random with many more cases
+#   make test-long     long campaigns, planted faults in numbers, a hundred perturbed runs
+#   make test-random   property tests with many more examples (not in CI)
 #   make attack        hostile files, jobs, nodes, servers and disks, for an hour
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
@@ -15,7 +16,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-kilted attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
+.PHONY: demo test test-native test-long test-random test-kilted attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -60,9 +61,12 @@ unit: compiled
 test-native: compiled
 	$(BIN)/python -m pytest -m native $(PYTEST)
 
-LONG := HYPOTHESIS_PROFILE=long RSLTRACE_RUNS=100 RSLTRACE_PLANTED=40
 test-long: compiled
-	$(LONG) $(BIN)/python -m pytest -n auto --dist worksteal -m 'long or repeated or hypothesis' $(PYTEST)
+	RSLTRACE_RUNS=100 RSLTRACE_PLANTED=40 $(BIN)/python -m pytest -n auto --dist worksteal -m 'long or repeated' $(PYTEST)
+
+# Property tests with four hundred examples each: they look for what nobody has seen yet.
+test-random: compiled
+	HYPOTHESIS_PROFILE=long $(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis $(PYTEST)
 
 # The standing attack (tests/attack); what gave way is kept in out/attack with the line that repeats
 # it, beside the figures of the run: make attack ATTACK_MINUTES=5 ATTACK_SEED=1234
