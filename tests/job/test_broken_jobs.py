@@ -184,7 +184,7 @@ def message(text: str) -> str:
 
 def test_the_good_job_is_good() -> None:
     Path("job.yaml").write_text(GOOD, encoding="utf-8")
-    load_job("job.yaml")
+    assert load_job("job.yaml").nodes
 
 
 def test_every_mistake_is_told_as_written_down() -> None:

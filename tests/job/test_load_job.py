@@ -770,6 +770,12 @@ def test_aliases_cannot_blow_up_a_small_file() -> None:
     assert "repeat more than 10000 values" in message("\n".join(rows))
 
 
+def test_a_file_has_a_largest_number_of_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rsltrace.job.reading.yaml_source.VALUES_MAX", 50)
+    assert message(f"seed: [{'1, ' * 60}]").startswith("job.yaml:1:")
+    assert "more than 50 values" in message(f"seed: [{'1, ' * 60}]")
+
+
 def test_deep_nesting_is_an_error_not_a_crash() -> None:
     text = "\n".join(" " * depth + "a:" for depth in range(1000))
     assert message(text) == "job.yaml: the values are nested too deeply"

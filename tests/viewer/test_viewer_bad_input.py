@@ -196,6 +196,7 @@ def test_the_end_of_a_recording_is_shown_at_once(
         await wait(viewer, lambda: viewer.app._follow._not_before > 0)
         growing.write_bytes(data)
         await wait(viewer, lambda: session.a.trace.complete)
+        assert session.a.trace.event_count >= 20_000
 
     drive(growing, steps, follow=True)
 

@@ -178,7 +178,7 @@ class _Builder:
         key_place = None if key is None else Place(self.source, _mark(key))
         self.count += 1
         if self.count > VALUES_MAX:
-            raise place.error(f"more than {VALUES_MAX} values once aliases are followed")
+            raise place.error(f"more than {VALUES_MAX} values")
         if id(node) in self.seen:
             self._repeat(node)
         self.seen.add(id(node))
