@@ -21,6 +21,7 @@ from click.testing import CliRunner, Result
 from rsltrace_viewer.terminal.choose import ChooseApp, traces_in
 
 from rsltrace.cli.main import cli
+from rsltrace.trace.reader import Trace
 
 
 def view(*arguments: object) -> Result:
@@ -155,7 +156,8 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
         tmux("send-keys", "/", "kind:srv", "Enter")
         wait_for("srv", "/check")
         tmux("resize-window", "-x", "150", "-y", "40")
-        wait_for("digest 6aa85b69f4342806", "13/603")
+        with Trace.open(made) as trace:
+            wait_for(f"digest {trace.digest}", "13/603")
         assert tmux("display-message", "-p", "#{alternate_on}").strip() == "1"
         tmux("send-keys", "q")
         assert "Traceback" not in wait_for("left with 0")
