@@ -14,8 +14,8 @@ import click
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.cli.event_json import EventJson
-from rsltrace.cli.event_line import EventLines
+from rsltrace.cli.output.event_json import EventJson
+from rsltrace.cli.output.event_line import EventLines
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
 from rsltrace.terminal import line_writer, tell

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
-from rsltrace.cli.text import table
-from rsltrace.cli.text_file import write_text
+from rsltrace.cli.output.text import table
+from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
@@ -88,7 +88,7 @@ def check(
 
 
 def _draw(checked: Checked, path: Path) -> None:
-    from rsltrace.cli.graph_svg import graph_svg
+    from rsltrace.cli.output.graph_svg import graph_svg
 
     picture = graph_svg(checked.overview)
     write_text(path, picture)

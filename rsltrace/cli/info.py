@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 
 import click
 
-from rsltrace.cli.text import table
+from rsltrace.cli.output.text import table
 from rsltrace.model.built_in import is_built_in
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind

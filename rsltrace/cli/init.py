@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.text_file import undone
+from rsltrace.cli.output.text_file import undone
 from rsltrace.errors import BagError, OutputError
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import tell

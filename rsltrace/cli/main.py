@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 import click
 
 from rsltrace._version import __version__
-from rsltrace.cli.exit_status import open_standard_streams, status_of
+from rsltrace.cli.output.exit_status import open_standard_streams, status_of
 from rsltrace.guard.pin import pin_recording
 
 _COMMANDS = {

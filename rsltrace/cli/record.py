@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
+from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.errors import NodeError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.model.finding import Source

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.diff import print_diffs
-from rsltrace.cli.exit_status import reopen_standard_streams, status_without_output
+from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.record import interruptible, progress
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import NodeError, ReplayError

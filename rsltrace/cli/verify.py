@@ -189,7 +189,7 @@ def _verify(
         keep.mkdir(parents=True, exist_ok=True)
         for trace in sorted(folder.glob("*.mcap")):
             shutil.move(trace, keep / trace.name)
-    from rsltrace.cli.verify_text import as_text, as_values
+    from rsltrace.cli.output.verify_text import as_text, as_values
 
     again = [_again(given, perturbations, one.surroundings) for one in _two(result)]
     if as_json:

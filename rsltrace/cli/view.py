@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.text_file import write_text
+from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import OutputError, SetupError, TraceError
 from rsltrace.terminal import tell
 

@@ -15,7 +15,7 @@ from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.interface import MessageType
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
-from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
+from rsltrace.middleware.qos.policies import Durability, History, Liveliness, Qos, Reliability
 from rsltrace.middleware.transport import Transport
 from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.trace.chain import hash64

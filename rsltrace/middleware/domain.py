@@ -9,14 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rsltrace.loop.loop import EventLoop
-from rsltrace.middleware.dispatcher import Dispatcher
-from rsltrace.middleware.event import Door
-from rsltrace.middleware.failure import FailuresEndTheRun
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.events.event import Door
+from rsltrace.middleware.events.failure import FailuresEndTheRun
 from rsltrace.middleware.graph import Graph
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
-from rsltrace.middleware.qos import DEFAULT_QOS, Qos
+from rsltrace.middleware.qos.policies import DEFAULT_QOS, Qos
 from rsltrace.middleware.services import Client, Service
 from rsltrace.middleware.subscription import Subscription
 from rsltrace.middleware.timer import Timer

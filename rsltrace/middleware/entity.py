@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, Protocol
 
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.entity import Entity, EntityKind
 
 

@@ -12,7 +12,7 @@ from rsltrace.errors import UnsupportedError
 from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
-from rsltrace.middleware.qos import Qos, incompatible_policies
+from rsltrace.middleware.qos.policies import Qos, incompatible_policies
 from rsltrace.middleware.services import Client, Service
 from rsltrace.middleware.subscription import Subscription
 

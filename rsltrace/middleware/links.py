@@ -12,11 +12,11 @@ from typing import Any
 from rsltrace.chance.channel import LOST_BURST, LOST_DROP, LOST_OUTAGE, Channel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.loop.loop import ORDER_RELEASE, Release
-from rsltrace.middleware.dispatcher import Dispatcher
-from rsltrace.middleware.endpoint_status import MESSAGE_LOST
 from rsltrace.middleware.entity import DomainEntity
-from rsltrace.middleware.qos import INFINITE_NS, Qos, Reliability
-from rsltrace.middleware.qos_timing import RequestedLease, finite
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.qos.policies import INFINITE_NS, Qos, Reliability
+from rsltrace.middleware.qos.status import MESSAGE_LOST
+from rsltrace.middleware.qos.timing import RequestedLease, finite
 from rsltrace.middleware.quick_link import Send, direct_send, quick_send
 from rsltrace.middleware.receiver import Receiver
 from rsltrace.middleware.subscription import Delivery, Subscription

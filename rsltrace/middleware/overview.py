@@ -9,8 +9,8 @@ from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.graph import Graph
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
-from rsltrace.middleware.qos import Liveliness, incompatible_policies
-from rsltrace.middleware.qos_timing import finite
+from rsltrace.middleware.qos.policies import Liveliness, incompatible_policies
+from rsltrace.middleware.qos.timing import finite
 from rsltrace.middleware.subscription import Subscription
 from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
 from rsltrace.model.stamp import format_duration

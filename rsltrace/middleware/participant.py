@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Protocol
 
-from rsltrace.middleware.dispatcher import Dispatcher
 from rsltrace.middleware.entity import DomainEntity, callback_name
-from rsltrace.middleware.event import Door, State
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.events.event import Door, State
 from rsltrace.middleware.timer import Timer
 from rsltrace.model.entity import EntityKind
 

@@ -6,12 +6,12 @@ from bisect import insort
 from collections import deque
 from typing import Any
 
-from rsltrace.middleware.endpoint_status import EndpointEvents
 from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.interface import MessageType
 from rsltrace.middleware.links import Link
-from rsltrace.middleware.qos import Durability, Qos, Reliability
-from rsltrace.middleware.qos_timing import Offers, finite
+from rsltrace.middleware.qos.policies import Durability, Qos, Reliability
+from rsltrace.middleware.qos.status import EndpointEvents
+from rsltrace.middleware.qos.timing import Offers, finite
 from rsltrace.middleware.subscription import Delivery, Subscription
 from rsltrace.middleware.transport import Transport
 from rsltrace.model.entity import EntityKind

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from rsltrace.chance.distribution import Sampler
 from rsltrace.loop.loop import ORDER_RELEASE, Release
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.receiver import Receiver
 from rsltrace.middleware.subscription import Subscription
 from rsltrace.model.draw import Draw, encode_draw

@@ -12,9 +12,9 @@ from rsltrace.chance.distribution import Distribution, Sampler
 from rsltrace.chance.stream import Stream
 from rsltrace.loop.ordered import OrderedLoop, Place, Workers
 from rsltrace.loop.policy import Candidate, Policy
-from rsltrace.middleware.dispatcher import Dispatcher
 from rsltrace.middleware.entity import Runnable
-from rsltrace.middleware.event import OutsideEvent, Owner
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.events.event import OutsideEvent, Owner
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import EventKind
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.interface import MessageType, ServiceType
-from rsltrace.middleware.qos import Qos
+from rsltrace.middleware.qos.policies import Qos
 from rsltrace.middleware.receiver import Receiver
 from rsltrace.middleware.transport import Transport
 from rsltrace.model.entity import EntityKind

@@ -6,12 +6,12 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.middleware.dispatcher import Dispatcher
-from rsltrace.middleware.endpoint_status import EndpointEvents
 from rsltrace.middleware.entity import DomainEntity, callback_name
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.interface import MessageType
-from rsltrace.middleware.qos import Qos
-from rsltrace.middleware.qos_timing import Deadline, finite
+from rsltrace.middleware.qos.policies import Qos
+from rsltrace.middleware.qos.status import EndpointEvents
+from rsltrace.middleware.qos.timing import Deadline, finite
 from rsltrace.middleware.receiver import Receiver
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from rsltrace.loop.timer import TimerState
-from rsltrace.middleware.dispatcher import Dispatcher
 from rsltrace.middleware.entity import DomainEntity, callback_name
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.chain import hash64

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.interface import MessageType
 from rsltrace.middleware.links import Network
 

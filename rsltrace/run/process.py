@@ -19,7 +19,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.mcap.descriptor import Descriptor
 
 if TYPE_CHECKING:
-    from rsltrace.middleware.dispatcher import Dispatcher
+    from rsltrace.middleware.events.dispatcher import Dispatcher
 
 _PROGRESS_EVERY_EVENTS = 1_000
 _GC_EVERY_EVENTS = 10_000

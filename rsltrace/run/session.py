@@ -21,7 +21,7 @@ from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
-from rsltrace.middleware.census import Census
+from rsltrace.middleware.events.census import Census
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.inputs import check_output
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from rsltrace.chance.network import NetworkPlan
     from rsltrace.doors.rclpy.entry import Entry
     from rsltrace.doors.rclpy.world import World
-    from rsltrace.middleware.recorded_run import RecordedRun
+    from rsltrace.middleware.events.recorded_run import RecordedRun
 
 
 @dataclass(frozen=True, slots=True)

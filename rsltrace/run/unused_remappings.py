@@ -12,7 +12,7 @@ from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.census import Asker, Census
+from rsltrace.middleware.events.census import Asker, Census
 from rsltrace.run.plans.entries import entry_keys
 
 _USUAL = frozenset(("/tf", "/tf_static", "tf", "tf_static"))

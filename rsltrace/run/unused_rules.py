@@ -15,7 +15,7 @@ from rsltrace.doors.rclpy.parameters import Parameters
 from rsltrace.errors import did_you_mean
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
-from rsltrace.middleware.census import Census
+from rsltrace.middleware.events.census import Census
 from rsltrace.model.built_in import NODE_SERVICES
 from rsltrace.model.stamp import format_duration
 from rsltrace.run.plans.entries import entry_keys

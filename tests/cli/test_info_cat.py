@@ -28,7 +28,7 @@ from trace_maker import (
 )
 
 from rsltrace.cli.main import cli
-from rsltrace.cli.text import table
+from rsltrace.cli.output.text import table
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.model.printable import printable

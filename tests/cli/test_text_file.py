@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.cli.text_file import write_text
+from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import OutputError
 
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"

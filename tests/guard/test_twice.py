@@ -216,7 +216,7 @@ import sys
 from rsltrace import Trace, load_job, record
 
 record(load_job(sys.argv[1]), sys.argv[2])
-ours = sys.modules["rsltrace.middleware.dispatcher"]  # was loaded in the run, and stays
+ours = sys.modules["rsltrace.middleware.events.dispatcher"]  # was loaded in the run, and stays
 assert type(ours.__loader__).__module__ != "rsltrace.guard.virtual.set_order", "it is not user code"
 with Trace.open(sys.argv[2]) as trace:
     assert list(trace.metadata("rsltrace:sources")) == ["cold"], trace.metadata("rsltrace:sources")

@@ -218,7 +218,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.interface import MessageType
-from rsltrace.middleware.qos import DEFAULT_QOS, Durability
+from rsltrace.middleware.qos.policies import DEFAULT_QOS, Durability
 from dataclasses import replace
 
 loop = EventLoop(start_ns=0, timers=timer_queue("creation"))

@@ -181,7 +181,7 @@ def test_only_svg_is_drawn(command: Any, job_file: Callable[..., Path]) -> None:
 
 
 def test_a_graph_without_connections_is_drawn_too(job_file: Callable[..., Path]) -> None:
-    from rsltrace.cli.graph_svg import graph_svg
+    from rsltrace.cli.output.graph_svg import graph_svg
 
     code = "class Alone(Node):\n    def __init__(self):\n        super().__init__('alone')\n"
     overview = check_job(
@@ -213,7 +213,7 @@ class Waits(Node):
 
 def test_the_picture_of_a_graph_is_the_same_every_time(job_file: Callable[..., Path]) -> None:
     pytest.importorskip("fast_sugiyama")
-    from rsltrace.cli.graph_svg import graph_svg
+    from rsltrace.cli.output.graph_svg import graph_svg
 
     job = load_job(job_file(JOB, NODES))
     pictures = {graph_svg(check_job(job).overview) for _ in range(3)}

@@ -14,8 +14,8 @@ from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import RsltraceError, RunError
 from rsltrace.loop.loop import Dispatchable
 from rsltrace.loop.stop import Stop
-from rsltrace.middleware.event import OutsideEvent
-from rsltrace.middleware.failure import Raised, end_run, note_raised
+from rsltrace.middleware.events.event import OutsideEvent
+from rsltrace.middleware.events.failure import Raised, end_run, note_raised
 from rsltrace.model.event import EventKind
 
 _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import NoReturn
 
-from rsltrace.middleware.failure import text_of, user_traceback
+from rsltrace.middleware.events.failure import text_of, user_traceback
 from rsltrace.terminal import tell
 
 

@@ -41,7 +41,7 @@ from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.event import OutsideEvent
+from rsltrace.middleware.events.event import OutsideEvent
 from rsltrace.middleware.links import Network
 from rsltrace.middleware.scheduling import Scheduling, SchedulingPlan
 from rsltrace.model.event import EventKind

@@ -22,7 +22,7 @@ from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.middleware.domain import Domain
-    from rsltrace.middleware.recorded_run import RecordedRun
+    from rsltrace.middleware.events.recorded_run import RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
@@ -34,7 +34,7 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | No
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
-    from rsltrace.middleware.recorded_run import RecordedRun
+    from rsltrace.middleware.events.recorded_run import RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
         return None

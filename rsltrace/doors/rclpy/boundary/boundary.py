@@ -36,14 +36,14 @@ from rsltrace.doors.rclpy.node_clocks import NodeClocks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
-from rsltrace.middleware.endpoint_status import (
+from rsltrace.middleware.graph import Graph, names_and_types
+from rsltrace.middleware.publisher import Publisher
+from rsltrace.middleware.qos.status import (
     CountStatus,
     IncompatibleQosStatus,
     LivelinessChangedStatus,
     MatchedStatus,
 )
-from rsltrace.middleware.graph import Graph, names_and_types
-from rsltrace.middleware.publisher import Publisher
 from rsltrace.middleware.services import RequestId, ServiceInfo
 from rsltrace.middleware.subscription import Subscription
 

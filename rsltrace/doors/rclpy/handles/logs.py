@@ -11,7 +11,7 @@ from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.guard.addresses import text_with_address
 from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.qos import Durability, History, Liveliness, Qos, Reliability
+from rsltrace.middleware.qos.policies import Durability, History, Liveliness, Qos, Reliability
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_seconds
 from rsltrace.terminal import tell

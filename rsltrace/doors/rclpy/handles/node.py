@@ -17,8 +17,8 @@ from rsltrace.doors.rclpy.stacks.construction import policy_of
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import NodeError
-from rsltrace.middleware.census import Asker
 from rsltrace.middleware.entity import DomainEntity, callback_name
+from rsltrace.middleware.events.census import Asker
 from rsltrace.middleware.graph import Graph, action_names_and_types, names_and_types
 from rsltrace.middleware.participant import Participant, full_name
 

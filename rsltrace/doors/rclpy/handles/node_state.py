@@ -12,7 +12,7 @@ from typing import Any
 from rsltrace.guard.guard import engage
 from rsltrace.guard.state.hashing import UNCHANGING, StateHasher
 from rsltrace.guard.state.snapshot import Snapshots
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.finding import Policy
 from rsltrace.trace.chain import hash64
 

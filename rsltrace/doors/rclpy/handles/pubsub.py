@@ -15,7 +15,7 @@ from rsltrace.doors.rclpy.wire.interfaces import message_type
 from rsltrace.errors import UnsupportedError
 from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.publisher import Publisher
-from rsltrace.middleware.qos import Qos
+from rsltrace.middleware.qos.policies import Qos
 from rsltrace.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
 
 

@@ -10,7 +10,8 @@ from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
-from rsltrace.middleware.endpoint_status import (
+from rsltrace.middleware.entity import callback_name
+from rsltrace.middleware.qos.status import (
     DEADLINE_MISSED,
     INCOMPATIBLE,
     LIVELINESS_CHANGED,
@@ -19,7 +20,6 @@ from rsltrace.middleware.endpoint_status import (
     MESSAGE_LOST,
     EndpointEvents,
 )
-from rsltrace.middleware.entity import callback_name
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind
 

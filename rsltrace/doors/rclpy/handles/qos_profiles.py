@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.middleware.qos import (
+from rsltrace.middleware.qos.policies import (
     INFINITE_NS,
     Durability,
     History,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.middleware.event import Event, OutsideEvent
+from rsltrace.middleware.events.event import Event, OutsideEvent
 from rsltrace.model.finding import Policy
 
 

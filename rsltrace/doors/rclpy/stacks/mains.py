@@ -20,7 +20,7 @@ from rsltrace.doors.rclpy.stacks.runners import RunEnded, Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.threads import SimThread
 from rsltrace.loop.stop import Stop
-from rsltrace.middleware.failure import text_of
+from rsltrace.middleware.events.failure import text_of
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from greenlet import greenlet
 
 from rsltrace.doors.rclpy.entry import Entry
-from rsltrace.middleware.failure import Raised
+from rsltrace.middleware.events.failure import Raised
 from rsltrace.model.entity import Entity, EntityKind
 
 _FAILURES_MAX = 16

@@ -24,7 +24,7 @@ from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.redirect import Redirected
 from rsltrace.loop.stop import Stop
 from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.failure import Raised, is_own_frame, text_of, user_traceback
+from rsltrace.middleware.events.failure import Raised, is_own_frame, text_of, user_traceback
 
 _ENDING = frozenset((signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT))
 _TIMERS = (signal.ITIMER_REAL, signal.ITIMER_VIRTUAL, signal.ITIMER_PROF)

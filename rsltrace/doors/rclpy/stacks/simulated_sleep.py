@@ -18,7 +18,7 @@ from rsltrace.doors.rclpy.stacks.sim_event import SimEvent
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
-from rsltrace.middleware.event import Event
+from rsltrace.middleware.events.event import Event
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000

@@ -13,9 +13,9 @@ from typing import Any
 
 from rsltrace.errors import OutputError
 from rsltrace.loop.loop import Dispatchable, EventLoop
-from rsltrace.middleware.entity_book import EntityBook
-from rsltrace.middleware.event import Door, Event, OutsideEvent, Owner
-from rsltrace.middleware.outcome import Outcome
+from rsltrace.middleware.events.entity_book import EntityBook
+from rsltrace.middleware.events.event import Door, Event, OutsideEvent, Owner
+from rsltrace.middleware.events.outcome import Outcome
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder

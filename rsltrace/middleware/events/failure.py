@@ -15,7 +15,7 @@ from types import FrameType
 from rsltrace.errors import NodeError, RunError
 from rsltrace.loop.loop import Dispatchable
 from rsltrace.loop.stop import Stop
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.event import EventFlag, OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.chain import hash64

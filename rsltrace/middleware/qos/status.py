@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol
 
-from rsltrace.middleware.qos import PolicyKind
+from rsltrace.middleware.qos.policies import PolicyKind
 
 MATCHED = "matched"
 INCOMPATIBLE = "incompatible"

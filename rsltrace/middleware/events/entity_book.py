@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Protocol
 
-from rsltrace.middleware.census import Census
+from rsltrace.middleware.events.census import Census
 from rsltrace.model.entity import Entity
 from rsltrace.trace.recorder import Recorder
 

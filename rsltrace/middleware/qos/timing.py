@@ -8,13 +8,13 @@ What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` comp
 from __future__ import annotations
 
 from rsltrace.loop.loop import EventLoop
-from rsltrace.middleware.endpoint_status import (
+from rsltrace.middleware.qos.policies import INFINITE_NS, Liveliness, Qos
+from rsltrace.middleware.qos.status import (
     DEADLINE_MISSED,
     LIVELINESS_CHANGED,
     LIVELINESS_LOST,
     EndpointEvents,
 )
-from rsltrace.middleware.qos import INFINITE_NS, Liveliness, Qos
 
 
 class _Watch:

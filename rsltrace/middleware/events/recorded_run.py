@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from rsltrace.loop.loop import NOTHING_LEFT
 from rsltrace.loop.recorded import Recorded, RecordedEvent, event_text
 from rsltrace.loop.stop import Stop
-from rsltrace.middleware.dispatcher import Dispatcher
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.stamp import format_seconds
 
 

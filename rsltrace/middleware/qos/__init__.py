@@ -1,0 +1,1 @@
+"""Quality of service: who connects to whom, deadlines and liveliness, and what came of them."""
