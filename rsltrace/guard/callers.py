@@ -18,7 +18,7 @@ _LINES_MAX = 6
 
 _USER, _STANDARD, _LIBRARY, _OURS, _IMPORT = range(5)
 _DOOR = os.path.join(_HERE, "doors", "rclpy")
-_CALLS_BACK = os.path.join(_HERE, "middleware", "dispatcher.py")
+_CALLS_BACK = os.path.join(_HERE, "middleware", "events", "dispatcher.py")
 """The one of our files that calls callbacks; rclpy's own do, too."""
 _THREADS = os.path.join(_DOOR, "stacks", "threads.py")
 _STANDS_IN = os.path.join(_DOOR, "stacks", "asyncio_loops.py")

@@ -21,6 +21,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from rsltrace.guard.callers import is_user_file
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import tell
 
@@ -34,7 +35,6 @@ _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
 _JOIN_S = 1.0
-_DISPATCHER = os.path.join("rsltrace", "middleware", "dispatcher.py")
 _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", "/debugpy/")
 
 
@@ -127,8 +127,7 @@ def _frames(frame: FrameType | None) -> Iterator[FrameType]:
 
 
 def _is_execute(frame: FrameType) -> bool:
-    code = frame.f_code
-    return code.co_name == "execute" and code.co_filename.endswith(_DISPATCHER)
+    return frame.f_code is Dispatcher.execute.__code__
 
 
 def _place(frame: FrameType) -> str:
