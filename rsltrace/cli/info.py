@@ -47,8 +47,6 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
 
             opened.check()
             check_contents(opened)
-        else:
-            opened.check_settings()
         counts = count(opened)
         if as_json:
             say(json.dumps(_as_json(opened, counts), indent=2))

@@ -59,7 +59,6 @@ def prepared(
     if "://" in str(path):
         raise ReplayError(f"{path}: download a trace to replay it")
     with Trace.open(path) as trace:
-        trace.check_settings()  # chunks are checked as they are read, the events by the replay
         if trace.event_count == 0:
             raise ReplayError(f"{path} has no events to replay")
         if job is None:

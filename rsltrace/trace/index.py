@@ -19,6 +19,7 @@ from rsltrace.mcap.source import ByteSource
 from rsltrace.mcap.summary import Summary
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
+    CHECKSUMS_KEY,
     FORMAT_VERSION,
     METADATA_FORMAT,
     SEGMENT_DTYPE,
@@ -58,7 +59,8 @@ class ChunkEntry(NamedTuple):
 class TraceIndex:
     """Everything needed to find things in a trace. ``segments`` is SEGMENT_DTYPE, shape (n,).
 
-    ``summary_start`` is where the data section is over (0: nobody knows). ``chunks_with`` returns,
+    ``checksums``: its own metadata have some. ``summary_start`` is where the data section is over
+    (0: nobody knows). ``chunks_with`` returns,
     in file order, the chunks that hold messages of some channels: a long run has thousands, which
     only payloads need and opening does not. It may raise Damaged.
     """
@@ -69,6 +71,7 @@ class TraceIndex:
     message_counts: dict[int, int] = field(default_factory=dict)
     metadata: dict[str, Span] = field(default_factory=dict)
     attachments: dict[str, Span] = field(default_factory=dict)
+    checksums: bool = False
     summary_start: int = 0
     segments: npt.NDArray[np.void] = field(default_factory=lambda: np.zeros(0, SEGMENT_DTYPE))
     chunks_with: Callable[[frozenset[int]], list[ChunkEntry]] = lambda channels: []
@@ -148,7 +151,9 @@ def check_version(source: ByteSource, index: TraceIndex) -> None:
     """Raise TraceFormatError unless this is a trace of the format version that is read here."""
     if METADATA_FORMAT not in index.metadata:
         raise not_a_trace(source, index)
-    version = read_metadata(source, index.metadata[METADATA_FORMAT]).get("version", "")
+    found = read_metadata(source, index.metadata[METADATA_FORMAT])
+    version = found.get("version", "")
+    index.checksums = CHECKSUMS_KEY in found
     if version != str(FORMAT_VERSION):
         raise TraceFormatError(
             f"{source.name} has trace format {version or 'unknown'}, this rsltrace reads "

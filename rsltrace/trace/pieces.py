@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from binascii import crc32
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from itertools import chain
 
+import xxhash
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap import chunk, walk
+from rsltrace.mcap import chunk as mcap_chunk
+from rsltrace.mcap import walk
 from rsltrace.mcap.limits import CHUNK_BYTES_MAX
 from rsltrace.mcap.records import (
     MESSAGE,
@@ -20,6 +23,7 @@ from rsltrace.mcap.records import (
     records_in,
 )
 from rsltrace.mcap.source import ByteSource
+from rsltrace.trace.format import CHECKSUM_KEY
 
 _CRC_BYTES = 4
 _MESSAGE_BODY_MIN = MESSAGE_HEAD.size - RECORD_HEAD.size
@@ -46,7 +50,7 @@ def read_body(source: ByteSource, span: Span, opcode: int, what: str) -> bytes:
 def read_chunk(source: ByteSource, span: Span, size_max: int = CHUNK_BYTES_MAX) -> bytes:
     """Return the records of the chunk at ``span``, their CRC checked. Raises TraceError."""
     try:
-        return chunk.read_chunk(source, span, size_max)
+        return mcap_chunk.read_chunk(source, span, size_max)
     except Damaged as error:
         raise damaged(source, span.offset, "the chunk", error) from error
 
@@ -67,12 +71,27 @@ def read_attachment(source: ByteSource, span: Span) -> bytes:
         raise damaged(source, span.offset, "the attachment", error) from error
 
 
-def read_metadata(source: ByteSource, span: Span) -> dict[str, str]:
-    """Return the mapping of the metadata record at ``span``. Raises TraceError."""
+def metadata_checksum(name: str, mapping: Mapping[str, str]) -> str:
+    """Return the checksum of a metadata record: XXH3 of its name, keys and values, in hex.
+
+    A zero byte stands between them, and the keys are in their order.
+    """
+    texts = [name, *chain.from_iterable(sorted(mapping.items()))]
+    return xxhash.xxh3_64_hexdigest("\0".join(texts).encode())
+
+
+def read_metadata(source: ByteSource, span: Span, *, checked: bool = False) -> dict[str, str]:
+    """Return the mapping of the metadata record at ``span``, without the checksum it may have.
+
+    ``checked``: it must have one. Raises TraceError.
+    """
     fields = Fields(read_body(source, span, Opcode.METADATA, "the metadata"))
     try:
-        fields.text()
-        return fields.mapping()
+        name, mapping = fields.text(), fields.mapping()
+        said = mapping.pop(CHECKSUM_KEY, None)
+        if (checked or said is not None) and said != metadata_checksum(name, mapping):
+            raise Damaged(f"the checksum of {name!r} does not match")
+        return mapping
     except Damaged as error:
         raise damaged(source, span.offset, "the metadata", error) from error
 

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.limits import ENTITY_ID_MAX, RESPONSE_BYTES_MAX
+from rsltrace.mcap.limits import ENTITY_ID_MAX
 from rsltrace.mcap.place import open_source
 from rsltrace.mcap.records import Header
 from rsltrace.mcap.source import ByteSource
@@ -33,6 +33,7 @@ from rsltrace.trace.format import (
     METADATA_ENVIRONMENT,
     METADATA_GUARD,
     METADATA_JOB,
+    METADATA_OWN,
     METADATA_RESULT,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
@@ -92,8 +93,10 @@ class Trace:
                 ids.get(TOPIC_OUTPUTS, [0])[0],
             )
             self._payloads = PayloadReader(source, index)
-            self._data_checked = False
             self._decoders: Decoders | None = None
+            if not index.complete:  # a name may be damaged, too
+                for name in index.metadata:
+                    self.metadata(name)
             self._check_result()
         except BaseException:
             source.close()
@@ -209,7 +212,10 @@ class Trace:
     def metadata(self, name: str) -> dict[str, str]:
         """Return a metadata record, or an empty mapping if there is none of that name."""
         span = self._index.metadata.get(name)
-        return read_metadata(self._source, span) if span else {}
+        if span is None:
+            return {}
+        checked = self._index.checksums and name.startswith(METADATA_OWN)
+        return read_metadata(self._source, span, checked=checked)
 
     def attachment(self, name: str) -> bytes | None:
         """Return the bytes of an attachment, or None if there is none of that name."""
@@ -221,24 +227,10 @@ class Trace:
 
         An interrupted trace has no checksum over the file; its hashes are checked all the same.
         """
-        self._check_data()
         if self._index.summary_start:
+            check_data_section(self._source, self._index.summary_start)
             check_records(self._source, self._index.summary_start)
         check_hashes(self._source, self._segments)
-
-    def check_settings(self) -> None:
-        """Raise TraceError unless job, environment and sources are as they were recorded.
-
-        They are covered by the checksum of the file up to its summary, so this reads it. It does
-        nothing for an interrupted trace, which has none, and a large one at an address.
-        """
-        if not (self._source.is_remote and self.size > RESPONSE_BYTES_MAX):
-            self._check_data()
-
-    def _check_data(self) -> None:
-        if self._index.summary_start and not self._data_checked:
-            check_data_section(self._source, self._index.summary_start)
-            self._data_checked = True
 
     # Entities.
 

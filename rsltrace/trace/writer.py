@@ -30,6 +30,8 @@ from rsltrace.trace.cdr import pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
+    CHECKSUM_KEY,
+    CHECKSUMS_KEY,
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
     METADATA_ENVIRONMENT,
@@ -54,6 +56,7 @@ from rsltrace.trace.format import (
     TOPIC_OUTPUTS,
     TOPIC_STATES,
 )
+from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
 
 _HEADER_BYTES = MESSAGE_HEAD.size
@@ -114,7 +117,9 @@ class TraceWriter:
             progress=lambda: f"{self._events_written} events",
         )
         try:
-            self._stream.metadata(METADATA_FORMAT, {"version": str(FORMAT_VERSION)})
+            self.add_metadata(
+                METADATA_FORMAT, {"version": str(FORMAT_VERSION), CHECKSUMS_KEY: "xxh3"}
+            )
             self._event_channel = self._own_channel(TOPIC_EVENTS, SCHEMA_EVENT)
             self._output_channel = self._own_channel(TOPIC_OUTPUTS, SCHEMA_OUTPUT)
             self._entity_channel = self._own_channel(TOPIC_ENTITIES, SCHEMA_ENTITY)
@@ -163,7 +168,8 @@ class TraceWriter:
         """Write a metadata record, its keys sorted: equal mappings give equal bytes."""
         if name == METADATA_ENVIRONMENT:
             self._ros_distro = mapping.get("ros_distro", "")
-        self._stream.metadata(name, dict(sorted(mapping.items())))
+        checksum = metadata_checksum(name, mapping)
+        self._stream.metadata(name, dict(sorted({**mapping, CHECKSUM_KEY: checksum}.items())))
 
     def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
         """Write an attachment."""
@@ -255,7 +261,7 @@ class TraceWriter:
             self._write_entities()
             self._write_payloads()
             self._stream.attachment(ATTACHMENT_INDEX, SEGMENT_MEDIA_TYPE, b"".join(self._segments))
-            self._stream.metadata(METADATA_RESULT, self._result(result))
+            self.add_metadata(METADATA_RESULT, self._result(result))
             self._stream.metadata(METADATA_ROSBAG2, {KEY: self._bag_metadata()})
             self._stream.finish(replace=replace)
         finally:
@@ -350,7 +356,7 @@ class TraceWriter:
         del self._output_sequences[chunks.count_numbered(self._outputs) :]
 
     def _result(self, given: Mapping[str, str]) -> dict[str, str]:
-        result = {
+        return {
             "start_time": str(self._stream.start_ns),
             "end_time": str(self._stream.end_ns),
             **given,
@@ -359,7 +365,6 @@ class TraceWriter:
             "events": str(self._events_written),
             "outputs": str(self._outputs_written),
         }
-        return dict(sorted(result.items()))
 
     def _bag_metadata(self) -> str:
         topics = [

@@ -12,6 +12,7 @@ import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from io import BytesIO
+from itertools import chain
 
 import lz4.frame
 import xxhash
@@ -151,6 +152,13 @@ def _relocate(
         part.record = records.SummaryOffset(
             group_opcode=record.group_opcode, group_start=start, group_length=size
         )
+    elif part.opcode == Opcode.METADATA:
+        record = part.record
+        assert isinstance(record, records.Metadata)
+        if record.metadata.pop("checksum", None) is not None:
+            texts = [record.name, *chain.from_iterable(sorted(record.metadata.items()))]
+            record.metadata["checksum"] = xxhash.xxh3_64_hexdigest("\0".join(texts).encode())
+            part.record = record
     elif part.opcode == Opcode.ATTACHMENT and segments_in(part) is not None:
         rows = [list(row) for row in segments_in(part) or ()]
         for row in rows:

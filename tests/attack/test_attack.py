@@ -161,7 +161,7 @@ _SABOTAGE: dict[Wrong, str] = {
     Wrong.EXECUTED: "open('canary', 'w').write('x')",
     Wrong.SECRET: "print('password-of-mine')",
 }
-_TIGHT = Limits(cpu_s=0.5, rss_mib=200, wall_s=100)
+_TIGHT = Limits(cpu_s=2, rss_mib=200, wall_s=100)
 
 
 def _case(folder: Path) -> Case:

@@ -12,6 +12,8 @@ from trace_maker import Feeder, boundaries, opcodes, write_run
 
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import writer as writer_module
+from rsltrace.trace.format import METADATA_RESULT
+from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 
@@ -200,7 +202,18 @@ def test_a_digest_that_contradicts_the_events_is_an_error(
     text = feeder.digest.encode()
     assert data.count(text) == 1
     path = tmp_path / "damaged.mcap"
-    path.write_bytes(data.replace(text, b"0123456789abcdef"))
+    path.write_bytes(data)
+    with Trace.open(path) as trace:
+        result = trace.metadata(METADATA_RESULT)
+    wrong = data.replace(text, b"0123456789abcdef")
+    path.write_bytes(wrong)
+    with pytest.raises(TraceError, match=r"the checksum of 'rsltrace:result' does not match"):
+        Trace.open(path)
+    checksums = (
+        metadata_checksum(METADATA_RESULT, {**result, "digest": digest}).encode()
+        for digest in (result["digest"], "0123456789abcdef")
+    )
+    path.write_bytes(wrong.replace(*checksums))
     with pytest.raises(TraceError, match=r"contradicts itself.*0123456789abcdef"):
         Trace.open(path)
 

@@ -49,6 +49,10 @@ class Independent:
                 while at < end:
                     key, at = self.text(body, at)
                     self.metadata[name][key], at = self.text(body, at)
+                if name.startswith("rsltrace:"):
+                    said = self.metadata[name].pop("checksum")
+                    texts = [name, *sum(sorted(self.metadata[name].items()), ())]
+                    assert said == xxhash.xxh3_64_hexdigest("\0".join(texts).encode())
             position += 9 + length
 
     @staticmethod
@@ -107,7 +111,7 @@ def test_the_document_is_enough_to_read_a_trace(written: tuple) -> None:
     assert len(read.events) == len(feeder.events)
     assert len(read.outputs) == sum(map(len, feeder.outputs))
     assert read.payloads["/count"] == [(i, s, d) for i, (s, d) in enumerate(feeder.payloads[5])]
-    assert read.metadata["rsltrace:format"] == {"version": "1"}
+    assert read.metadata["rsltrace:format"] == {"version": "1", "checksums": "xxh3"}
     assert read.attachments["job.yaml"].startswith(b"nodes:")
     entities = []
     for _, stamp, message in read.payloads["/rsltrace/entities"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import struct
 import subprocess
 import sys
 import time
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
+from mcap.opcode import Opcode
 from trace_maker import Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import OutputError, TraceError
@@ -179,9 +181,33 @@ def test_info_and_diff_find_a_flipped_bit_of_the_settings(tmp_path: Path) -> Non
         result = CliRunner().invoke(cli, list(map(str, arguments)))
         assert result.exit_code == 2, result.output
         said = " ".join(result.output.split())
-        assert "damaged.mcap: the data section" in said, said
-        assert "its checksum does not match" in said, said
+        assert "damaged.mcap: the metadata" in said, said
+        assert "the checksum of 'rsltrace:environment' does not match" in said, said
     assert CliRunner().invoke(cli, ["diff", *map(str, runs)]).exit_code == 1
+
+
+def test_a_flipped_bit_in_the_metadata_of_a_cut_trace_is_found_wherever_it_is(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run.mcap"
+    write_run(path, 300)
+    data = path.read_bytes()
+    offsets = boundaries(data)
+    codes = list(opcodes(data, offsets))
+    cut_at = offsets[len(codes) - 1 - codes[::-1].index(Opcode.CHUNK)]
+    path.write_bytes(data[:cut_at])
+    with Trace.open(path) as trace:
+        assert not trace.complete
+        assert trace.environment["python"] == "3.12.3"
+    records = [at for at, code in zip(offsets, codes, strict=False) if code == Opcode.METADATA]
+    for record in (at for at in records if at < cut_at):
+        (length,) = struct.unpack_from("<Q", data, record + 1)
+        for at in range(record + 9, record + 9 + length):
+            damaged = bytearray(data[:cut_at])
+            damaged[at] ^= 0x01
+            path.write_bytes(damaged)
+            with pytest.raises(TraceError, match=r"damaged|no trace|not a trace|trace format"):
+                Trace.open(path).close()
 
 
 # -- interrupted, or damaged ----------------------------------------------------------------------

@@ -58,9 +58,6 @@ class _Comparison:
         self._run_b = Run(b, self._matching, of_b=True)
         self._job = job_settings(a, b)
         self._environment = environment_settings(a, b)
-        if self._job or self._environment:  # nothing is blamed that is a flipped bit
-            a.check_settings()
-            b.check_settings()
         self._notes = list(interruptions(a, b))
         self._counts = EventCounts()
         self._aligned_to = (start, start)

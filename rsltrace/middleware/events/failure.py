@@ -22,7 +22,7 @@ from rsltrace.trace.chain import hash64
 
 _RAISED = int(EventFlag.RAISED)
 _OWN_FILES = (
-    os.path.join(Path(__file__).resolve().parents[1], ""),
+    os.path.join(Path(__file__).resolve().parents[2], ""),  # this package
     "<serialize ",  # the code that is made for a message type
     "<deserialize ",
 )
