@@ -38,6 +38,7 @@ def audit_job(job: Job, executable: Executables) -> Audit:
     :raises JobError: if a node's module is not found.
     """
     names: dict[str, str] = {}
+    programs: set[str] = set()
     scripts = []
     targets: list[str | Path] = []
     for index, spec in enumerate(job.nodes):
@@ -45,13 +46,19 @@ def audit_job(job: Job, executable: Executables) -> Audit:
         target: str | Path = spec.target
         if spec.executable is not None:
             target = executable(spec.executable, where)
+        elif spec.script is not None:
+            target = job.resolve(spec.script)
+        elif spec.module is not None:
+            inside = f"{spec.module}.__main__"  # if it is a package
+            programs |= {spec.module, inside}
+            names.setdefault(inside, where)
         targets.append(target)
         if isinstance(target, Path):
             scripts.append(target)
         else:
             names.setdefault(module_of(target), where)
     folders = [job.resolve(folder).resolve() for folder in job.search_path]
-    collection, missing = collect_modules(list(names), scripts, folders)
+    collection, missing = collect_modules(list(names), scripts, folders, programs)
     for name in missing:
         parent = name.rpartition(".")[0]
         if parent and parent in collection.files:

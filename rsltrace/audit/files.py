@@ -8,6 +8,7 @@ import re
 import sys
 import tokenize
 from collections.abc import Iterator, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
 from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
@@ -121,10 +122,13 @@ def module_name(path: Path) -> str:
 
 
 def collect_modules(
-    names: Sequence[str], scripts: Sequence[Path], folders: Sequence[Path]
+    names: Sequence[str],
+    scripts: Sequence[Path],
+    folders: Sequence[Path],
+    programs: AbstractSet[str] = frozenset(),
 ) -> tuple[Collection, list[str]]:
     """Return modules by name, and what they import as far as it is the user's own; also the names
-    that were not found.
+    that were not found. ``programs`` are those that ``python -m`` runs.
 
     The user's own are modules below ``folders`` (no virtual environment there), and of an installed
     package those of the package itself.
@@ -156,7 +160,7 @@ def collect_modules(
         if file.suffix != ".py":
             found.notes.append(f"{name} is compiled ({file.name}): it cannot be looked at")
             continue
-        source = found.add(file, name)
+        source = found.add(file, name, as_script=name in programs)
         if source is not None:
             parents = [name.rsplit(".", up)[0] for up in range(1, name.count(".") + 1)]
             imports = [*parents, *sorted(source.module.imports)]

@@ -117,7 +117,12 @@ def _paths_exist(job: JobFields) -> Iterator[Problem]:
                 what = "is not a file" if path.exists() else "there is no such parameter file"
                 loc = ("nodes", index, "parameter_files", number)
                 yield Problem(f"{file!r}: {what}{_near(job, file)}", loc)
-    for place, file in job.model_files():
+    scripts = [
+        (("nodes", index, "script"), node.script)
+        for index, node in enumerate(job.nodes)
+        if node.script is not None
+    ]
+    for place, file in [*scripts, *job.model_files()]:
         path = job.resolve(file)
         if not path.is_file():
             what = "is not a file" if path.exists() else "there is no such file"

@@ -74,6 +74,12 @@ def _named_by(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path | No
     for spec in job.nodes:
         if spec.executable is not None:
             yield from _executable(spec.executable, folders)
+        elif spec.script is not None:
+            yield f"{_OF_FILES}{spec.script}", job.resolve(spec.script)
+        elif spec.module is not None:
+            inside = f"{spec.module}.__main__"
+            file = file_of(inside, folders)
+            yield (spec.module, file_of(spec.module, folders)) if file is None else (inside, file)
     for launch in job.launch:
         yield launch.file, job.resolve(launch.file)
 

@@ -6,7 +6,6 @@ used, but only of a job whose modules use such libraries: any other has the same
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable
 from types import ModuleType
@@ -39,7 +38,7 @@ def numerical_libraries(job: Job) -> str:
 def _modules(job: Job) -> Iterable[ModuleType]:
     """Return the loaded modules that are the user's: in the search path, or a node's package."""
     names = set(user_modules([str(job.resolve(folder)) for folder in job.search_path]))
-    packages = {re.split("[:./]", spec.target)[0] for spec in job.nodes}
+    packages = {spec.package for spec in job.nodes} - {""}
     names |= {name for name in sys.modules if name.partition(".")[0] in packages}
     return [sys.modules[name] for name in sorted(names)]
 

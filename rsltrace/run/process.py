@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib.util
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -170,16 +172,38 @@ def user_modules(folders: list[str]) -> dict[str, Path]:
     is rsltrace: which of its modules are loaded depends on what was done before.
     An episode of a ``Simulation`` asks more than once, of some thousand modules: these are texts.
     """
-    below = tuple(os.path.join(folder, "") for folder in folders)
+    below = _below(folders)
     found: dict[str, Path] = {}
     for name, module in sorted(sys.modules.items()):
         file = getattr(module, "__file__", None)
-        if not isinstance(file, str) or is_own(name):
-            continue
-        path = os.path.normpath(file)
-        if path.startswith(below) and _INSTALLED.isdisjoint(path.split(os.sep)):
+        if isinstance(file, str) and not is_own(name) and _is_below(file, below):
             found[name] = Path(file)
     return found
+
+
+def is_below(file: str, folders: Sequence[str]) -> bool:
+    """Whether a file lies in one of ``folders`` and is not installed there."""
+    return _is_below(file, _below(folders))
+
+
+def _below(folders: Sequence[str]) -> tuple[str, ...]:
+    return tuple(os.path.join(folder, "") for folder in folders)
+
+
+def _is_below(file: str, below: tuple[str, ...]) -> bool:
+    path = os.path.normpath(file)
+    return path.startswith(below) and _INSTALLED.isdisjoint(path.split(os.sep))
+
+
+def run_as_main(name: str) -> ModuleSpec | None:
+    """Return what ``python -m name`` runs: the module, or the ``__main__`` of a package.
+
+    The packages that it is in are imported, which may raise whatever they do.
+    """
+    spec = importlib.util.find_spec(name)
+    if spec is not None and spec.submodule_search_locations is not None:
+        spec = importlib.util.find_spec(f"{name}.__main__")
+    return spec
 
 
 def is_of_pytest(name: str) -> bool:

@@ -7,7 +7,7 @@ import importlib.metadata
 import json
 import os
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
@@ -17,7 +17,7 @@ from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
 from rsltrace.run.numerical_libraries import numerical_libraries
-from rsltrace.run.process import is_of_pytest, user_modules
+from rsltrace.run.process import is_below, is_of_pytest, run_as_main, user_modules
 from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
 from rsltrace.trace.writer import TraceWriter
 
@@ -51,7 +51,7 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def sources(job: Job) -> dict[str, str]:
     """Return a hash of the code of every module loaded from the job's search path, by name; and of
-    the files that its models come from (``file:`` and the path in the job).
+    its scripts and the files that its models come from (``file:`` and the path in the job).
 
     Which tests run beside it says nothing of a job, unless its nodes are theirs.
     """
@@ -62,10 +62,22 @@ def sources(job: Job) -> dict[str, str]:
         for name, path in user_modules(folders).items()
         if name in of_nodes or not is_of_pytest(name)
     }
+    modules.update(_run_as_main(job, folders))
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
     return {
         name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in modules.items()
     }
+
+
+def _run_as_main(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path]]:
+    """Yield the files of a job that run as ``__main__`` and are no loaded modules."""
+    for spec in job.nodes:
+        if spec.script is not None:
+            yield f"file:{spec.script}", job.resolve(spec.script)
+        elif spec.module is not None:
+            found = run_as_main(spec.module)
+            if found is not None and is_below(found.origin or "", folders):
+                yield found.name, Path(found.origin or "")
 
 
 def _module_of(target: Target | None) -> str:

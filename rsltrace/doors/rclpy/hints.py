@@ -74,7 +74,7 @@ def import_raised(module: str, error: BaseException, said: str) -> str:
     if isinstance(error, SystemExit):
         hint = (
             "; what a module does when it is imported should be definitions: put the rest into a "
-            "function (and name that with 'main:')"
+            "function (and name that with 'main:'), or run it as a program ('script:', 'module:')"
         )
     shown = f" ({place})\n    {line.strip()}" if place else ""
     return f"module {module!r} cannot be imported: it raised {said}{hint}{shown}"

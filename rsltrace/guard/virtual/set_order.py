@@ -203,6 +203,18 @@ def rewritten(source: bytes, path: str) -> CodeType:
     return code
 
 
+def code_of_script(source: bytes, path: str) -> CodeType:
+    """Return the code of a program that is not imported, with sets in order while a guard sees to
+    that.
+
+    :raises SyntaxError, ValueError: if it is not Python.
+    """
+    if any(type(finder) is _Finder for finder in sys.meta_path):
+        return rewritten(source, path)
+    code: CodeType = compile(source, path, "exec", dont_inherit=True)
+    return code
+
+
 class _Loader(importlib.machinery.SourceFileLoader):
     def get_code(self, fullname: str) -> CodeType | None:
         path = self.get_filename(fullname)

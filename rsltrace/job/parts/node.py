@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -13,6 +14,7 @@ from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import attach, check, items, one_of, text
 from rsltrace.job.values.names import (
     check_executable,
+    check_module,
     check_namespace,
     check_node_name,
     check_remap_from,
@@ -51,7 +53,7 @@ def _check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:
     if not isinstance(value, dict):
         raise Problem(
             "expected a mapping of argument names to values (node:) or a list of command-line "
-            f"words (main:, executable:), got {describe(value)}"
+            f"words (main:, executable:, script:, module:), got {describe(value)}"
         )
     for name in value:
         if not isinstance(name, str) or not name.isidentifier():
@@ -86,6 +88,11 @@ def _check_executable(value: object) -> str:
     return text(check_executable)(value)
 
 
+def _check_module(value: object) -> str:
+    return text(check_module)(value)
+
+
+attach(_check_module, schema={"type": "string", "pattern": check_module.pattern})  # type: ignore[attr-defined]
 attach(_check_executable, schema={"type": "string", "pattern": check_executable.pattern})  # type: ignore[attr-defined]
 
 
@@ -102,8 +109,10 @@ def _plain_floats(value: object) -> object:
     return value
 
 
-_KINDS = ("node", "main", "executable")
+_KINDS = ("node", "main", "executable", "script", "module")
 """What an entry may be."""
+_ONE_OF = f"{', '.join(map(repr, _KINDS[:-1]))} and {_KINDS[-1]!r}"
+_WITH_WORDS = ", ".join(f"'{kind}'" for kind in _KINDS[1:])
 
 _NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
 attach(
@@ -125,13 +134,14 @@ attach(
 
 
 class NodeSpec(Part):
-    """One entry of ``nodes:``: one of ``node``, ``main`` and ``executable``.
+    """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``.
 
     ``node`` is a Node subclass or a function returning a node or a list of nodes, ``main`` a
     function that initializes rclpy, makes nodes and spins, ``executable`` (``package/name``) an
-    installed one. ``arguments`` are keyword arguments of a ``node``, and command-line words (a
-    list) of the other two. ``parameters`` are flat (dotted names); paths are relative to the job's
-    folder.
+    installed one, ``script`` a file to run as ``python script.py`` does, ``module`` one to run as
+    ``python -m module`` does. ``arguments`` are keyword arguments of a ``node``, and command-line
+    words (a list) of the others. ``parameters`` are flat (dotted names); paths are relative to the
+    job's folder.
     """
 
     ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
@@ -139,6 +149,8 @@ class NodeSpec(Part):
     @staticmethod
     def meant_key(word: str) -> str:
         """Return the key that text in place of an entry was meant for."""
+        if word.endswith(".py"):
+            return "script"
         return "executable" if "/" in word and ":" not in word else "node"
 
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
@@ -158,6 +170,17 @@ class NodeSpec(Part):
         description="Instead of `node`: an installed Python executable, as `ros2 run` would start "
         "it, as `package/name`.",
         examples=["demo_nodes_py/talker"],
+    )
+    script: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a Python file, run as `python script.py` runs it.",
+        examples=["scripts/talker.py"],
+    )
+    module: Annotated[str | None, check(_check_module, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a module (or package), run as `python -m module` runs it. "
+        "Looked for in `search_path`.",
+        examples=["my_robot.talker"],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
         default=None,
@@ -185,8 +208,7 @@ class NodeSpec(Part):
     )
     arguments: Annotated[dict[str, Any] | tuple[str, ...], check(_check_arguments)] = Field(
         default_factory=dict,
-        description="Keyword arguments of a `node`; a list of command-line words of a `main` or "
-        "an `executable`.",
+        description="Keyword arguments of a `node`; a list of command-line words of all others.",
         examples=[{"robots": 3}, ["--rate", 10]],
     )
     on_exception: Annotated[Literal["stop", "log"], check(one_of("stop", "log"))] = Field(
@@ -215,6 +237,8 @@ class NodeSpec(Part):
             node: Target | None = None,
             main: Target | None = None,
             executable: str | None = None,
+            script: str | os.PathLike[str] | None = None,
+            module: str | None = None,
             name: str | None = None,
             namespace: str | None = None,
             parameters: dict[str, Any] = ...,
@@ -230,11 +254,10 @@ class NodeSpec(Part):
     def _check_kind(self) -> NodeSpec:
         kinds = [name for name in _KINDS if getattr(self, name) is not None]
         if not kinds:
-            raise Problem("missing key: give one of 'node', 'main' and 'executable'")
+            raise Problem(f"missing key: give one of {_ONE_OF}")
         if len(kinds) > 1:
             raise Problem(
-                f"'{kinds[0]}' says what to run already: give only one of 'node', 'main' and "
-                "'executable'",
+                f"'{kinds[0]}' says what to run already: give only one of {_ONE_OF}",
                 (kinds[1],),
                 at_key=True,
             )
@@ -246,7 +269,7 @@ class NodeSpec(Part):
         if self.node is not None and isinstance(self.arguments, tuple):
             raise Problem(
                 "a node takes arguments by name (a mapping); a list of command-line words is for "
-                "'main' and 'executable'",
+                f"{_WITH_WORDS}",
                 ("arguments",),
             )
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
@@ -258,15 +281,20 @@ class NodeSpec(Part):
 
     @property
     def kind(self) -> str:
-        """Which of ``node``, ``main`` and ``executable`` the entry is."""
+        """Which of ``node``, ``main``, ``executable``, ``script`` and ``module`` the entry is."""
         return next(name for name in _KINDS if getattr(self, name) is not None)
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """The other two of ``node``, ``main`` and ``executable``."""
+        """The keys that stand for other kinds of entries."""
         return tuple(name for name in _KINDS if name != self.kind)
 
     @property
     def target(self) -> str:
-        """What is run: ``module:attribute``, or ``package/name`` of an executable."""
+        """What is run: ``module:attribute``, ``package/name``, a file, or a module."""
         return target_text(getattr(self, self.kind))
+
+    @property
+    def package(self) -> str:
+        """The package that the entry names (or the module that is in none), "" for a script."""
+        return "" if self.script is not None else re.split("[:./]", self.target)[0]

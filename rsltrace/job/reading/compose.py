@@ -28,7 +28,7 @@ from rsltrace.job.values.paths import check_path, near_path
 from rsltrace.job.values.problem import Collected, Loc, Problem, describe
 
 DEPTH_MAX = 20
-_WHAT = frozenset(("node", "main", "executable", "launch"))
+_WHAT = frozenset(("node", "main", "executable", "script", "module", "launch"))
 """Keys that say what an entry of ``nodes`` is; without one it changes another file's entry."""
 
 

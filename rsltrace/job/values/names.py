@@ -27,6 +27,7 @@ _REMAP_TO = re.compile(_RULE_NAME, re.ASCII)
 
 _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
+_MODULE_NAME = re.compile(_MODULE)
 _EXECUTABLE = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", re.ASCII)
 
 
@@ -99,6 +100,15 @@ def check_executable(name: str) -> None:
         raise ValueError(f"expected package/executable (as ros2 run has them), got {name!r}")
 
 
+def check_module(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` looks like ``package.module``."""
+    if not _MODULE_NAME.fullmatch(name) or name.endswith(".py"):
+        path = name.partition(":")[0]
+        hint = f"; a file is named by 'script: {name}'" if path.endswith(".py") else ""
+        hint = hint or (f"; a function is named by 'main: {name}'" if ":" in name else "")
+        raise ValueError(f"expected package.module (as in python -m), got {name!r}{hint}")
+
+
 def check_variable(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` can be a variable of a job."""
     if not _VARIABLE.fullmatch(name):
@@ -160,6 +170,7 @@ _PATTERNS: tuple[tuple[Any, str], ...] = (
     (check_field_path, r"^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*$"),
     (check_target, r"^[^\s:]+:[^\s:]+$"),
     (check_executable, r"^[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+$"),
+    (check_module, r"^[^\s:./]+(\.[^\s:./]+)*$"),
     (check_remap_from, r"^[A-Za-z0-9_~/:]+$"),
     (check_remap_to, r"^[A-Za-z0-9_~/]+$"),
     (check_glob, r"^[/*?\[]"),

@@ -25,7 +25,7 @@ _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 def node_entries(job: Job) -> list[Entry]:
     """Import what the job names and let rcl parse the arguments, before anything is constructed."""
     entries = []
-    mains = Mains()
+    mains = Mains(job)
     for_all = _arguments_for_all(job)
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         loc = ("nodes", index, spec.kind)

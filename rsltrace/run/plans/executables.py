@@ -1,4 +1,4 @@
-"""Finding what ``main:`` and ``executable:`` name: the function that ``ros2 run`` would run.
+"""Finding what ``main:``, ``executable:``, ``script:`` and ``module:`` name: what runs it.
 
 An executable is a console script of a Python distribution, or a Python script that a ROS package
 has installed (``lib/<package>/<executable>`` below a prefix of the ament index). Both run as they
@@ -11,14 +11,14 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext
-from functools import partial
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
 from rsltrace.errors import JobError, nearest
-from rsltrace.job import NodeSpec
+from rsltrace.job import Job, NodeSpec
+from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
 
 _ELF = b"\x7fELF"
@@ -27,7 +27,8 @@ _ELF = b"\x7fELF"
 class Mains:
     """Finds the mains of a job. Each has the globals of its package to itself, as a process has."""
 
-    def __init__(self) -> None:
+    def __init__(self, job: Job) -> None:
+        self._job = job
         self._packages: set[str] = set()
 
     def find(self, spec: NodeSpec, *, where: str) -> tuple[str, Callable[[], object]]:
@@ -42,6 +43,13 @@ class Mains:
                 with _command_line(name, spec):
                     return name, self._load(found, where)
             return name, found
+        if spec.script is not None:
+            script = script_program(self._job.resolve(spec.script), what=spec.script, where=where)
+            return str(script.path), script
+        if spec.module is not None:
+            with _command_line(spec.module, spec), self._copied(spec.package):
+                program = module_program(spec.module, self._job.base_dir, where=where)
+            return str(program.path), program
         assert spec.main is not None
         if isinstance(spec.main, str):
             name = spec.main.partition(":")[0].rpartition(".")[2]
@@ -50,12 +58,15 @@ class Mains:
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
-        package = re.split("[.:]", target)[0]
-        again = package in self._packages
-        self._packages.add(package)
-        with _own_copy(package) if again else nullcontext():
+        with self._copied(re.split("[.:]", target)[0]):
             function: Callable[[], object] = load_target(target, where=where)
         return function
+
+    def _copied(self, package: str) -> AbstractContextManager[None]:
+        """Let a package be imported once more if somebody else has it already."""
+        again = package in self._packages
+        self._packages.add(package)
+        return _own_copy(package) if again else nullcontext()
 
 
 @contextmanager
@@ -121,7 +132,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         return scripts[name]
     files = _installed_files(package)
     if name in files:
-        return partial(_run_script, _python_script(files[name], target, where), files[name])
+        return _python_script(files[name], target, where)
     known = _packages()
     if not scripts and not files and package not in known:
         raise JobError(
@@ -185,37 +196,24 @@ def _near(name: str, names: Iterable[str]) -> str:
     return f"; did you mean {near!r}?" if near not in (None, name) else ""
 
 
-def _python_script(path: Path, target: str, where: str) -> str:
-    """Return the text of a Python script.
+def _python_script(path: Path, target: str, where: str) -> MainProgram:
+    """Return a Python script to run.
 
     :raises JobError: if it is something else.
     """
-    data = path.read_bytes()
-    first = data.split(b"\n", 1)[0]
-    if data.startswith(_ELF):
+    with path.open("rb") as file:
+        first = file.readline(256)
+    if first.startswith(_ELF):
         what = "a compiled program"
     elif first.startswith(b"#!") and b"python" not in first:
         what = f"a script for {first[2:].decode(errors='replace').strip()}"
     else:
-        try:
-            compile(data, str(path), "exec", dont_inherit=True)
-            return data.decode()
-        except (SyntaxError, ValueError) as error:
-            what = f"not a Python program ({error})"
+        return script_program(path, what=target, where=where)
     raise JobError(
         f"{target} is {what} ({path.name}): rsltrace runs Python nodes only; leave it out, or feed "
         "the graph what it publishes from a bag",
         where=where,
     )
-
-
-def _run_script(text: str, path: Path) -> None:
-    """Run a script as ``python script`` would, in a module of its own."""
-    folder = str(path.parent)
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    code = compile(text, str(path), "exec", dont_inherit=True)
-    exec(code, {"__name__": "__main__", "__file__": str(path), "__builtins__": __builtins__})
 
 
 __all__ = ["Mains", "find_executable", "source_of"]

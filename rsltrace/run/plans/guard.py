@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import re
 import sys
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
@@ -142,7 +141,4 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
 
 
 def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
-    return frozenset(re.split("[:./]", spec.target)[0] for spec in nodes) - {
-        "rsltrace",
-        "rclpy",
-    }
+    return frozenset(spec.package for spec in nodes) - {"", "rsltrace", "rclpy"}

@@ -1,16 +1,19 @@
 """One executable of a job: its ``main``, and what a process of its own would have.
 
 All mains of a job run in one process. What rclpy and Python keep per process (the default context,
-the global executor, ``sys.argv``) is exchanged whenever the loop goes over to another main, so each
-finds its own. The nodes that the job itself constructs share one program, the host.
+the global executor, ``sys.argv``, ``sys.path``, the module ``__main__``) is exchanged whenever the
+loop goes over to another main, so each finds its own. The nodes that the job itself constructs
+share one program, the host.
 """
 
 from __future__ import annotations
 
+import builtins
 import sys
 from collections import deque
 from collections.abc import Callable
 from functools import lru_cache
+from types import ModuleType
 from typing import Any, Protocol
 
 from greenlet import greenlet
@@ -102,9 +105,16 @@ class Program:
         before._kept = [names[name] for names, name, _ in places]
         if self._kept is None:
             self._kept = [first for _, _, first in places]
-            self._kept[0] = None if self.entry is None else self.entry.argv
+            self._kept[:3] = self._first_values()
         for (names, name, _), value in zip(places, self._kept, strict=True):
             names[name] = value
+
+    def _first_values(self) -> tuple[object, ...]:
+        """Return what a process begins with: its arguments, its ``__main__``, where it imports."""
+        argv = None if self.entry is None else self.entry.argv
+        main = ModuleType("__main__")
+        vars(main).update(__builtins__=builtins, __annotations__={})
+        return argv, main, list(sys.path)
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -129,14 +139,16 @@ class Program:
 
 
 @lru_cache(maxsize=1)
-def _places() -> list[tuple[dict[str, object], str, object]]:
-    """Return where process-wide values are kept, and their first values."""
+def _places() -> list[tuple[dict[str, Any], str, object]]:
+    """Return where process-wide values are kept, and their first values (None: a program's own)."""
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
     return [
-        (vars(sys), "argv", []),
+        (vars(sys), "argv", None),
+        (sys.modules, "__main__", None),
+        (vars(sys), "path", None),
         (vars(rclpy), "__executor", None),
         (vars(rclpy.utilities), "g_default_context", None),
         (vars(rclpy.context), "g_logging_ref_count", 0),
