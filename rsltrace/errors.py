@@ -8,6 +8,7 @@
     │   ├── TraceFormatError         2  not a trace, or one of another format version
     │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
     ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
+    ├── ConditionError               2  where to stop, or what to evaluate, cannot be understood
     └── RunError                     3  the run itself went wrong; the trace up to there is complete
         ├── NodeError                3  a node's constructor or callback raised
         ├── LivelockError            3  events without end while simulated time stands still
@@ -73,6 +74,23 @@ class ReplayError(TraceError):
 
 class OutputError(RsltraceError):
     """The trace cannot be written."""
+
+
+class ConditionError(RsltraceError):
+    """A breakpoint's condition, or an expression, that cannot be understood or not be evaluated.
+
+    ``text`` is what was typed, ``start`` and ``end`` say which characters of it are meant. The
+    message shows them.
+    """
+
+    def __init__(self, message: str, text: str, start: int = 0, end: int | None = None) -> None:
+        self.message = message
+        self.text = text
+        self.start = min(start, len(text))
+        self.end = max(len(text) if end is None else min(end, len(text)), self.start + 1)
+        shown = "".join(c if c.isprintable() else "?" for c in text)
+        carets = "^" * (self.end - self.start)
+        super().__init__(f"{message}\n  {shown}\n  {' ' * self.start}{carets}")
 
 
 class RunError(RsltraceError):

@@ -16,17 +16,12 @@ import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.cli.output.event_line import EventLines
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
 from rsltrace.terminal import line_writer, tell
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.times import parse_stamp
-
-_TOPIC_KINDS = frozenset(
-    (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
-)
-
 
 if TYPE_CHECKING:
     _IntParam = click.ParamType[int]
@@ -155,7 +150,7 @@ def _choice(
         _warn_if_none(named, "entity", entities, everything)
         wanted = named if wanted is None else wanted & named
     if topics:
-        with_topic = [e for e in everything if e.kind in _TOPIC_KINDS]
+        with_topic = [e for e in everything if e.kind in WITH_TOPIC]
         on_topic = {e.id for e in with_topic if _any(e.name, topics)}
         _warn_if_none(on_topic, "topic or service", topics, with_topic)
         touching = np.array(sorted(on_topic), dtype=np.uint32)

@@ -30,6 +30,12 @@ class EntityKind(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+WITH_TOPIC = frozenset(
+    (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
+)
+"""Kinds of entities whose name is that of a topic or service."""
+
+
 @dataclass(frozen=True, slots=True)
 class Entity:
     """One entity of the graph as the trace knows it.

@@ -7,4 +7,5 @@ phrases   an event as part of a sentence: ``subscription /scan of /filter``, ``a
 kinds     kinds and flags: ``guard_condition``, ``sub``, ``raised``
 logs      log records
 times     times as people type them
+matching  names and levels as people type them
 """

@@ -10,7 +10,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import EntityKind
+from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 from rsltrace_viewer.model.history import History, Marks
@@ -22,7 +22,7 @@ from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
-from rsltrace_viewer.model.run import WITH_TOPIC, Run
+from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import Columns, layout
 from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
 from rsltrace_viewer.model.timeline.short_names import ShortNames

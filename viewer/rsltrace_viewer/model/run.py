@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, Event, Output
 from rsltrace.model.printable import printable
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
@@ -27,11 +27,6 @@ from rsltrace.words.events import EventWords
 
 _SEGMENTS_KEPT = 24
 """About 0.4 MB each with outputs."""
-
-WITH_TOPIC = frozenset(
-    (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION, EntityKind.CLIENT, EntityKind.SERVICE)
-)
-"""Kinds of entities whose name is that of a topic or service."""
 
 
 @dataclass(frozen=True, slots=True)

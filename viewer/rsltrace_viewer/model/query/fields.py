@@ -5,13 +5,14 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 
 import numpy as np
 
 from rsltrace.errors import TraceError
+from rsltrace.model.entity import WITH_TOPIC
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.words.kinds import SHORT_KINDS
+from rsltrace.words.matching import LOG_LEVELS, is_named
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
@@ -23,24 +24,13 @@ from rsltrace_viewer.model.query.tokens import (
     number_range,
     unquoted,
 )
-from rsltrace_viewer.model.run import WITH_TOPIC, Run
-
-_LEVELS = {"debug": 10, "info": 20, "warn": 30, "warning": 30, "error": 40, "fatal": 50}
-
-
-def _named(pattern: str, name: str) -> bool:
-    """Whether a name is meant: a glob matches it whole, ``/x`` is it, ``x`` is contained in it."""
-    if any(c in pattern for c in "*?["):
-        return fnmatchcase(name, pattern)
-    if pattern.startswith("/"):
-        return name == pattern
-    return pattern.casefold() in name.casefold()
+from rsltrace_viewer.model.run import Run
 
 
 def _read_node(run: Run, token: Token) -> Condition:
     owners = set()
     for part in alternatives(token):
-        matching = {node.id for node in run.nodes if _named(part.text, node.name)}
+        matching = {node.id for node in run.nodes if is_named(part.text, node.name)}
         if not matching:
             names = ", ".join(node.name for node in run.nodes[:8])
             raise QueryError(f"no node matches; there are {names}", part.start, part.end)
@@ -55,7 +45,7 @@ def _read_entity(run: Run, token: Token) -> Condition:
         matching = {
             e.id
             for e in run.entities.values()
-            if (e.name and _named(part.text, e.name)) or str(e.id) == number
+            if (e.name and is_named(part.text, e.name)) or str(e.id) == number
         }
         if not matching:
             raise QueryError("no entity has such a name or number", part.start, part.end)
@@ -69,7 +59,7 @@ def _read_topic(run: Run, token: Token) -> Condition:
         matching = {
             e.id
             for e in run.entities.values()
-            if e.kind in WITH_TOPIC and _named(part.text, e.name)
+            if e.kind in WITH_TOPIC and is_named(part.text, e.name)
         }
         if not matching:
             names = ", ".join(run.topics[:8])
@@ -83,7 +73,9 @@ def _read_topic(run: Run, token: Token) -> Condition:
 def _read_type(run: Run, token: Token) -> Condition:
     parts = alternatives(token)
     found = {
-        e.id for e in run.entities.values() if e.type and any(_named(p.text, e.type) for p in parts)
+        e.id
+        for e in run.entities.values()
+        if e.type and any(is_named(p.text, e.type) for p in parts)
     }
     if not found:
         raise QueryError("no interface of the trace matches", token.start, token.end)
@@ -117,7 +109,7 @@ def _read_out(run: Run, token: Token) -> Condition:
 
 
 def _read_level(run: Run, token: Token) -> Condition:
-    return conditions.log_at_least(min(_choose(token, _LEVELS, "level")))
+    return conditions.log_at_least(min(_choose(token, LOG_LEVELS, "level")))
 
 
 _STATES: dict[str, Condition] = {
@@ -194,7 +186,7 @@ def bare_word(run: Run, token: Token) -> Condition:
     named = {
         e.id
         for e in run.entities.values()
-        if _named(word, e.name) or _named(word, run.node_name(e.id))
+        if is_named(word, e.name) or is_named(word, run.node_name(e.id))
     }
     return conditions.Any(
         (conditions.OfEntities(conditions.ids(named), outputs=True), conditions.says(word))
@@ -231,7 +223,7 @@ FIELDS: dict[str, Field] = {
     "time": Field("simulated seconds: 1.5..2, >3, 20ms", _read_time),
     "index": Field("event numbers: 100..200, >5000", _read_index),
     "text": Field("text in messages and logs (slow)", _read_text),
-    "level": Field("logs of a level or worse", _read_level, lambda run: list(_LEVELS)),
+    "level": Field("logs of a level or worse", _read_level, lambda run: list(LOG_LEVELS)),
     "out": Field(
         "events with an output of a kind", _read_out, lambda run: [k.label for k in OutputKind]
     ),

@@ -1,0 +1,1 @@
+"""Stopping a run where somebody wants to look, and going back in it."""

@@ -1,0 +1,87 @@
+"""Conditions that compare an event with what was before it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from rsltrace.debug.conditions.condition import Armed, error_text, shown
+from rsltrace.debug.conditions.expressions import Expression
+from rsltrace.debug.conditions.view import EventView, Moment
+from rsltrace.model.event import EventKind
+from rsltrace.model.stamp import format_seconds
+
+_NOT_THERE = "(not there)"
+
+
+class AtTime(Armed):
+    """Before the first event at a simulated time or after it."""
+
+    def __init__(self, time_ns: int, moment: Moment) -> None:
+        self._time_ns = time_ns
+        self._is_past = moment.stamp_ns >= time_ns
+
+    def before(self, view: EventView) -> str:
+        """Compare with the event's time; nodes may be constructed at another."""
+        if self._is_past or view.stamp_ns < self._time_ns or view.kind == EventKind.CONSTRUCT:
+            return ""
+        self._is_past = True
+        return f"{format_seconds(view.stamp_ns)} s"
+
+
+class Watch(Armed):
+    """After an event in which the value of an expression has changed.
+
+    A value is known by its hash: two equal lists are the same, however they were made.
+    """
+
+    def __init__(self, expression: Expression, moment: Moment) -> None:
+        from rsltrace.guard.state.hashing import StateHasher  # which loads numpy
+
+        self._expression = expression
+        self._hasher = StateHasher()
+        self._hash, self._shown = self._now(moment)
+
+    def after(self, view: EventView) -> str:
+        """Compare with what it was before."""
+        before_hash, before = self._hash, self._shown
+        self._hash, self._shown = self._now(view)
+        if self._hash == before_hash:
+            return ""
+        return f"{self._expression.text}: {before} -> {self._shown}"
+
+    def _now(self, moment: Moment) -> tuple[int, str]:
+        try:
+            value = self._expression.value(moment)
+        except Exception as error:
+            self.note = error_text(error)
+            return 0, _NOT_THERE
+        self.note = ""
+        try:
+            found = self._hasher.digest(value, self._expression.text)
+        except Exception as error:  # an attribute that raises when it is looked at
+            self.note = error_text(error)
+            return 0, shown(value)
+        return found, shown(value)
+
+
+class When(Armed):
+    """After the event with which an expression becomes true."""
+
+    def __init__(self, expression: Expression, moment: Moment) -> None:
+        self._expression = expression
+        self._is_true = self._now(moment)
+
+    def after(self, view: EventView) -> str:
+        """See whether it was not before, and is now."""
+        was_true, self._is_true = self._is_true, self._now(view)
+        return f"{self._expression.text} is true now" if self._is_true and not was_true else ""
+
+    def _now(self, moment: Moment) -> bool:
+        try:
+            value: Any = self._expression.value(moment)
+            found = bool(value)
+        except Exception as error:
+            self.note = error_text(error)
+            return False
+        self.note = ""
+        return found

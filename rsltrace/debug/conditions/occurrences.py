@@ -1,0 +1,212 @@
+"""Conditions that one event answers, whatever was before it."""
+
+from __future__ import annotations
+
+import builtins
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rsltrace.debug.conditions.condition import Armed, is_true, shown, shown_text
+from rsltrace.debug.conditions.expressions import Expression
+from rsltrace.debug.conditions.view import EventView, Sent
+from rsltrace.model.event import OutputKind
+from rsltrace.words.matching import is_named
+
+_MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
+_SENDS = {
+    OutputKind.MESSAGE: "published on",
+    OutputKind.REQUEST: "called",
+    OutputKind.RESPONSE: "answered",
+}
+
+
+@dataclass
+class AtIndex(Armed):
+    """Before the event of a number."""
+
+    index: int
+
+    def before(self, view: EventView) -> str:
+        """Compare numbers."""
+        return f"event {self.index}" if view.index == self.index else ""
+
+
+@dataclass
+class OfNode(Armed):
+    """Before an event of a node."""
+
+    pattern: str
+
+    def before(self, view: EventView) -> str:
+        """Compare names."""
+        return view.node if view.node and is_named(self.pattern, view.node) else ""
+
+
+@dataclass
+class OfEntity(Armed):
+    """Before an event of an entity, which goes by its name or (``#27``) its number."""
+
+    pattern: str
+
+    def before(self, view: EventView) -> str:
+        """Compare names."""
+        name = view.entity_name
+        if self.pattern == f"#{view.entity}" or (name and is_named(self.pattern, name)):
+            return f"{view.node}: {name}" if view.node else name or self.pattern
+        return ""
+
+
+@dataclass
+class OnTopic(Armed):
+    """Before an event that receives a message on a topic, and after one that sends one.
+
+    With an ``expression``, one of whose fields it is true.
+    """
+
+    text: str
+    pattern: str
+    expression: Expression | None = None
+
+    def before(self, view: EventView) -> str:
+        """Look at the input."""
+        found = view.received()
+        if found is None or not is_named(self.pattern, found[0]):
+            return ""
+        return self._why(f"{view.node} receives {found[0]}", view, found[1])
+
+    def after(self, view: EventView) -> str:
+        """Look at what was sent."""
+        for sent in view.sent():
+            if sent.kind in _MESSAGES and is_named(self.pattern, sent.name):
+                message = None
+                if self.expression is not None and sent.message is not None:
+                    message = sent.message()
+                does = _SENDS[OutputKind(sent.kind)]
+                why = self._why(f"{view.node or 'the run'} has {does} {sent.name}", view, message)
+                if why:
+                    return why
+        return ""
+
+    def _why(self, what: str, view: EventView, message: object) -> str:
+        if self.expression is None:
+            return what
+        if message is None:
+            return ""
+        found, note = is_true(self.expression, view, self.text, message)
+        self.note = note or self.note
+        return f"{what}, and {self.expression.text}" if found else ""
+
+
+class _AfterOutputs(Armed):
+    """After an event with an output for which ``_matches`` says something."""
+
+    def after(self, view: EventView) -> str:
+        """Look at the outputs, one after the other."""
+        return next(filter(None, map(self._matches, view.sent())), "")
+
+    def _matches(self, sent: Sent) -> str:
+        raise NotImplementedError
+
+
+@dataclass
+class WithHash(_AfterOutputs):
+    """After an event whose outputs (all together, or one of them) have a hash that begins so."""
+
+    digits: str
+
+    def after(self, view: EventView) -> str:
+        """Look at the event's own hash first."""
+        if f"{view.output_hash:016x}".startswith(self.digits) and view.output_hash:
+            return f"output hash {view.output_hash:016x}"
+        return super().after(view)
+
+    def _matches(self, sent: Sent) -> str:
+        text = f"{sent.hash:016x}"
+        return f"output {text}" if sent.hash and text.startswith(self.digits) else ""
+
+
+@dataclass
+class Raised(_AfterOutputs):
+    """After an event that raised an exception: of any type, or of one or its subclasses."""
+
+    type: str = ""
+
+    def _matches(self, sent: Sent) -> str:
+        if sent.kind != OutputKind.EXCEPTION:
+            return ""
+        name = sent.text.partition(":")[0].strip()
+        return shown_text(f"raised {sent.text}") if self._is_one(name) else ""
+
+    def _is_one(self, name: str) -> bool:
+        if self.type in ("", name) or name.endswith(f".{self.type}"):
+            return True
+        wanted = getattr(builtins, self.type, None)
+        found = getattr(builtins, name, None)
+        if not (isinstance(wanted, type) and isinstance(found, type)):
+            return False
+        return issubclass(found, wanted)
+
+
+@dataclass
+class Logged(_AfterOutputs):
+    """After an event with a log record of a level or worse that says something."""
+
+    level: int
+    says: Callable[[str], object]
+
+    def _matches(self, sent: Sent) -> str:
+        if sent.kind != OutputKind.LOG or sent.level < self.level or not self.says(sent.text):
+            return ""
+        return f"log {shown(sent.text)}"
+
+
+@dataclass
+class Found(Armed):
+    """After an event in which the guard found something."""
+
+    source: str = ""
+
+    def after(self, view: EventView) -> str:
+        """Compare what was found."""
+        for source in view.findings():
+            if self.source in ("", source):
+                return f"the guard found {source}"
+        return ""
+
+
+@dataclass
+class If(Armed):
+    """Another condition, where an expression is true as well."""
+
+    inner: Armed
+    expression: Expression
+    text: str
+
+    def before(self, view: EventView) -> str:
+        """Ask the other first."""
+        return self._if(self.inner.before(view), view)
+
+    def after(self, view: EventView) -> str:
+        """Ask the other first."""
+        return self._if(self.inner.after(view), view)
+
+    def _if(self, why: str, view: EventView) -> str:
+        if not why:
+            return ""
+        received = view.received()
+        message = None if received is None else received[1]
+        found, note = is_true(self.expression, view, self.text, message)
+        self.note = note or self.note or self.inner.note
+        return f"{why} if {self.expression.text}" if found else ""
+
+
+def says_pattern(pattern: re.Pattern[str]) -> Callable[[str], object]:
+    """Return whether a text has something that a regular expression fits."""
+    return pattern.search
+
+
+def says_words(words: str) -> Callable[[str], object]:
+    """Return whether a text contains words, in capitals or not."""
+    folded = words.casefold()
+    return lambda text: folded in text.casefold()
