@@ -5,6 +5,7 @@
 #   make test-native   comparisons with rclpy's own executors over DDS, in real time
 #   make test-long     long campaigns, planted faults in numbers, a hundred perturbed runs
 #   make test-random   property tests with many more examples (not in CI)
+#   make truth         a thousand planted faults, and what diff says of them
 #   make attack        hostile files, jobs, nodes, servers and disks, for an hour
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
@@ -16,7 +17,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-random test-kilted attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
+.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -74,6 +75,12 @@ ATTACK_MINUTES ?= 60
 ATTACK_SEED ?=
 attack: compiled
 	$(BIN)/python -m tests.attack --minutes $(ATTACK_MINUTES) $(if $(ATTACK_SEED),--seed $(ATTACK_SEED))
+
+# Faults planted in random graphs, and an oracle that reads the traces with the mcap package alone
+# (tests/truth); the table of classes is in out/truth/table.md: make truth TRUTH_FAULTS=200
+TRUTH_FAULTS ?= 1000
+truth: compiled
+	$(BIN)/python -m tests.truth --faults $(TRUTH_FAULTS)
 
 # rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
 RCLPY ?=

@@ -1,0 +1,111 @@
+"""Queues and QoS: what was sent and not received."""
+
+from __future__ import annotations
+
+import random
+import re
+
+from tests.truth.faults.planting import ALWAYS_FALSE, NOT_DETERMINISTIC, Planted, Truth, fault
+from tests.truth.graph import Callback, NodePlan, World, random_world
+
+NEVER = (*ALWAYS_FALSE, NOT_DETERMINISTIC)
+
+
+def _burst(rng: random.Random) -> tuple[World, NodePlan]:
+    """Return a world in which one node gets eight messages at once, every 50 ms."""
+    a = random_world(rng)
+    sender = NodePlan(
+        "burst",
+        "burst",
+        [
+            'self.out = self.create_publisher(Float64, "/burst", 20)',
+            "self.timer = self.create_timer(0.05, self.tick)",
+        ],
+        [
+            Callback(
+                "tick",
+                "timer",
+                "Burst.tick",
+                [
+                    "for number in range(8):",
+                    "    self.out.publish(Float64(data=self.n * 8.0 + number))",
+                ],
+                "",
+                50,
+            )
+        ],
+    )
+    receiver = NodePlan(
+        "drain",
+        "drain",
+        [
+            'self.subscription = self.create_subscription(Float64, "/burst", self.heard, 10)',
+            'self.out = self.create_publisher(Float64, "/drained", 10)',
+        ],
+        [
+            Callback(
+                "heard",
+                "subscription",
+                "/burst",
+                ["self.out.publish(Float64(data=message.data))"],
+                "/drained",
+            )
+        ],
+    )
+    a.nodes += [sender, receiver]
+    a.job["nodes"] += [{"node": f"{n.module}:{n.class_name}"} for n in (sender, receiver)]
+    return a, receiver
+
+
+@fault("queue depth")
+def depth(rng: random.Random) -> Planted:
+    a, receiver = _burst(rng)
+    b = a.copy()
+    shallow = rng.randint(1, 5)
+    setup = b.node("drain").setup
+    setup[0] = setup[0].replace("self.heard, 10", f"self.heard, {shallow}")
+    return Planted(
+        a,
+        b,
+        Truth(
+            ("missing",),
+            receiver.full_name,
+            "/burst",
+            first=(rf"queue of {shallow} overflowed",),
+            says=(rf"code of module {receiver.module}",),
+            never=NEVER,
+        ),
+    )
+
+
+@fault("queue that overflows because its node is slow")
+def slow(rng: random.Random) -> Planted:
+    a, receiver = _burst(rng)
+    a.job["executors"] = "per_node"
+    b = a.copy()
+    b.job["execution"] = {"nodes": {receiver.full_name: "12ms"}}
+    return Planted(
+        a,
+        b,
+        Truth(("draw", "timing"), receiver.full_name, says=(r"execution",), never=NEVER),
+    )
+
+
+@fault("QoS that does not fit")
+def incompatible(rng: random.Random) -> Planted:
+    a, _ = _burst(rng)
+    b = a.copy()
+    setup = b.node("burst").setup
+    setup[0] = setup[0].replace(
+        ", 20)", ", QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT))"
+    )
+    return Planted(
+        a,
+        b,
+        Truth(
+            ("missing", "graph", "same-input-different-output"),
+            says=(r"QoS|reliab", re.escape("/burst"), r"code of module truth_burst"),
+            never=NEVER,
+            independent=None,
+        ),
+    )

@@ -1,0 +1,76 @@
+"""What ``rsltrace diff`` says of planted faults is true: some of ``make truth``."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+from tests.truth import faults
+from tests.truth.campaign import Outcome, try_cases
+from tests.truth.known import KNOWN, mended
+
+faults.load()
+NAMES = list(faults.FAULTS)
+PARTS = 3
+SEED = int(os.environ.get("RSLTRACE_TRUTH_SEED", "0"))
+
+pytestmark = pytest.mark.ros
+
+
+def wrong(outcomes: list[Outcome]) -> str:
+    return "\n".join(
+        f"{o.name}: {c.what}: {c.text}\n  {o.reproducer}"
+        for o in outcomes
+        for c in o.wrong
+        if f"{o.name}: {c.what}" in o.unknown
+    )
+
+
+def test_there_are_classes_enough() -> None:
+    assert len(NAMES) >= 100
+
+
+@pytest.mark.parametrize("part", range(PARTS))
+def test_what_is_said_of_a_third_of_the_classes_is_true(part: int) -> None:
+    """Every class stands in one of the thirds; half of the cases of each are tried here."""
+    outcomes = list(try_cases((name, SEED) for name in NAMES[part :: 2 * PARTS]))
+    assert not wrong(outcomes), wrong(outcomes)
+    keys = [key for outcome in outcomes for key in outcome.keys]
+    stale = mended(keys, [outcome.name for outcome in outcomes])
+    assert not stale, f"no longer wrong, so tests/truth/known.py must forget it: {stale}"
+
+
+@pytest.mark.long
+def test_what_is_said_of_every_class_is_true() -> None:
+    outcomes = list(try_cases((name, seed) for seed in (1, 2) for name in NAMES))
+    assert not wrong(outcomes), wrong(outcomes)
+
+
+def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A report with another index, another sentence and another cause is not let through."""
+    from dataclasses import replace
+
+    from tests.truth import oracle
+
+    real = oracle.diff
+
+    def lying(a: object, b: object) -> object:
+        found = real(a, b)
+        first = replace(found.divergences[0], root_sentence="chance decided otherwise")
+        return replace(
+            found,
+            agreeing=found.agreeing + 1,
+            sentence="something differs",
+            divergences=(first,),
+        )
+
+    monkeypatch.setattr(oracle, "diff", lying)
+    (outcome,) = try_cases([("value, in code", 0)])
+    assert {"index", "first line", "cause", "blame", "values"} <= {c.what for c in outcome.wrong}
+
+
+def test_what_is_known_names_classes() -> None:
+    assert {key.rpartition(": ")[0] for key in KNOWN} <= set(NAMES)
