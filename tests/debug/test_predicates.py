@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from typing import Any
 
 import pytest
@@ -93,8 +94,8 @@ def test_logs_exceptions_hashes_and_findings() -> None:
 
 
 def test_fields_are_those_of_loaded_classes() -> None:
-    import nav_msgs.msg  # noqa: F401
-
+    for package in ("geometry_msgs", "nav_msgs"):
+        import_module(f"{package}.msg")
     names = Names(
         topics=("/odom",),
         are_all=True,
