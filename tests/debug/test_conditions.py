@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ from hypothesis import strategies as st
 
 from rsltrace.debug.conditions.condition import Armed, Condition
 from rsltrace.debug.conditions.expressions import parse_expression
+from rsltrace.debug.conditions.message_fields import loaded_fields
 from rsltrace.debug.conditions.names import Names
 from rsltrace.debug.conditions.text import parse_condition
 from rsltrace.debug.conditions.view import Sent
@@ -420,3 +422,16 @@ def test_an_expression_is_worth_what_python_says(text: str, x: float, y: int) ->
     found = parse_expression(text, NAMES, has_own=True).value(view, message=message)
     assert found == expected
     assert type(found) is type(expected)
+
+
+@pytest.mark.ros
+def test_fields_are_those_of_loaded_classes() -> None:
+    for package in ("geometry_msgs", "nav_msgs"):
+        import_module(f"{package}.msg")
+    interfaces = {"/odom": "nav_msgs/msg/Odometry"}
+    names = Names(topics=("/odom",), are_all=True, interfaces=interfaces, fields=loaded_fields)
+    parse_condition("/odom: pose.pose.position.x > 3 and pose.covariance[0] > 1", names)
+    for text in ("/odom: pose.pose.position.w > 3", "/odom: pose.position.x > 3"):
+        with pytest.raises(ConditionError, match="has no field"):
+            parse_condition(text, names)
+    assert loaded_fields("no_such_msgs/msg/Thing") is None

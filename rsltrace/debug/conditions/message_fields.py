@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
+from collections.abc import Mapping
 from typing import NamedTuple
 
 from rsltrace.debug.conditions.names import Fields
@@ -56,3 +58,13 @@ def _interface(text: str) -> str:
         return ""
     package, *_, name = text.split("/")
     return f"{package}/msg/{name}" if text.count("/") == 1 else text
+
+
+def loaded_fields(interface: str) -> Mapping[str, str] | None:
+    """Return the fields of an interface (``nav_msgs/msg/Odometry``) whose class is loaded; to look
+    at a run must not import anything into it."""
+    package, _, name = interface.partition("/")
+    kind, _, name = name.partition("/")
+    found = getattr(sys.modules.get(f"{package}.{kind}"), name, None)
+    known = getattr(found, "get_fields_and_field_types", None)
+    return None if known is None else dict(known())
