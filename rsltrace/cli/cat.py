@@ -48,6 +48,7 @@ class _Time(_IntParam):
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 @click.option("--payloads", is_flag=True, help="With --json: add the decoded messages.")
+@click.option("--code", is_flag=True, help="Add where the function that ran is: module.py:24.")
 @click.option(
     "--topic",
     "topics",
@@ -85,6 +86,7 @@ def cat(
     trace: Path,
     as_json: bool,
     payloads: bool,
+    code: bool,
     topics: tuple[str, ...],
     nodes: tuple[str, ...],
     entities: tuple[str, ...],
@@ -108,7 +110,7 @@ def cat(
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
         write = line_writer()
-        form = _json_form(opened, payloads) if as_json else EventLines(opened).line
+        form = _json_form(opened, payloads) if as_json else EventLines(opened, code=code).line
         for event, outputs in islice(_events(opened, choice), limit):
             write(form(event, outputs))
 

@@ -132,7 +132,7 @@ def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
     if len(shown) < len(entities):
         left_out = len(entities) - len(shown)
         title += f"  ({left_out} built-in ones that did nothing are left out; --all shows them)"
-    rows = [("  id", "node", "kind", "name", "type", "events", "outputs", "Hz")]
+    rows = [("  id", "node", "kind", "name", "type", "events", "outputs", "Hz", "code")]
     for entity in shown:
         rate = counts.rate_hz(entity.id) if entity.id else None
         rows.append(
@@ -145,6 +145,7 @@ def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
                 str(_count(counts.events, entity.id)),
                 str(_count(counts.outputs, entity.id)),
                 "-" if rate is None else f"{rate:.6g}",
+                printable(entity.source) or "-",
             )
         )
     return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]

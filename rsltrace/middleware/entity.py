@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
 
 
@@ -88,6 +89,9 @@ class DomainEntity:
 
     def entity(self) -> Entity:
         """Return the entity as the trace describes it."""
+        detail = self.trace_detail()
+        if source := source_of(self.user_callback()):
+            detail["source"] = source
         return Entity(
             id=self.entity_id,
             node=self.node.entity_id if self.node is not None else 0,
@@ -95,7 +99,7 @@ class DomainEntity:
             name=self.trace_name(),
             type=self.trace_type(),
             created_ns=self.created_ns,
-            detail=self.trace_detail(),
+            detail=detail,
         )
 
     def trace_name(self) -> str:
@@ -109,6 +113,10 @@ class DomainEntity:
     def trace_detail(self) -> dict[str, object]:
         """Return what only this kind of entity has."""
         return {}
+
+    def user_callback(self) -> object:
+        """Return the user's callable that its events run, None if there is none."""
+        return getattr(self, "callback", None)
 
     def describe(self) -> str:
         """Name the entity for people: ``/listener: subscription /chatter``."""

@@ -139,7 +139,7 @@ class Service(ServiceEnd):
             network.response(self.service, client, self, exchange)
 
     def trace_detail(self) -> dict[str, object]:
-        return {"callback": callback_name(self.callback)}
+        return {"callback": callback_name(self.user_callback())}
 
 
 class Client(ServiceEnd):

@@ -78,7 +78,7 @@ class Subscription(Receiver):
         return self.type.name
 
     def trace_detail(self) -> dict[str, object]:
-        return {"callback": callback_name(self.callback), "qos": self.qos.summary()}
+        return {"callback": callback_name(self.user_callback()), "qos": self.qos.summary()}
 
     def _destroy(self) -> None:
         super()._destroy()

@@ -94,7 +94,7 @@ class Timer(DomainEntity):
         return self.state.period_ns
 
     def trace_name(self) -> str:
-        return callback_name(self.callback)
+        return callback_name(self.user_callback())
 
     def trace_detail(self) -> dict[str, object]:
         return {"period_ns": self.state.period_ns}

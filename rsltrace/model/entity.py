@@ -44,7 +44,7 @@ class Entity:
     (a node owns itself; 0 is the run). ``name`` is the fully qualified topic, service or node
     name; a timer, guard condition or task is named after its callback. ``type`` is the interface
     (``std_msgs/msg/UInt64``) or empty. ``detail`` holds what only one kind has (QoS, period_ns,
-    callback) as JSON-compatible values.
+    callback, source) as JSON-compatible values.
     """
 
     id: int
@@ -54,3 +54,9 @@ class Entity:
     type: str
     created_ns: int
     detail: dict[str, object]
+
+    @property
+    def source(self) -> str:
+        """Where the function that its events run is defined, ``module.py:24``; "" if unknown."""
+        source = self.detail.get("source")
+        return source if isinstance(source, str) else ""

@@ -9,6 +9,7 @@ from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKin
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.reader import Trace
+from rsltrace.words.code import code_place
 from rsltrace.words.kinds import flag_names
 from rsltrace.words.logs import log_record
 
@@ -38,6 +39,7 @@ class EventJson:
             "output_hash": f"{event.output_hash:016x}",
             "state_hash": f"{event.state_hash:016x}" if event.state_hash else None,
             "chain_hash": f"{event.chain_hash:016x}",
+            "code": code_place(self._trace, event) or None,
             "flags": flag_names(event.flags),
             "outputs": [self._output(output) for output in outputs],
             "findings": [

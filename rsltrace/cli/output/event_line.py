@@ -7,6 +7,7 @@ from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
+from rsltrace.words.code import code_place
 from rsltrace.words.events import EventWords
 from rsltrace.words.kinds import flag_names
 
@@ -19,10 +20,14 @@ class EventLines:
     """Writes the events of a trace as lines.
 
     Index, simulated seconds, node, kind, entity, input hash, output hash, outputs, flags. Columns
-    without a value hold ``-``; outputs and flags come last because they have any length.
+    without a value hold ``-``; outputs and flags come last because they have any length. With
+    ``code``, the place of the function that ran comes before the outputs.
     """
 
-    def __init__(self, trace: Trace) -> None:
+    def __init__(self, trace: Trace, *, code: bool = False) -> None:
+        self._trace = trace
+        places = [printable(entity.source) for entity in trace.entities.values()] if code else []
+        self._code_width = min(max(map(len, places), default=0), _COLUMN_MAX)
         self._findings = trace.findings
         self._words = EventWords(trace)
         names = self._words.names
@@ -41,6 +46,9 @@ class EventLines:
             f"{node:<{self._node_width}}  {event.kind.label:<15}  {name:<{self._name_width}}  "
             f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
         )
+        if self._code_width:
+            place = printable(code_place(self._trace, event)) or "-"
+            columns += f"  {place:<{self._code_width}}"
         what = ", ".join(self._words.outputs(outputs))
         flags = "".join(f"  [{flag}]" for flag in flag_names(event.flags))
         found = self._findings.get(event.index, ())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from xml.sax.saxutils import escape, quoteattr
 
 from rsltrace.diff.options import DiffOptions
@@ -46,8 +47,7 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
         level = "error" if diff.failed else "notice"
         title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
         text = plain_text(report_lines(diff, options)) if diff.failed else _message(diff)
-        file = command_property(printable(diff.a.path))
-        place = f"file={file},title={command_property(printable(title))}"
+        place = f"{_place(diff)},title={command_property(printable(title))}"
         lines.append(f"::{level} {place}::{command_data(text)}")
         if isinstance(diff, Diff):
             for setting in diff.settings:
@@ -59,6 +59,18 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
                         f"::notice {place},title=rsltrace%3A job differs::{command_data(change)}"
                     )
     return "".join(f"{row}\n" for row in lines)
+
+
+def _place(diff: Diff | BagDiff) -> str:
+    """Return what an annotation points to: the code that ran where two runs diverge, if it is
+    here, or else the file that was compared."""
+    found = diff.divergences[0] if isinstance(diff, Diff) and diff.divergences else None
+    views = () if found is None else (found.b, found.a)
+    for code in (view.code for view in views if view is not None):
+        name, _, number = code.rpartition(":")
+        if Path(name).is_file():
+            return f"file={command_property(printable(name))},line={number}"
+    return f"file={command_property(printable(diff.a.path))}"
 
 
 def _message(diff: Diff | BagDiff) -> str:

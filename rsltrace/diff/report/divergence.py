@@ -61,6 +61,11 @@ def _event(found: Divergence, width: int) -> Section:
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
         if not title.startswith("event ") or a.flags != b.flags or not found.messages:
             rows += _did([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
+        if code := printable(a.code or b.code):
+            if len(title) + len(code) + 3 <= width:
+                title += f" ({code})"
+            else:
+                rows.insert(0, line(("  code ", Style.FAINT), code))
     elif some is not None:
         title = "where they diverge" if a and b else "the event"
         rows += _events_of([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)

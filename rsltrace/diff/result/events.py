@@ -14,7 +14,8 @@ class EventView:
 
     ``position`` counts the events of this entity before it; -1 far into a long run, where counting
     would mean reading all of it. A constructor goes by the node it makes. ``summary`` is a short
-    text of its outputs (``/t1, call /s1``).
+    text of its outputs (``/t1, call /s1``), ``code`` where the function that ran is
+    (``module.py:24``): by its path in the present folder if it is found below that.
     """
 
     index: int
@@ -30,3 +31,4 @@ class EventView:
     outputs: int
     position: int
     summary: str = ""
+    code: str = ""

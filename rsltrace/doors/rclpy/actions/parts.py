@@ -48,6 +48,9 @@ class Part(ReceiverHandle):
     def trace_detail(self) -> dict[str, object]:
         return {"action": self.owner.name}
 
+    def user_callback(self) -> object:
+        return getattr(self.wrapper, "_execute_callback", None)  # of an action client: none
+
 
 class GoalService(Part, ServiceHandle):
     """A server's end of one of the three services."""

@@ -110,7 +110,10 @@ class EntityHandle(Destroyable, DomainEntity):
         return mailbox is not None and mailbox.keeps(self)
 
     def trace_name(self) -> str:
-        return callback_name(getattr(self.wrapper, "callback", None))
+        return callback_name(self.user_callback())
+
+    def user_callback(self) -> object:
+        return getattr(self.wrapper, "callback", None)
 
     def runnable(self) -> Runnable:
         node = self.node

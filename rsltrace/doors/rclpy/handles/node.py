@@ -233,6 +233,9 @@ class NodeHandle(Destroyable, Participant):
     def trace_type(self) -> str:
         return "" if self.wrapper is None else class_name(type(self.wrapper))
 
+    def user_callback(self) -> object:
+        return None if self.wrapper is None else type(self.wrapper)  # its constructor
+
     def timer_periods(self) -> Iterable[tuple[str, int]]:
         timers = () if self.wrapper is None else self.wrapper.timers
         return ((callback_name(each.callback), each.handle.state.period_ns) for each in timers)

@@ -13,7 +13,6 @@ from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_corou
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import message_type
 from rsltrace.errors import UnsupportedError
-from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.middleware.qos.policies import Qos
 from rsltrace.middleware.subscription import SUBSCRIPTION, Delivery, Subscription
@@ -164,10 +163,6 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         return len(self.publishers)
 
     trace_name = Subscription.trace_name
-
-    def trace_detail(self) -> dict[str, object]:
-        callback = callback_name(getattr(self.wrapper, "callback", None))
-        return {"callback": callback, "qos": self.qos.summary()}
 
 
 def _message_info(delivery: Delivery) -> dict[str, int | None]:

@@ -119,4 +119,4 @@ class EventHandle(EntityHandle):
         return f"{self._parent.topic} {self._name}"
 
     def trace_detail(self) -> dict[str, object]:
-        return {"callback": callback_name(getattr(self.wrapper, "callback", None))}
+        return {"callback": callback_name(self.user_callback())}

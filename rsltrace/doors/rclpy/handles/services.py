@@ -22,7 +22,6 @@ from rsltrace.doors.rclpy.stacks.tasks import executor_of, is_coroutine_function
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import service_type
 from rsltrace.doors.rclpy.wire.type_descriptions import answer
-from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.graph import Graph
 from rsltrace.middleware.services import (
     CLIENT,
@@ -143,9 +142,6 @@ class ServiceHandle(ServiceEndHandle, Service):
         self.respond(self._response.serialize(response), request_id)
         if self._service_events is not None:
             self._tell(RESPONSE_SENT, request_id, response)
-
-    def trace_detail(self) -> dict[str, object]:
-        return {"callback": callback_name(getattr(self.wrapper, "callback", None))}
 
 
 class ClientHandle(ServiceEndHandle, Client):

@@ -33,6 +33,7 @@ from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.callers import is_user_file
 from rsltrace.middleware.entity import Runnable, on_no_executor
+from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 
@@ -184,7 +185,11 @@ class SimThread:
         """Return the thread as the trace describes it."""
         node = self.node.entity_id if self.node is not None else 0
         now_ns = self.stacks.loop.now_ns
-        return Entity(self.entity_id, node, EntityKind.THREAD, self.name, "", now_ns, {})
+        source = source_of(
+            getattr(self.thread, "_target", None) or getattr(self.thread, "run", None)
+        )
+        detail: dict[str, object] = {"source": source} if source else {}
+        return Entity(self.entity_id, node, EntityKind.THREAD, self.name, "", now_ns, detail)
 
 
 # -- what stands in for Python's own functions -------------------------------------------------
