@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.output.text_file import undone
+from rsltrace.cli.output.text_file import undone, write_text
+from rsltrace.cli.schema import schema_text
 from rsltrace.errors import BagError, OutputError
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import tell
@@ -19,10 +20,11 @@ if TYPE_CHECKING:
 
 _HEAD = """\
 # yaml-language-server: $schema=job.schema.json
-# A job of rsltrace. `rsltrace schema > job.schema.json` lets editors complete and check it,
+# A job of rsltrace; with the schema beside it editors complete and check it.
 # `rsltrace check {name}` shows what it means, `rsltrace record {name}` runs it.
 # Every key is explained in docs/jobs.md.
 """
+_SCHEMA = "job.schema.json"
 _PLACES = (".", "src", "scripts", "..")
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 """Recorded with everything else, and hardly ever meant: the nodes of the run have their own."""
@@ -44,7 +46,7 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
 
     Of a bag it lists the topics, their types and how long it is, of a node its name and the
     parameters that its source declares. Nothing is imported or run. A file that exists is left
-    alone.
+    alone. The job's schema goes beside it, for editors (job.schema.json).
     """
     if ":" in job.name and job.suffix not in (".yaml", ".yml"):
         raise click.UsageError(
@@ -61,6 +63,10 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
     ]
     nodes = [_look(source, folder) for source in sources if source not in bags]
     text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes))
+    schema = folder / _SCHEMA
+    has_schema = schema.exists()
+    if not has_schema:
+        write_text(schema, schema_text() + "\n")
     try:
         with job.open("x", encoding="utf-8") as file, undone(job):
             file.write(text)
@@ -71,7 +77,8 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
 
     if sources:
         load_job(job)  # what was written must be a job
-    tell(f"wrote {job}; next: rsltrace check {job}")
+    written = f"{job}" if has_schema else f"{job} and {schema}"
+    tell(f"wrote {written}; next: rsltrace check {job}")
 
 
 def _is_python(source: str) -> bool:

@@ -25,6 +25,7 @@ _COMMANDS = {
     "audit": "Look into nodes' sources for what could make runs differ.",
     "check": "Check a job and show its graph, without running it.",
     "schema": "Print the JSON Schema of a job file, for editors.",
+    "completion": "Print what bash, zsh or fish needs to complete commands.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",
     "cat": "Print the events of a trace, one per line.",
     "view": "Look at a trace in the terminal, or at two side by side.",

@@ -19,6 +19,11 @@ def schema() -> None:
     and as the first line of the job file:
       # yaml-language-server: $schema=job.schema.json
     """
+    say(schema_text())
+
+
+def schema_text() -> str:
+    """Return the JSON Schema of a job file."""
     from rsltrace.job.documents.schema import job_schema
 
-    say(json.dumps(job_schema(), indent=2))
+    return json.dumps(job_schema(), indent=2)

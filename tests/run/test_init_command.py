@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import struct
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
+from rsltrace.job.documents.schema import job_schema
 from rsltrace.job.reading.node_source import look_up
 
 NODE = """
@@ -80,7 +82,8 @@ def folder(tmp_path: Path) -> Path:
 def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
     done = rsltrace("init", "--from", "a.db3", "--from", "robot.nodes:Hearer")
     assert (done.returncode, done.stdout) == (0, "")
-    assert done.stderr == "wrote job.yaml; next: rsltrace check job.yaml\n"
+    assert done.stderr == "wrote job.yaml and job.schema.json; next: rsltrace check job.yaml\n"
+    assert json.loads((folder / "job.schema.json").read_text()) == job_schema()
     assert not (folder / "imported").exists()
     text = (folder / "job.yaml").read_text()
     assert text.startswith("# yaml-language-server: $schema=")

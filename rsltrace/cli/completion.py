@@ -1,0 +1,27 @@
+"""``rsltrace completion``: what a shell needs to complete commands, options and files."""
+
+from __future__ import annotations
+
+import click
+from click.shell_completion import get_completion_class
+
+from rsltrace.terminal import say
+
+_PROGRAM = "rsltrace"
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(("bash", "zsh", "fish")))
+def completion(shell: str) -> None:
+    """Print the script that lets SHELL complete rsltrace's commands and options.
+
+    \b
+      bash: eval "$(rsltrace completion bash)"                 in ~/.bashrc
+      zsh:  eval "$(rsltrace completion zsh)"                  in ~/.zshrc
+      fish: rsltrace completion fish | source                  in ~/.config/fish/config.fish
+    """
+    from rsltrace.cli.main import cli
+
+    made = get_completion_class(shell)
+    assert made is not None
+    say(made(cli, {}, _PROGRAM, f"_{_PROGRAM.upper()}_COMPLETE").source())
