@@ -7,6 +7,7 @@
     ├── TraceError                   2  a trace cannot be read or compared
     │   ├── TraceFormatError         2  not a trace, or one of another format version
     │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
+    ├── BisectError                  2  the revisions of a job cannot be searched, or not judged
     ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
     ├── ConditionError               2  where to stop, or what to evaluate, cannot be understood
     └── RunError                     3  the run itself went wrong; the trace up to there is complete
@@ -70,6 +71,10 @@ class TraceFormatError(TraceError):
 
 class ReplayError(TraceError):
     """A trace cannot be replayed: what it needs is not here, or nobody has said to trust it."""
+
+
+class BisectError(RsltraceError):
+    """No commit can be named: no repository, ends that do the same, a check without an answer."""
 
 
 class OutputError(RsltraceError):

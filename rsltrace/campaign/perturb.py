@@ -178,7 +178,7 @@ def record_in(
     path = path or folder / f"{name}.mcap"
     command = [sys.executable]
     command += ["-c", _NOISE, values[HEAP]] if HEAP in values else ["-m", "rsltrace"]
-    command += ["record", *arguments, "-o", str(path), "--force", "--quiet", "--json"]
+    command += record_words(arguments, path)
     if "nice" in values.get(LOAD, "") and shutil.which("nice"):
         command = ["nice", "-n", "5", *command]
     if ADDRESSES not in values and can_fix_addresses():
@@ -187,10 +187,16 @@ def record_in(
     load = started.beside([sys.executable, "-c", _BUSY]) if LOAD in values else nullcontext()
     with load:
         done = started.run(command, cwd=cwd, env=_environment(values, cwd), timeout_s=timeout_s)
-    return _recorded(around, path, done)
+    return recorded(around, path, done)
 
 
-def _recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
+def record_words(arguments: Sequence[str], path: Path) -> list[str]:
+    """Return the words of a command whose output ``recorded`` reads."""
+    return ["record", *arguments, "-o", str(path), "--force", "--quiet", "--json"]
+
+
+def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
+    """Return what came of a run, from what its process has printed."""
     last = done.output.strip().splitlines()[-1:] or [""]
     try:
         result = json.loads(last[0])

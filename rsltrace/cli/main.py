@@ -22,6 +22,7 @@ _COMMANDS = {
     "replay": "Run the job of a trace again, and check every event on the way.",
     "init": "Write a commented first job, from bags and nodes.",
     "verify": "Record a job many times in unlike surroundings and compare.",
+    "bisect": "Find the commit that changed what a job does.",
     "audit": "Look into nodes' sources for what could make runs differ.",
     "check": "Check a job and show its graph, without running it.",
     "schema": "Print the JSON Schema of a job file, for editors.",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import shutil
 import signal
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,15 +39,11 @@ class Given:
     no_pin: bool
     ros: tuple[str, ...]
 
-    def arguments(self, *, absolute: bool) -> list[str]:
-        """Return the words; ``absolute``: with paths that mean the same in every folder."""
-
-        def path(text: str) -> str:
-            return str(Path(text).absolute()) if absolute else text
-
-        found = [word if ":=" in word else path(word) for word in self.words]
+    def arguments(self, path: Callable[[str], object] = str) -> list[str]:
+        """Return the words; ``path`` makes of a path what it is where they are used."""
+        found = [word if ":=" in word else str(path(word)) for word in self.words]
         if self.launch is not None:
-            found += ["--launch", path(str(self.launch))]
+            found += ["--launch", str(path(str(self.launch)))]
         found += ["--skip-unsupported"] * self.skip
         for override in self.overrides:
             found += ["--set", override]
@@ -59,7 +56,7 @@ class Given:
             ros = list(self.ros)
             for index, word in enumerate(ros[:-1]):
                 if word == "--params-file":
-                    ros[index + 1] = path(ros[index + 1])
+                    ros[index + 1] = str(path(ros[index + 1]))
             found += ["--ros-args", *ros, "--"]
         return found
 
@@ -149,7 +146,7 @@ def verify(
         raise click.UsageError("--only and --output go with --run N")
     given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
     job_of(words, launch, skip, overrides)  # what is wrong with it is said once, and here
-    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, _terminated():
+    with tempfile.TemporaryDirectory(prefix="rsltrace-verify-") as name, terminated():
         folder = Path(name)
         if number is not None:
             return _one_run(given, folder, number, perturbations, only, output)
@@ -175,7 +172,7 @@ def _verify(
             tell(f"run {around.number}: digest {recorded.digest or '-'}")
 
     series = Verification(
-        given.arguments(absolute=True),
+        given.arguments(os.path.abspath),
         folder,
         workers=jobs,
         seed=perturbations,
@@ -208,7 +205,7 @@ def _two(result: Verified) -> list[Recorded]:
 
 def _again(given: Given, perturbations: int, around: Surroundings) -> str:
     """Return the command that repeats one run."""
-    words = ["rsltrace", "verify", *given.arguments(absolute=False)]
+    words = ["rsltrace", "verify", *given.arguments()]
     if perturbations:
         words += ["--perturbations", str(perturbations)]
     return shlex.join([*words, "--run", str(around.number)])
@@ -231,7 +228,7 @@ def _one_run(
         around = around.only(only)
     path = (output or Path(f"run-{number}.mcap")).absolute()
     tell(f"run {number}: {around}")
-    done = record_in(around, given.arguments(absolute=True), folder, path=path)
+    done = record_in(around, given.arguments(os.path.abspath), folder, path=path)
     tell(done.errors, end="")
     if not done.digest:
         raise RsltraceError(f"run {number}: {done.failure}")
@@ -240,7 +237,7 @@ def _one_run(
 
 
 @contextmanager
-def _terminated() -> Iterator[None]:
+def terminated() -> Iterator[None]:
     """Let SIGTERM and SIGHUP end the runs, too, instead of leaving them behind."""
 
     def end(number: int, frame: object) -> None:

@@ -1,0 +1,221 @@
+"""``rsltrace bisect``: which commit changed what a job does?"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options, ros_arguments_given
+from rsltrace.cli.verify import Given, terminated
+from rsltrace.errors import BisectError, JobError, OutputError
+from rsltrace.terminal import say, tell
+
+if TYPE_CHECKING:
+    from rsltrace.campaign.bisect.judges import Check
+    from rsltrace.campaign.bisect.repository import Repository
+    from rsltrace.campaign.bisect.runs import Runner
+    from rsltrace.campaign.bisect.search import Found
+    from rsltrace.campaign.processes import Processes
+
+_BEFORE, _AFTER = "before.mcap", "after.mcap"
+
+
+@click.command(cls=RosArgsCommand)
+@job_options
+@click.option("--good", metavar="REV", required=True, help="A revision before the change.")
+@click.option("--bad", metavar="REV", required=True, help="A revision that has the change.")
+@click.option(
+    "--check",
+    "expression",
+    metavar="EXPR",
+    help="Judge by this, not by the digest: 'count(\"/odom\") > 0', or MODULE:FUNCTION of a Trace.",
+)
+@click.option(
+    "--run",
+    "shell",
+    metavar="COMMAND",
+    help="Judge by the exit status of a shell command: 0 good, 125 skip, others bad; "
+    "RSLTRACE_TRACE names the trace.",
+)
+@click.option("--first-parent", is_flag=True, help="Of merges, follow the first parent only.")
+@click.option(
+    "--share",
+    "shared",
+    multiple=True,
+    type=click.Path(path_type=Path, exists=True),
+    metavar="PATH",
+    help="A file or folder here that git does not track, and that the nodes need.",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help=f"Keep the traces before and after the change there ({_BEFORE}, {_AFTER}).",
+)
+@click.option("--force", is_flag=True, help="Replace traces that are in DIR.")
+@click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
+@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Kill a run after so many seconds (default: 30 times what the first took, at least 120).",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+@click.option("-q", "--quiet", is_flag=True, help="No progress.")
+def bisect(
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
+    overrides: tuple[str, ...],
+    good: str,
+    bad: str,
+    expression: str | None,
+    shell: str | None,
+    first_parent: bool,
+    shared: tuple[Path, ...],
+    output: Path | None,
+    force: bool,
+    seed: int | None,
+    until: str | None,
+    no_pin: bool,
+    timeout: float | None,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    """Run JOB at revisions of its git repository and name the first commit that changed it.
+
+    The job and its nodes are those of each revision, in a git worktree of their own; the checkout
+    is not touched. What changes is the run's digest, or what --check or --run says. Both ends are
+    run first, and twice. Revisions that do not run (or in which a node raises, unless it does so
+    at an end) are skipped, as by "git bisect skip".
+
+    The exit status is 0 if one commit is named, 1 if only several of which one is it, 2 for
+    trouble: ends that do not differ, a job that is not deterministic, no repository.
+    """
+    from rsltrace.campaign.bisect.repository import Repository
+    from rsltrace.campaign.bisect.runs import Runner
+    from rsltrace.campaign.bisect.search import Search
+    from rsltrace.campaign.bisect.worktree import Worktree
+    from rsltrace.campaign.processes import Processes
+    from rsltrace.cli.output.bisect_text import line_of
+
+    if expression is not None and shell is not None:
+        raise click.UsageError("--check or --run, not both")
+    given = Given(words, launch, skip, overrides, seed, until, no_pin, ros_arguments_given())
+    files = _named(given)
+    if output is not None and not force:
+        _check_free(output)
+    repository = Repository.of(files[0])
+    ends = repository.commit(good), repository.commit(bad)
+    _check_ends(repository, *ends)
+    processes = Processes()
+    check = _check(expression, shell, processes)
+    links = [*_untracked(repository, given, files), *(path.resolve() for path in shared)]
+    say_progress: Callable[[str], object] = (lambda text: None) if quiet else tell
+    with terminated(), Worktree(repository, links) as tree:
+        runner = Runner(repository, tree, tuple(given.arguments(tree.path)), processes, timeout)
+        try:
+            search = Search(
+                runner,
+                *ends,
+                check,
+                first_parent=first_parent,
+                on_try=lambda tried: say_progress(line_of(tried)),
+                on_note=say_progress,
+            )
+            found = search.find()
+        finally:
+            processes.kill()
+        return _report(found, runner, output, as_json=as_json)
+
+
+def _check(expression: str | None, shell: str | None, processes: Processes) -> Check | None:
+    from rsltrace.campaign.bisect.judges import check_of, command
+
+    if expression is not None:
+        return check_of(expression)
+    return None if shell is None else command(shell, processes)
+
+
+def _named(given: Given) -> list[Path]:
+    """Return the files that the command line names, the job's (or launch file's) first."""
+    files = [Path(word) for word in given.words if ":=" not in word]
+    files += [given.launch] if given.launch is not None else []
+    if not files:
+        raise click.UsageError("Missing argument 'JOB' (or --launch FILE).")
+    ros = given.ros
+    files += [Path(ros[at + 1]) for at, word in enumerate(ros[:-1]) if word == "--params-file"]
+    return [file.parent.resolve() / file.name for file in files]
+
+
+def _check_free(folder: Path) -> None:
+    for name in (_BEFORE, _AFTER):
+        if (folder / name).exists():
+            raise OutputError(f"{folder / name} exists; --force replaces it")
+
+
+def _check_ends(repository: Repository, good: Any, bad: Any) -> None:
+    """See that the search has a beginning and an end.
+
+    :raises BisectError: they are one commit, or in the wrong order.
+    """
+    if good == bad:
+        raise BisectError(f"the good and the bad revision are one commit, {good}")
+    if repository.is_ancestor(bad, good):
+        raise BisectError(
+            f"{bad} is older than {good}: the first commit that changed something is looked for, "
+            "so --good is the older one"
+        )
+
+
+def _untracked(repository: Repository, given: Given, files: list[Path]) -> Iterator[Path]:
+    """Yield what the job here names in the checkout and git does not track: it is shared."""
+    candidates = list(files)
+    try:
+        job, _ = job_of(given.words, given.launch, given.skip, given.overrides)
+    except JobError:
+        pass  # the one here may be broken: what counts are those of the revisions
+    else:
+        texts = _texts(job.resolved())
+        candidates += [job.resolve(text) for text in texts if text and len(text) < 4096]
+    for path in dict.fromkeys(Path(os.path.normpath(path)) for path in candidates):
+        inside = path.is_relative_to(repository.top) and path != repository.top
+        if inside and os.path.lexists(path) and not repository.has_tracked(path):
+            yield path
+
+
+def _texts(value: Any) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, dict):
+        for one in value.values():
+            yield from _texts(one)
+    elif isinstance(value, list):
+        for one in value:
+            yield from _texts(one)
+
+
+def _report(found: Found, runner: Runner, output: Path | None, *, as_json: bool) -> int:
+    """Say what was found, keep the traces if asked for, and return the exit status."""
+    from rsltrace.cli.output.bisect_text import as_text, as_values
+
+    kept = None
+    if output is not None:
+        output.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(found.before.run.path, output / _BEFORE)
+        shutil.copyfile(found.after.run.path, output / _AFTER)
+        kept = (output / _BEFORE, output / _AFTER)
+    if as_json:
+        say(json.dumps(as_values(found, runner.repository, kept)))
+    else:
+        say(as_text(found, runner.repository, kept))
+    return 0 if found.first is not None else 1
