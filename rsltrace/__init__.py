@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         load_job,
     )
     from rsltrace.replay import replay_trace as replay
+    from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.result import ReplayResult
     from rsltrace.run import RunResult, Simulation, record
     from rsltrace.trace.reader import Trace
@@ -48,6 +49,7 @@ _HOMES = {
     "HooksSpec": "rsltrace.job",
     "Job": "rsltrace.job",
     "LaunchSpec": "rsltrace.job",
+    "NodeReplayResult": "rsltrace.replay.one_node.result",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
     "ReplayResult": "rsltrace.replay.result",
@@ -71,6 +73,7 @@ __all__ = [
     "HooksSpec",
     "Job",
     "LaunchSpec",
+    "NodeReplayResult",
     "NodeSpec",
     "RecordSpec",
     "ReplayResult",

@@ -14,8 +14,9 @@ import click
 from rsltrace.cli.diff import print_diffs
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.record import interruptible, progress
+from rsltrace.cli.replay_node import check_options, replay_one, tell_of_run
 from rsltrace.diff.options import DiffOptions
-from rsltrace.errors import NodeError, ReplayError
+from rsltrace.errors import ReplayError
 from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
@@ -52,6 +53,17 @@ _SHOWN_MAX = 12
     help="The folder of the job file (default: that of the trace, or the present one).",
 )
 @click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
+@click.option("--node", metavar="NAME", help="Run this node alone, fed with what it got.")
+@click.option(
+    "--until-diverged", is_flag=True, help="With --node: end at the first output that differs."
+)
+@click.option("--all", "everything", is_flag=True, help="With --node: show all that differs.")
+@click.option(
+    "--ignore",
+    multiple=True,
+    metavar="FIELD",
+    help="With --node: do not compare such fields (header.stamp, /odom:twist).",
+)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
@@ -63,6 +75,10 @@ def replay(
     force: bool,
     job_folder: Path | None,
     trust: bool,
+    node: str | None,
+    until_diverged: bool,
+    everything: bool,
+    ignore: tuple[str, ...],
     as_json: bool,
     no_pin: bool,
     quiet: bool,
@@ -77,20 +93,37 @@ def replay(
     Unless the job file in the present folder (or in --job-folder) names the same code, it takes a
     yes on the terminal, or --trust.
 
+    With --node, only that node runs. It gets the messages, requests and responses of the recording
+    at their recorded times and in their recorded order, and its outputs are compared: all of them
+    are the same as long as its code is, and after a change of its code one sees what changes.
+
     The exit status is 0 if every event was as recorded (of a run that failed: the failure, too), 1
     if the replay diverged, 2 for trouble, 130, 143 or 129 if it was interrupted.
     """
     from rsltrace.replay.preparation import count_to, prepared
 
+    check_options(node, until, first, (until_diverged, everything, bool(ignore)))
     with prepared(trace, job_folder) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
         count = None if until is None else count_to(plan.trace, until)
         begin = 0 if first is None else count_to(plan.trace, first) - 1
         if not as_json:
-            for line in _told(plan):
+            for line in _told(plan, node):
                 tell(line)
         _agree(plan, trust=trust)
+        if node is not None:
+            return replay_one(
+                plan,
+                node,
+                until_diverged=until_diverged,
+                options=DiffOptions(ignore=ignore) if ignore else None,
+                output=output,
+                force=force,
+                quiet=quiet,
+                as_json=as_json,
+                everything=everything,
+            )
         result = _replayed(plan, count, max(begin, 0), output, force=force, quiet=quiet or as_json)
         reopen_standard_streams()
         status = result.exit_code
@@ -165,14 +198,14 @@ def _from(first: int, show: _Show | None) -> _Show | None:
 # -- what is told --------------------------------------------------------------------------------
 
 
-def _told(plan: Preparation) -> Iterator[str]:
+def _told(plan: Preparation, node: str | None) -> Iterator[str]:
     """Yield what will run, from where, and what is not as it was."""
     trace = plan.trace
     job = trace.job.get("name", "") or "a job"
-    yield printable(
-        f"replaying {trace.name}: {trace.event_count} events of {job} in {plan.folder}, with the "
-        "code of"
-    )
+    what = f"{trace.name}: {trace.event_count} events of {job} in {plan.folder}"
+    if node is not None:
+        what = f"{node} of {trace.name} alone ({job} in {plan.folder})"
+    yield printable(f"replaying {what}, with the code of")
     code = [(one.name, str(_near(one.file)) if one.file else "-", one.change) for one in plan.code]
     width = min(max((len(name) for name, _, _ in code), default=0), 40)
     for name, file, change in code[:_SHOWN_MAX]:
@@ -181,7 +214,7 @@ def _told(plan: Preparation) -> Iterator[str]:
         changed = [name for name, _, change in code[_SHOWN_MAX:] if change]
         more = f" (changed or not here: {', '.join(changed[:_SHOWN_MAX])})" if changed else ""
         yield printable(f"  and {len(code) - _SHOWN_MAX} more{more}")
-    if plan.job.bags:
+    if plan.job.bags and node is None:
         yield printable(f"and the bags {', '.join(bag.path for bag in plan.job.bags)}")
     if plan.changes:
         changes = (f"{c.name} {c.recorded or '-'} -> {c.present or '-'}" for c in plan.changes)
@@ -194,16 +227,7 @@ def _near(file: Path) -> Path:
 
 
 def _print(result: ReplayResult) -> None:
-    error = result.error
-    if error is not None:
-        if result.diverged and isinstance(error, NodeError) and error.traceback_text:
-            tell(error.traceback_text.rstrip())
-        as_recorded = "" if result.diverged else ", as recorded"
-        tell(f"rsltrace: the run failed{as_recorded}: {error}")
-    for note in result.notes:
-        tell(f"note: {note}")
-    if result.path is not None:
-        tell(f"wrote {result.path}")
+    tell_of_run(result.error, result.diverged, result.notes, result.path)
     if result.diff is not None:
         print_diffs([result.diff], "text", DiffOptions(), None)
         say(f"\nnext: {_next(result)}")

@@ -162,6 +162,10 @@ class Client(ServiceEnd):
         """Send a request; ``callback`` gets the first response."""
         self._pending[self.request(data).sequence_number] = callback
 
+    def has_asked(self, sequence: int) -> bool:
+        """Return whether it has sent a request of that number."""
+        return sequence <= self._sequence
+
     def request(self, data: bytes) -> RequestId:
         """Send a request to every server of that name; without one it is lost, as in DDS."""
         self._sequence += 1

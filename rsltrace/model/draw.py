@@ -52,6 +52,11 @@ def is_second_copy(number: int) -> bool:
     return number >> _SHIFT == Draw.DUPLICATE
 
 
+def duration_of(number: int, kind: Draw) -> int | None:
+    """Return how many nanoseconds a decision of that kind says, None if it is of another kind."""
+    return number & _VALUE_MAX if number >> _SHIFT == kind else None
+
+
 def draw_text(number: int) -> str:
     """Return a decision in words: ``delay 5.2 ms``, ``lost in a burst``."""
     kind, value_ns = number >> _SHIFT, number & _VALUE_MAX

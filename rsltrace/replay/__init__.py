@@ -10,15 +10,18 @@ This package is also that function, as ``rsltrace.diff`` is. Importing it loads 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 from rsltrace.callable_package import make_callable
 
 if TYPE_CHECKING:
+    from rsltrace.diff.options import DiffOptions
     from rsltrace.job import Job
+    from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.result import ReplayResult
 
 
+@overload
 def replay_trace(
     trace: str | Path,
     *,
@@ -29,7 +32,39 @@ def replay_trace(
     job_folder: str | Path | None = None,
     trust: bool = False,
     echo: bool = False,
-) -> ReplayResult:
+) -> ReplayResult: ...
+
+
+@overload
+def replay_trace(
+    trace: str | Path,
+    *,
+    node: str,
+    until_diverged: bool = False,
+    options: DiffOptions | None = None,
+    output: str | Path | None = None,
+    force: bool = False,
+    job: Job | None = None,
+    job_folder: str | Path | None = None,
+    trust: bool = False,
+    echo: bool = False,
+) -> NodeReplayResult: ...
+
+
+def replay_trace(
+    trace: str | Path,
+    *,
+    node: str | None = None,
+    until: int | str | None = None,
+    until_diverged: bool = False,
+    options: DiffOptions | None = None,
+    output: str | Path | None = None,
+    force: bool = False,
+    job: Job | None = None,
+    job_folder: str | Path | None = None,
+    trust: bool = False,
+    echo: bool = False,
+) -> ReplayResult | NodeReplayResult:
     """Run the job of a trace again, and stop at the first event that is not as recorded.
 
     ``until`` is the last event to verify, by its index (an int, or digits), or a simulated time as
@@ -38,10 +73,15 @@ def replay_trace(
     and the present one are tried. ``job`` is the job itself, of one made in Python that cannot be
     loaded from its text. ``echo`` prints the nodes' log records on stderr.
 
+    With ``node``, that node runs alone, fed with what the recording says it got, and its outputs
+    are compared, within what ``options`` leave out or tolerate; ``until_diverged`` ends the run at
+    the first that differs. Then ``until`` has no meaning, and the result is another one.
+
     This runs the code that the trace names. Unless the job file in the present folder (or in
     ``job_folder``) says the same, that takes ``trust=True``.
 
-    Returns a ``rsltrace.ReplayResult``. A run that fails as the recorded one did is verified.
+    Returns a ``rsltrace.ReplayResult``, with ``node`` a ``NodeReplayResult``. A run that fails as
+    the recorded one did is verified.
 
     :raises ReplayError: the trace cannot be replayed here, or is not trusted.
     :raises TraceError: it is missing or damaged.
@@ -55,10 +95,23 @@ def replay_trace(
     with prepared(trace, folder, job) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
+        place = None if output is None else Path(output)
+        if node is not None:
+            from rsltrace.replay.one_node.replaying import replay_node
+
+            return replay_node(
+                plan,
+                node,
+                until_diverged=until_diverged,
+                options=options,
+                output=place,
+                force=force,
+                echo=echo,
+            )
         return replay_prepared(
             plan,
             until=None if until is None else count_to(plan.trace, until),
-            output=None if output is None else Path(output),
+            output=place,
             force=force,
             echo=echo,
         )

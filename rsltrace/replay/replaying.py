@@ -12,6 +12,7 @@ from pathlib import Path
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
+from rsltrace.errors import ReplayError
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.result import ReplayResult
 from rsltrace.replay.verification import Verification
@@ -19,6 +20,7 @@ from rsltrace.run import Observer, RunResult
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
 from rsltrace.trace.chain import digest_text
+from rsltrace.trace.format import METADATA_FED
 from rsltrace.trace.reader import Trace
 
 THE_REPLAY = "the replay"
@@ -40,14 +42,21 @@ def replay_prepared(
     This runs user code: see ``trust``. ``echo`` prints what the nodes log from event number
     ``first`` on.
 
+    :raises ReplayError: it is the trace of one node alone.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     """
+    fed = plan.trace.metadata(METADATA_FED).get("node")
+    if fed is not None:
+        raise ReplayError(
+            f"{plan.trace.name} was made by replaying {fed} alone, without the nodes it hears: "
+            f"replay it with --node {fed}"
+        )
 
     def on_first(session: Session) -> None:
         session.world.echo_logs(echo)
 
     verification = Verification(plan.trace, until, first=first, on_first=on_first)
-    with _place(output) as path:
+    with place_for(output) as path:
         run = _run(plan, verification, path, force=force, observer=observer)
         compared = _diverged(plan.trace, verification)
         place = run.path or path
@@ -56,7 +65,7 @@ def replay_prepared(
 
 
 @contextmanager
-def _place(output: Path | None) -> Iterator[Path]:
+def place_for(output: Path | None) -> Iterator[Path]:
     """Give a place for the replay's trace: what is not asked for is gone afterwards."""
     if output is not None:
         yield output

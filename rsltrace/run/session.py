@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -190,8 +190,7 @@ class Session:
         from rsltrace.doors.rclpy.world import World
 
         job = self.job
-        kind = OrderedLoop if is_ordered(job) else EventLoop
-        self.loop = loop = kind(
+        self.loop = loop = self._kind_of_loop()(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
             timers=timer_queue(job.timer_ties),
             livelock_limit=job.livelock_limit,
@@ -207,12 +206,20 @@ class Session:
         if self._plan is not None:
             world.use_network(self._plan)
         world.domain.entities.census = Census() if has_rules(job) else None
-        self._recorded = recorded_run(job, world.domain, stack)
+        self._order_events(stack)
+        world.use_clocks(clocks_of(job), self.start_ns)
+
+    def _kind_of_loop(self) -> type[EventLoop]:
+        return OrderedLoop if is_ordered(self.job) else EventLoop
+
+    def _order_events(self, stack: ExitStack) -> None:
+        """Say what runs when, if the job does, and for how long."""
+        loop = self.loop
+        self._recorded = recorded_run(self.job, self.world.domain, stack)
         if isinstance(loop, OrderedLoop):
             recorded = None if self._recorded is None else self._recorded.order
             with self._guarded.engaged():
-                world.use_scheduling(loop, scheduling_plan(job, self.start_ns, recorded))
-        world.use_clocks(clocks_of(job), self.start_ns)
+                self.world.use_scheduling(loop, scheduling_plan(self.job, self.start_ns, recorded))
 
     def _import_what_is_named(self) -> None:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""
@@ -240,7 +247,7 @@ class Session:
                 f"{path} stays as it is until this run is over; until then it goes to "
                 f"{writer.place}"
             )
-        recorder = Recorder(writer, keep_payload=payload_filter(job))
+        recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
@@ -249,6 +256,9 @@ class Session:
         note_choices(self.loop)
         if job.stop.size is not None:
             self.loop.stop_conditions += (stop_at_size(job.stop.size, lambda: writer.size),)
+
+    def _payload_filter(self) -> Callable[[str], bool]:
+        return payload_filter(self.job)
 
     def _interrupt(self, stop: Stop) -> None:
         """End the run after the present event, or within it if it does not come back.

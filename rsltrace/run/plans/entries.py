@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from functools import partial
 from inspect import Parameter
 from typing import Any
@@ -22,12 +22,17 @@ from rsltrace.run.plans.target import load_target
 _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
 
-def node_entries(job: Job) -> list[Entry]:
-    """Import what the job names and let rcl parse the arguments, before anything is constructed."""
+def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
+    """Import what the job names and let rcl parse the arguments, before anything is constructed.
+
+    ``only`` are the places in ``nodes:`` of those that are wanted (None: all).
+    """
     entries = []
     mains = Mains(job)
     for_all = _arguments_for_all(job)
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+        if only is not None and index not in only:
+            continue
         loc = ("nodes", index, spec.kind)
         where = spec.origin or locate(job, loc)
         argv = None

@@ -15,7 +15,6 @@ from rsltrace.loop.policy import (
     PriorityRule,
     RateMonotonic,
 )
-from rsltrace.loop.recorded import Recorded
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.run.plans.target import load_target
 
@@ -30,8 +29,8 @@ def is_ordered(job: Job) -> bool:
     return not fifo or job.executors is not None or job.execution is not None
 
 
-def scheduling_plan(job: Job, start_ns: int, recorded: Recorded | None) -> SchedulingPlan:
-    """Return the plan of a job. ``recorded`` is the order that it follows, if it says so.
+def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> SchedulingPlan:
+    """Return the plan of a job. ``policy`` is what it follows instead of its own.
 
     :raises JobError: if the policy's class cannot be made.
     """
@@ -46,7 +45,7 @@ def scheduling_plan(job: Job, start_ns: int, recorded: Recorded | None) -> Sched
         if job.execution.default is not None:
             rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
     return SchedulingPlan(
-        policy=recorded or _policy(job),
+        policy=policy or _policy(job),
         executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
         occupies=job.executors is not None or job.execution is not None,
         execution=tuple(rules),

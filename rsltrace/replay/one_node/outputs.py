@@ -1,0 +1,157 @@
+"""What a node has put out in two recordings, side by side.
+
+Outputs are compared topic by topic (or service, or the log): those of one simulated time in their
+order. Where one has more than the other, something is missing or new.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.values.fields import WHOLE, diff_messages, preview
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import Output, OutputKind
+from rsltrace.replay.one_node.result import Change, OutputChange
+from rsltrace.trace.format import TOPIC_ROSOUT
+from rsltrace.trace.reader import Trace
+
+_COMPARED = (
+    OutputKind.MESSAGE,
+    OutputKind.REQUEST,
+    OutputKind.RESPONSE,
+    OutputKind.LOG,
+    OutputKind.EXCEPTION,
+)
+_NOT_KEPT = "(not kept)"
+_FIELDS_MAX = 20
+Key = tuple[OutputKind, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Put:
+    """An output of a node: when, where to, its place among all outputs of the node."""
+
+    stamp_ns: int
+    key: Key
+    place: int
+    output: Output
+
+
+def outputs_of_node(trace: Trace, node: str) -> list[Put]:
+    """Return what a node has published, called, answered, logged and raised, in its order."""
+    entities = trace.entities
+    named = [one for one in entities.values() if one.name == node]
+    nodes = {one.id for one in named if one.kind is EntityKind.NODE}
+    own = {one.id: one.name for one in entities.values() if one.node in nodes}
+    found: list[Put] = []
+    for rows, outputs in zip(trace.events(), trace.outputs(), strict=True):
+        first = int(rows["index"][0]) if len(rows) else 0
+        stamps = rows["stamp"]
+        for event, entity, kind, digest, sequence in zip(
+            outputs["event"].tolist(),
+            outputs["entity"].tolist(),
+            outputs["kind"].tolist(),
+            outputs["hash"].tolist(),
+            outputs["sequence"].tolist(),
+            strict=True,
+        ):
+            if kind in _COMPARED and entity in own:
+                kind = OutputKind(kind)
+                name = TOPIC_ROSOUT if kind is OutputKind.LOG else own[entity]
+                output = Output(event, entity, kind, digest, sequence)
+                found.append(Put(int(stamps[event - first]), (kind, name), len(found), output))
+    return found
+
+
+def changes(
+    recorded: tuple[Trace, Sequence[Put]],
+    present: tuple[Trace, Sequence[Put]],
+    options: DiffOptions,
+) -> Iterator[OutputChange]:
+    """Yield what has changed, in the order of its time."""
+    for before, after in _pairs(recorded[1], present[1]):
+        if before is not None and after is not None:
+            if before.output.hash == after.output.hash:
+                continue
+            fields = _fields(recorded[0], before, present[0], after, options)
+            if not fields:
+                continue  # what differs is ignored, or tolerated
+            yield _change(Change.CHANGED, before, before, after, fields)
+        elif before is not None:
+            text = _preview(recorded[0], before)
+            yield _change(Change.MISSING, before, before, None, (FieldDifference(WHOLE, text, ""),))
+        else:
+            assert after is not None
+            text = _preview(present[0], after)
+            yield _change(Change.NEW, after, None, after, (FieldDifference(WHOLE, "", text),))
+
+
+def _change(
+    what: Change,
+    at: Put,
+    before: Put | None,
+    after: Put | None,
+    fields: tuple[FieldDifference, ...],
+) -> OutputChange:
+    return OutputChange(
+        change=what,
+        time_ns=at.stamp_ns,
+        kind=at.key[0].label,
+        name=at.key[1],
+        recorded_event=None if before is None else before.output.event,
+        event=None if after is None else after.output.event,
+        fields=fields,
+    )
+
+
+def _pairs(recorded: Sequence[Put], present: Sequence[Put]) -> list[tuple[Put | None, Put | None]]:
+    """Return outputs that stand for each other, in order."""
+    waiting: dict[tuple[Key, int], list[Put]] = {}
+    for put in present:
+        waiting.setdefault((put.key, put.stamp_ns), []).append(put)
+    for same in waiting.values():
+        same.reverse()
+    found: list[tuple[Put | None, Put | None]] = []
+    for put in recorded:
+        others = waiting.get((put.key, put.stamp_ns))
+        found.append((put, others.pop() if others else None))
+    found += [(None, put) for others in waiting.values() for put in others]
+    return sorted(found, key=_place)
+
+
+def _place(pair: tuple[Put | None, Put | None]) -> tuple[int, int]:
+    put = pair[0] or pair[1]
+    assert put is not None
+    return put.stamp_ns, put.place
+
+
+def _fields(
+    trace: Trace, before: Put, other: Trace, after: Put, options: DiffOptions
+) -> tuple[FieldDifference, ...]:
+    a, b = _decoded(trace, before), _decoded(other, after)
+    if a is None or b is None:
+        return (FieldDifference(WHOLE, _preview(trace, before), _preview(other, after)),)
+    found, _ = diff_messages(a, b, options.for_topic(before.key[1]), limit=_FIELDS_MAX)
+    return tuple(one for one in found if not one.within_tolerance)
+
+
+def _decoded(trace: Trace, put: Put) -> object | None:
+    if put.key[0] is OutputKind.EXCEPTION:
+        return trace.detail(put.output)
+    channel = trace.channel_of(put.output)
+    payload = trace.payload(put.output)
+    if channel is None or payload is None:
+        return None
+    try:
+        return trace.decode(channel, payload[2])
+    except TraceError:
+        return None
+
+
+def _preview(trace: Trace, put: Put) -> str:
+    message = _decoded(trace, put)
+    return _NOT_KEPT if message is None else preview(message, 60)

@@ -1,0 +1,101 @@
+"""What replaying one node found: the outputs that are not as recorded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rsltrace.model.stamp import format_seconds
+
+if TYPE_CHECKING:
+    from rsltrace.diff.result.fields import FieldDifference
+    from rsltrace.errors import RunError
+
+
+class Change(Enum):
+    """What has become of an output."""
+
+    CHANGED = "changed"
+    MISSING = "missing"
+    NEW = "new"
+
+
+@dataclass(frozen=True, slots=True)
+class OutputChange:
+    """An output of the node that is not as recorded.
+
+    ``time_ns`` is simulated time, ``kind`` is ``message``, ``request``, ``response``, ``log`` or
+    ``exception``, ``name`` the topic or service. ``fields`` say what differs (``a`` recorded,
+    ``b`` new); of a missing or new output it is one entry with the whole of it. ``recorded_event``
+    and ``event`` are the indices of the events in the recording and in the replay, or None.
+    """
+
+    change: Change
+    time_ns: int
+    kind: str
+    name: str
+    recorded_event: int | None
+    event: int | None
+    fields: tuple[FieldDifference, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class NodeReplayResult:
+    """How a node did, alone, with the inputs of a recording.
+
+    ``trace`` (a path) is the recording, ``node`` the node's full name; ``inputs`` is how many
+    messages, requests and responses of others were fed. ``compared`` is how many outputs the
+    recording has of it (until ``end_ns``, if the replay ended before); ``changes`` are those that
+    are not the same now, in the order of time, the first one first. ``ended`` says why the replay
+    ended. ``path`` is the replay's own trace, None if none was asked for. ``error`` is what went
+    wrong in the node. ``notes`` are texts for people.
+    """
+
+    trace: str
+    node: str
+    inputs: int
+    compared: int
+    changes: tuple[OutputChange, ...]
+    end_ns: int
+    ended: str
+    path: Path | None = None
+    error: RunError | None = field(default=None, compare=False)
+    notes: tuple[str, ...] = ()
+    interrupted: int = 0
+    """The exit status of a replay that was itself interrupted (130: Ctrl-C), else 0."""
+
+    @property
+    def same(self) -> bool:
+        """Whether every output is as recorded."""
+        return not self.changes
+
+    @property
+    def diverged(self) -> bool:
+        """Whether some output is not as recorded."""
+        return bool(self.changes)
+
+    @property
+    def first(self) -> OutputChange | None:
+        """The first output that is not as recorded."""
+        return self.changes[0] if self.changes else None
+
+    @property
+    def exit_code(self) -> int:
+        """0 the same, 1 not; of an interrupted replay 130, 143 or 129."""
+        return 1 if self.changes else self.interrupted
+
+    @property
+    def sentence(self) -> str:
+        """The result in one sentence."""
+        inputs = "1 input" if self.inputs == 1 else f"{self.inputs} inputs"
+        fed = f"fed with {inputs} to {format_seconds(self.end_ns)} s"
+        first = self.first
+        if first is None:
+            return f"{self.node} does the same: {self.compared} outputs ({fed})"
+        when = format_seconds(first.time_ns)
+        at = f"{first.kind} {first.name} at {when} s is {first.change.value}"
+        more = len(self.changes) - 1
+        later = f", and {more} later" if more else ""
+        return f"{self.node} does something else: {at}{later}, of {self.compared} outputs ({fed})"

@@ -1,0 +1,222 @@
+"""A run of one entry of a recorded job, fed with what its nodes got then."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from rsltrace.errors import ReplayError
+from rsltrace.loop.fed import FedLoop, FedOrderedLoop, end_of
+from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.policy import Fifo
+from rsltrace.middleware.services import Client
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.replay.one_node.answers import Answers
+from rsltrace.replay.one_node.columns import Columns
+from rsltrace.replay.one_node.script import RecordedScript
+from rsltrace.replay.one_node.unit import Unit
+from rsltrace.replay.one_node.watch import Watch
+from rsltrace.replay.preparation import Preparation
+from rsltrace.run import Observer, RunResult
+from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
+from rsltrace.run.session import Session
+from rsltrace.trace.format import METADATA_FED
+
+
+class FedSession(Session):
+    """Runs ``unit`` alone. The stages are those of ``Session``; bags, stop conditions, policy and
+    executors of the job are none of its business: the recording has what came of them."""
+
+    loop: FedLoop
+
+    def __init__(
+        self,
+        plan: Preparation,
+        columns: Columns,
+        unit: Unit,
+        output: Path,
+        *,
+        force: bool = False,
+        echo: bool = False,
+        observer: Observer | None = None,
+    ) -> None:
+        recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
+        super().__init__(
+            plan.job, output, force=force, echo=echo, observer=observer, replay=recorded
+        )
+        self._columns = columns
+        self._unit = unit
+        self._trace = plan.trace
+        self.script = RecordedScript(columns, unit, self._perform)
+        self._answers = Answers(columns, unit.is_own)
+
+    # -- what is different from a run of the whole job --------------------------------------------
+
+    def _open_bags(self, stack: ExitStack, notes: object) -> None:
+        self._bags = []
+        self._notes = ()
+        events = self._columns.events
+        jumps = events["stamp"][events["kind"] == EventKind.CLOCK_JUMP]
+        self.start_ns = self._trace.start_ns
+        if not self._trace.result and len(jumps):
+            self.start_ns = int(jumps[0])
+        self.end_ns = self.script.end_ns
+
+    def _kind_of_loop(self) -> type[EventLoop]:
+        return FedOrderedLoop if is_ordered(self.job) else FedLoop
+
+    def _order_events(self, stack: ExitStack) -> None:
+        loop = self.loop
+        self._recorded = None
+        loop.script = self.script
+        loop.by_steps, loop.min_step_ns = bool(loop.min_step_ns), 0
+        if isinstance(loop, FedOrderedLoop):
+            plan = scheduling_plan(self.job, self.start_ns, Fifo())
+            self.world.use_scheduling(loop, replace(plan, occupies=False))
+            loop.has_workers = plan.occupies
+
+    def _import_what_is_named(self) -> None:
+        from rsltrace.doors.stand_ins import StandIns
+
+        job, world = self.job, self.world
+        self._stand_ins = StandIns(world.domain, self._definition)
+        self.loop.stop_conditions = (end_of(self.script, self.loop),)  # type: ignore[assignment]
+        hooks = int(job.hooks.before is not None)
+        nodes = range(hooks, hooks + len(job.nodes))
+        with world.importing():
+            self._entries = []
+            if hooks and 0 in self._unit.entries:
+                self._entries += hook_entries(job, "before", job.hooks.before, lambda: job)
+            wanted = [place - hooks for place in self._unit.entries if place in nodes]
+            self._entries += node_entries(job, wanted)
+            if any(place >= nodes.stop for place in self._unit.entries):
+                self._entries += hook_entries(job, "after", job.hooks.after, world.all_nodes)
+
+    def _payload_filter(self) -> Callable[[str], bool]:
+        return lambda topic: True
+
+    def _open_trace(self, stack: ExitStack, path: Path) -> None:
+        super()._open_trace(stack, path)
+        assert self._writer is not None
+        told = {
+            "node": self._unit.node.name,
+            "entries": ",".join(map(str, self._unit.entries)),
+        }
+        self._writer.add_metadata(METADATA_FED, told)
+        self._listen()
+
+    def _listen(self) -> None:
+        """Hear of the unit's entities and events."""
+        recorder = self.world.domain.dispatcher.recorder
+        assert recorder is not None
+        met, end_event = recorder.entity, recorder.end_event
+        names: dict[int, str] = {0: ""}
+        script = self.script
+
+        def entity(one: Entity) -> None:
+            met(one)
+            if one.node == one.id:
+                names[one.id] = one.name
+            script.met(one, names.get(one.node, ""))
+
+        def ended(stamp_ns: int, kind: int, flags: int, whose: int, *rest: int) -> None:
+            end_event(stamp_ns, kind, flags, whose, *rest)
+            if kind != EventKind.BAG:
+                script.happened(kind, whose, stamp_ns)
+
+        recorder.entity = entity  # type: ignore[method-assign, assignment]
+        recorder.end_event = ended  # type: ignore[method-assign, assignment]
+
+    @property
+    def fed(self) -> int:
+        """How many messages, requests and responses of others there have been."""
+        return self._stand_ins.fed
+
+    def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
+        """Return nothing: rules for other nodes have nothing to do here."""
+        return ()
+
+    def begin(self) -> None:
+        """Construct the unit among the others, and jump to the start."""
+        world = self.world
+        constructions = self._columns.constructions
+        own = [one for one in constructions if self._unit.own_events[one]]
+        with self._failures(), self._engaged():
+            world.plan(self._entries)
+            world.stacks.programs.fed = True
+            for event, entry in zip(own, self._entries, strict=False):
+                self.script.perform_until(event)
+                if not world.construct(entry):
+                    say_where(self.job, entry, world.error)
+                    break
+            if not self.ended:
+                self.script.perform_until(constructions[-1] + 1)
+                world.jump(self.start_ns)
+                self._has_begun = not self.ended
+
+    # -- what others did --------------------------------------------------------------------------
+
+    def _perform(
+        self,
+        event: int,
+        created: list[Entity],
+        sent: list[tuple[int, Any]],
+        busy_ns: int,
+    ) -> None:
+        from rsltrace.doors.stand_ins import Sent
+
+        found = []
+        for position, row in sent:
+            kind, entity = OutputKind(int(row["kind"])), int(row["entity"])
+            answers = None
+            if kind is OutputKind.RESPONSE:
+                answers = self._answers.of(event, position, entity)
+                if answers is None:
+                    continue
+            data = self._payload(event, position)
+            found.append(Sent(kind, entity, data, int(row["hash"]), answers))
+        self._stand_ins.perform(created, found, busy_ns, self._client)
+
+    def _payload(self, event: int, position: int) -> Callable[[], bytes]:
+        def read() -> bytes:
+            data = self._columns.payload(event, position)
+            if data is None:
+                output = self._trace.outputs_of(event)[position]
+                name = self._trace.entity(output.entity).name
+                raise ReplayError(
+                    f"{self._trace.name} does not hold the messages of {name}, which "
+                    f"{self._unit.node.name} asks for now: record once more with them "
+                    "(record.topics)"
+                )
+            return data
+
+        return read
+
+    def _client(self, recorded: int) -> Client | None:
+        """Return the client of the unit that stands for a recorded one, if it is there."""
+        present = self.script.present(recorded)
+        clients = self.world.domain.graph.clients(self._trace.entity(recorded).name)
+        return next((one for one in clients if one.entity_id == present), None)
+
+    def _definition(self, type_name: str) -> tuple[str, str]:
+        for channel in self._trace.channels.values():
+            if channel.type == type_name:
+                return channel.schema_text, str(channel.metadata.get("topic_type_hash", ""))
+        return "", ""
+
+
+def run_fed(session: FedSession, watch: Watch | None = None) -> RunResult:
+    """Run a session to its end."""
+    with session:
+        if watch is not None:
+            watch.attach(session)
+        session.begin()
+        if not session.ended:
+            session.go_on()
+        return session.finish()

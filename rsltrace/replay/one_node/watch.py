@@ -1,0 +1,80 @@
+"""Seeing the first output that is not as recorded when it comes about, and ending the run there."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from rsltrace.loop.stop import Stop
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import OutputKind
+from rsltrace.replay.one_node.outputs import Put
+from rsltrace.trace.format import TOPIC_ROSOUT
+
+if TYPE_CHECKING:
+    from rsltrace.run.session import Session
+
+
+class Watch:
+    """Compares the outputs of ``node`` with ``recorded`` ones, and ends the run with ``stop``."""
+
+    def __init__(self, recorded: Sequence[Put], node: str, stop: Stop) -> None:
+        self._stop = stop
+        self._node = node
+        self._own: dict[int, str] = {}
+        self._nodes: set[int] = set()
+        self._in_order = deque(put for put in recorded if put.key[0] is not OutputKind.EXCEPTION)
+        self._expected: dict[tuple[int, str], deque[Put]] = {}
+        for put in self._in_order:
+            self._expected.setdefault((int(put.key[0]), put.key[1]), deque()).append(put)
+        self._met: set[int] = set()
+        self._sent: list[tuple[int, int, int]] = []
+
+    def attach(self, session: Session) -> None:
+        """Compare what comes from now on."""
+        recorder = session.world.domain.dispatcher.recorder
+        assert recorder is not None, "a replay is recorded"
+        met, message, end_event = recorder.entity, recorder.message, recorder.end_event
+        loop = session.loop
+
+        def entity(one: Entity) -> None:
+            met(one)
+            if one.node == one.id and one.name == self._node:
+                self._nodes.add(one.id)
+            if one.node in self._nodes:
+                self._own[one.id] = one.name
+
+        def sent(
+            kind: int, entity: int, channel: int, stamp_ns: int, data: bytes, content_hash: int
+        ) -> int:
+            self._sent.append((kind, entity, content_hash))
+            return message(kind, entity, channel, stamp_ns, data, content_hash)
+
+        def ended(stamp_ns: int, *event: int) -> None:
+            end_event(stamp_ns, *event)
+            if not self._as_recorded(stamp_ns):
+                loop.stop(self._stop)
+
+        recorder.entity = entity  # type: ignore[method-assign, assignment]
+        recorder.message = sent  # type: ignore[method-assign]
+        recorder.end_event = ended  # type: ignore[method-assign, assignment]
+
+    def _as_recorded(self, now_ns: int) -> bool:
+        """Return whether what an event has sent was recorded, and nothing is missing until now."""
+        sent, self._sent = self._sent, []
+        for kind, entity, content_hash in sent:
+            name = TOPIC_ROSOUT if kind == OutputKind.LOG else self._own.get(entity)
+            if entity not in self._own or name is None:
+                continue
+            expected = self._expected.get((kind, name))
+            if not expected:
+                return False
+            put = expected.popleft()
+            self._met.add(put.place)
+            if put.stamp_ns != now_ns or put.output.hash != content_hash:
+                return False
+        waiting = self._in_order
+        while waiting and waiting[0].place in self._met:
+            self._met.discard(waiting.popleft().place)
+        return not waiting or waiting[0].stamp_ns >= now_ns

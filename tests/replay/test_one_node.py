@@ -1,0 +1,194 @@
+"""One node of a trace alone does what it did in the graph, whatever the job is made of."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rsltrace
+from rsltrace.job import load_job
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind
+from rsltrace.run import run
+from rsltrace.trace.reader import Trace
+from tests.replay.test_jobs_replay import EXAMPLES, FEATURES
+from tests.run.conftest import TALKER
+from tests.run.test_recorded_order import ALL, MIXED
+
+pytestmark = pytest.mark.ros
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def nodes_of(trace: Path) -> list[str]:
+    """Return the names of the nodes in a trace."""
+    with Trace.open(trace) as opened:
+        nodes = (e.name for e in opened.entities.values() if e.kind is EntityKind.NODE)
+        return list(dict.fromkeys(nodes))
+
+
+def events_of(trace: Path, node: str) -> list[tuple[int, int, int]]:
+    """Return (simulated time, kind, input hash) of the events of a node."""
+    with Trace.open(trace) as opened:
+        own = {e.id for e in opened.entities.values() if opened.node_of(e).name == node}
+        return [
+            (int(row["stamp"]), int(row["kind"]), int(row["input_hash"]))
+            for rows in opened.events()
+            for row in rows
+            if int(row["entity"]) in own
+        ]
+
+
+def unchanged(
+    trace: Path, folder: Path, *, without: tuple[str, ...] = (), twice: bool = False
+) -> None:
+    """See that each node alone does the same: its outputs, and its events with their inputs.
+
+    ``twice``: also when it is fed from the trace of that.
+    """
+    names = [name for name in nodes_of(trace) if name not in without]
+    assert len(names) > 1
+    for name in names:
+        again = trace.with_name("alone.mcap")
+        result = rsltrace.replay(
+            trace, node=name, trust=True, job_folder=folder, output=again, force=True
+        )
+        assert result.same, result.sentence
+        assert result.exit_code == 0
+        assert result.compared > 0
+        assert events_of(again, name) == events_of(trace, name)
+        if not twice:
+            continue
+        once_more = rsltrace.replay(again, node=name, trust=True, job_folder=folder)
+        assert once_more.same, once_more.sentence
+        assert once_more.compared == result.compared
+
+
+@pytest.mark.parametrize(("job", "overrides"), EXAMPLES)
+def test_each_node_of_the_examples(
+    job: str, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The monitor of the determinism network reads the states of the others, as no robot could."""
+    if "benchmark8" in job:
+        pytest.skip("one entry makes all of its nodes")
+    assert run(load_job(ROOT / job, overrides=overrides), tmp_path / "run.mcap").error is None
+    monkeypatch.chdir(tmp_path)
+    unchanged(tmp_path / "run.mcap", (ROOT / job).parent, without=("/monitor",))
+
+
+@pytest.mark.parametrize("feature", ["", *FEATURES])
+def test_mains_threads_services_and_blocking_calls(feature: str, tmp_path: Path) -> None:
+    (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
+    (tmp_path / "job.yaml").write_text(ALL + FEATURES.get(feature, "") + "seed: 5\n")
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap").error is None
+    unchanged(tmp_path / "run.mcap", tmp_path, twice=not feature)
+
+
+@pytest.mark.skipif(importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs")
+@pytest.mark.parametrize(
+    "more", ["", "delay: {default: {uniform: {min: 1ms, max: 30ms}}}\n", "policy: permutation\n"]
+)
+def test_actions_lifecycles_and_parameters_set_from_outside(more: str, tmp_path: Path) -> None:
+    programs = ("fibonacci_server", "fibonacci_client", "camera", "camera_manager")
+    nodes = "".join(f"  - {{main: demo_interactions.{name}:main}}\n" for name in programs)
+    folder = ROOT / "tests/demos/demo_interactions"
+    (tmp_path / "job.yaml").write_text(
+        f"nodes:\n{nodes}search_path: [{folder}]\nstop: {{duration: 5s}}\nseed: 3\n{more}"
+    )
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap").error is None
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        assert any((rows["kind"] == EventKind.ACTION).any() for rows in trace.events())
+    unchanged(tmp_path / "run.mcap", tmp_path, twice=True)
+
+
+def test_a_changed_node_is_seen_at_its_first_changed_output(
+    recorded: Callable[..., Path], tmp_path: Path
+) -> None:
+    trace = recorded()
+    code = tmp_path / "nodes_of_replay.py"
+    code.write_text(code.read_text().replace("self.warned += 3", "self.warned += 4"))
+    result = rsltrace.replay(trace, node="watch", trust=True)
+    assert result.node == "/watch"
+    assert result.exit_code == 1
+    assert result.first is not None
+    assert (result.first.kind, result.first.name) == ("log", "/rosout")
+    assert result.first.change.value == "changed"
+    assert result.first.fields[0].path == "msg"
+    assert any("those of the recording" in note for note in result.notes)
+    first_only = rsltrace.replay(trace, node="watch", trust=True, until_diverged=True)
+    assert first_only.changes == (result.first,)
+    assert first_only.end_ns <= result.first.time_ns + 100_000_000
+    assert rsltrace.replay(trace, node="source", trust=True).same
+    assert rsltrace.replay(trace, node="filter", trust=True).same
+
+
+def test_others_need_not_be_there(recorded: Callable[..., Path], tmp_path: Path) -> None:
+    """The code of the other nodes may be gone, or broken: it is not imported."""
+    job = """\
+nodes:
+  - {node: nodes_of_replay:Source, parameters: {gain: 2.0}}
+  - {node: filter_of_replay:Filter}
+stop: {duration: 1s}
+"""
+    (tmp_path / "filter_of_replay.py").write_text("from nodes_of_replay import Filter\n")
+    trace = recorded(job)
+    (tmp_path / "filter_of_replay.py").write_text("raise SystemExit('never imported')\n")
+    assert rsltrace.replay(trace, node="source", trust=True).same
+
+
+def test_what_the_trace_does_not_hold_is_named(recorded: Callable[..., Path]) -> None:
+    job = """\
+nodes: [{node: nodes_of_replay:Source}, {node: nodes_of_replay:Filter}]
+stop: {duration: 1s}
+record: {exclude: [/speed]}
+"""
+    trace = recorded(job)
+    with pytest.raises(
+        rsltrace.RsltraceError, match=r"does not hold what /filter got on /speed: .*record\.exclude"
+    ):
+        rsltrace.replay(trace, node="filter", trust=True)
+    assert rsltrace.replay(trace, node="source", trust=True).same
+
+
+def test_wrong_names_and_whole_replays_of_a_part(
+    recorded: Callable[..., Path], tmp_path: Path
+) -> None:
+    trace = recorded()
+    with pytest.raises(rsltrace.RsltraceError, match=r"no node /wach: did you mean '/watch'"):
+        rsltrace.replay(trace, node="wach", trust=True)
+    rsltrace.replay(trace, node="watch", trust=True, output=tmp_path / "alone.mcap")
+    with pytest.raises(rsltrace.RsltraceError, match="replay it with --node /watch"):
+        rsltrace.replay(tmp_path / "alone.mcap", trust=True)
+
+
+def test_a_node_that_raises_as_recorded_is_the_same(recorded: Callable[..., Path]) -> None:
+    code = """
+class Fragile(Watch):
+    def got(self, message):
+        super().got(message)
+        if message.data > 3.0:
+            raise ValueError(f'{message.data} is too much')
+"""
+    job = """\
+nodes: [{node: nodes_of_replay:Source}, {node: nodes_of_replay:Filter},
+        {node: nodes_of_replay:Fragile}]
+stop: {duration: 3s}
+"""
+    trace = recorded(job, code)
+    result = rsltrace.replay(trace, node="watch", trust=True)
+    assert result.same
+    assert result.error is not None
+    assert rsltrace.replay(trace, node="filter", trust=True).same
+
+
+def test_traces_that_were_cut_off(recorded: Callable[..., Path], tmp_path: Path) -> None:
+    trace = recorded(overrides=["record.segment_events=16"])
+    data = trace.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(data[: len(data) * 3 // 5])
+    result: Any = rsltrace.replay(cut, node="filter", trust=True)
+    assert result.same, result.sentence
+    assert any("cut off" in note for note in result.notes)
