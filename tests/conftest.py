@@ -8,7 +8,7 @@ import gc
 import os
 import signal
 import subprocess
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, settings
 
 from rsltrace.cli.main import cli
+from tests.forked_command import Forks
 
 settings.register_profile(
     "same", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
@@ -86,3 +87,11 @@ def command(
         return subprocess.CompletedProcess(texts, result.exit_code, result.stdout, result.stderr)
 
     return call
+
+
+@pytest.fixture(scope="session")
+def forks() -> Iterator[Forks]:
+    """Runs ``rsltrace record`` in a process that need not be started anew."""
+    started = Forks()
+    yield started
+    started.close()

@@ -27,7 +27,7 @@ from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace
 
-CASES = int(os.environ.get("RSLTRACE_PLANTED", "5"))
+CASES = int(os.environ.get("RSLTRACE_PLANTED", "3"))
 pytestmark = pytest.mark.repeated
 SEEDS = st.integers(0, 2**32 - 1)
 

@@ -278,7 +278,7 @@ def test_an_object_may_say_itself_what_its_state_is() -> None:
 
 # -- in runs --------------------------------------------------------------------------------------
 
-PLANTINGS = 5 * int(os.environ.get("RSLTRACE_PLANTED", "8"))
+PLANTINGS = 5 * int(os.environ.get("RSLTRACE_PLANTED", "4"))
 
 PLANTED: dict[str, Any] = {"at": -1, "change": lambda node: None}
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import pytest
 
+from tests.forked_command import Forks, can_fork
+
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 if "demo_packages" not in sys.modules:  # tests are imported without their folder
@@ -77,14 +79,17 @@ def record_job(job_file: Callable[..., Path], tmp_path: Path) -> Callable[..., A
 
 
 @pytest.fixture
-def rsltrace(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess[str]]:
-    """Run the command in ``tmp_path`` and return what it did."""
+def rsltrace(tmp_path: Path, forks: Forks) -> Callable[..., subprocess.CompletedProcess[str]]:
+    """Run the command in a process of its own, in ``tmp_path``, and return what it did."""
 
     def call(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
         options.setdefault("cwd", tmp_path)
         env = {**os.environ, **options.pop("env", {})}
+        words = [str(argument) for argument in arguments]
+        if options.keys() == {"cwd"} and can_fork(words, env):
+            return forks.run(words, options["cwd"], env, 300)
         return subprocess.run(
-            [sys.executable, "-m", "rsltrace", *map(str, arguments)],
+            [sys.executable, "-m", "rsltrace", *words],
             capture_output=True,
             text=True,
             timeout=300,

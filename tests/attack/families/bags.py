@@ -283,6 +283,5 @@ FAMILY = Family(
         "metadata": _metadata,
         "strange-places": _strange_places,
     },
-    rounds=1,
     ros=True,
 )

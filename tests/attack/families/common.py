@@ -22,11 +22,9 @@ class Family:
     attacks: Mapping[str, Attack]
     slow: frozenset[str] = frozenset()
     """Attacks that wait: not for the slice in ``make test``."""
-    once: frozenset[str] = frozenset()
-    """Attacks that are dear: the slice tries them in the first round only."""
     sliced: frozenset[str] = frozenset()
     """The attacks of the slice, if not all that are not slow."""
-    rounds: int = 2
+    rounds: int = 1
     """How often the slice tries each."""
     ros: bool = False
     """Whether nodes run."""
@@ -38,8 +36,6 @@ class Family:
     def in_slice(self, seed: int) -> bool:
         """Return whether ``make test`` may try a seed."""
         attack = self.attack_of(seed)
-        if attack in self.once and seed >= len(self.attacks):
-            return False
         return attack in self.sliced if self.sliced else attack not in self.slow
 
     def case(self, seed: int, folder: Path, corpus: Corpus) -> Case:

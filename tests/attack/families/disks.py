@@ -300,4 +300,4 @@ _ATTACKS: dict[str, Callable[[Random, Case, Corpus], None]] = {
     "small-disk": _small_disk,
 }
 
-FAMILY = Family("disks", _ATTACKS, rounds=1, ros=True)
+FAMILY = Family("disks", _ATTACKS, ros=True)

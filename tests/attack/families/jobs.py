@@ -420,7 +420,5 @@ FAMILY = Family(
         "command-line": _shouts,
         "canaries": _canaries,
     },
-    once=frozenset(("laughs", "nesting")),
-    rounds=2,
     ros=True,
 )

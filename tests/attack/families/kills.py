@@ -83,6 +83,5 @@ FAMILY = Family(
         **{f"{name}-early": _attack(*end, early=True) for name, end in _ENDS.items()},
     },
     slow=frozenset(f"{name}-early" for name in _ENDS),  # what they hit is up to the wall clock
-    rounds=2,
     ros=True,
 )

@@ -160,6 +160,5 @@ FAMILY = Family(
     "nodes",
     {what: _attack(what) for group in _GROUPS.values() for what in group.split()},
     sliced=frozenset(_SLICE.split()),
-    rounds=1,
     ros=True,
 )

@@ -185,6 +185,6 @@ FAMILY = Family(
         "job-name": _attack(_name_of_job),
         "node-names": _attack(_names_of_nodes),
     },
-    rounds=4,
+    rounds=2,
     ros=True,
 )

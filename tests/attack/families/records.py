@@ -403,5 +403,4 @@ FAMILY = Family(
         "attachments": _attack(_attachments),
         "channels": _attack(_channels),
     },
-    rounds=1,
 )

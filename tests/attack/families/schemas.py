@@ -160,5 +160,4 @@ FAMILY = Family(
         "huge": _attack(_huge),
         "syntax": _attack(_syntax),
     },
-    rounds=1,
 )

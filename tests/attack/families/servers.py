@@ -312,5 +312,4 @@ FAMILY = Family(
         )
     ),
     slow=frozenset(("endless", "silent", "drips", "drips-headers", "each-slow")),
-    rounds=1,
 )

@@ -177,5 +177,4 @@ FAMILY = Family(
         "attachments": _records(_attachments),
         "file-name": _file_name,
     },
-    rounds=1,
 )

@@ -139,5 +139,4 @@ FAMILY = Family(
         "another-run": _another_run,
         "cut-before-first-segment": _cut_before_the_first_segment,
     },
-    rounds=1,
 )
