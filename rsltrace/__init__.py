@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace._version import __version__
 
 if TYPE_CHECKING:
+    from rsltrace.debug.client import DebugSession
     from rsltrace.diff import diff_files as diff
     from rsltrace.diff.bags.comparison import diff_bags
     from rsltrace.diff.options import DiffOptions
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagDiff": "rsltrace.diff.result.bags",
     "BagSpec": "rsltrace.job",
+    "DebugSession": "rsltrace.debug.client",
     "Diff": "rsltrace.diff.result.traces",
     "DiffOptions": "rsltrace.diff.options",
     "HooksSpec": "rsltrace.job",
@@ -68,6 +70,7 @@ _HOMES = {
 __all__ = [
     "BagDiff",
     "BagSpec",
+    "DebugSession",
     "Diff",
     "DiffOptions",
     "HooksSpec",

@@ -8,6 +8,7 @@
     │   ├── TraceFormatError         2  not a trace, or one of another format version
     │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
     ├── BisectError                  2  the revisions of a job cannot be searched, or not judged
+    ├── DebugError                   2  a debugging session cannot do what it is asked
     ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
     ├── ConditionError               2  where to stop, or what to evaluate, cannot be understood
     └── RunError                     3  the run itself went wrong; the trace up to there is complete
@@ -75,6 +76,10 @@ class ReplayError(TraceError):
 
 class BisectError(RsltraceError):
     """No commit can be named: no repository, ends that do the same, a check without an answer."""
+
+
+class DebugError(RsltraceError):
+    """A debugging session cannot do what it is asked; it goes on unless the message says not."""
 
 
 class OutputError(RsltraceError):

@@ -90,7 +90,7 @@ class Guard:
         self.pace = RealTimePace()
         self._policy = policy
         self._thread = _thread_id()
-        self._process = _process_id()
+        self.process = _process_id()
         self._event = -1
         self._in_event = 0
         self._reads = 0
@@ -100,7 +100,7 @@ class Guard:
 
     def in_charge(self) -> bool:
         """Return whether the calling thread is the simulation's (and no child process)."""
-        return bool(_thread_id() == self._thread and _process_id() == self._process)
+        return bool(_thread_id() == self._thread and _process_id() == self.process)
 
     def mode(self, source: Source, frame: FrameType) -> Mode:
         """Return what the job says about ``source`` in the code of ``frame``."""

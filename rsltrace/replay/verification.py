@@ -47,7 +47,7 @@ class Verification:
         self.is_last = False
         """Whether the run was ended where the trace's was, by somebody outside of the job."""
         self._trace = trace
-        self._limit, self._at_limit = _limit(trace, until)
+        self._limit, self._at_limit = limit_of(trace, until)
         self._on_first = on_first
         self._first = first if on_first is not None else -1
         self._next_mark = self._limit if self._first < 1 else self._first
@@ -112,7 +112,7 @@ class Verification:
             yield from rows["chain_hash"].tolist()
 
 
-def _limit(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
+def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
     """Return after how many events a replay ends by itself (-1: it does not), and why."""
     count, found = trace.event_count, []
     if until is not None and until < count:

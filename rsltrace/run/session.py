@@ -113,9 +113,14 @@ class Session:
         echo: bool = False,
         observer: Observer | None = None,
         replay: Path | None = None,
+        writer: TraceWriter | None = None,
     ) -> None:
+        """``writer`` takes what is recorded where there is no ``output``, and stays open: who gives
+        it looks after the run, too, so that nobody else watches for callbacks that hang.
+        """
         self.job = job
         self._replay = replay
+        self._recorded_by = writer
         self.stop: Stop | None = None
         self._output = output
         self._has_begun = False
@@ -130,6 +135,16 @@ class Session:
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
         self._recorded: RecordedRun | None
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether the nodes are constructed, and time stands at the start or beyond."""
+        return self._has_begun
+
+    def changes_process(self, pid: int) -> None:
+        """Take note that the run goes on in a copy of its process."""
+        self.world.stacks.runners.process = pid
+        self._guarded.changes_process(pid)
 
     def __enter__(self) -> Session:
         """Open everything. Whatever can be known to be wrong is found before a file is made.
@@ -165,12 +180,15 @@ class Session:
         check_bag_types(self.job, self._bags)
         if self._output is not None:
             self._open_trace(stack, self._output)
+        elif self._recorded_by is not None:
+            self._record_to(self._recorded_by)
         self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
         if self._observer.interrupt is not None:
             self._observer.interrupt(self._interrupt)
         stack.enter_context(quiet_gc())
         keep_heap()
-        stack.enter_context(self._watchdog.on_duty())
+        if self._recorded_by is None:
+            stack.enter_context(self._watchdog.on_duty())
 
     def _open_bags(self, stack: ExitStack, notes: Sequence[str]) -> None:
         """Open the bags, from which the run may have its start and its end."""
@@ -247,6 +265,10 @@ class Session:
                 f"{path} stays as it is until this run is over; until then it goes to "
                 f"{writer.place}"
             )
+        self._record_to(writer)
+
+    def _record_to(self, writer: TraceWriter) -> None:
+        job = self.job
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)

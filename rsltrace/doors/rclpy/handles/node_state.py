@@ -85,6 +85,14 @@ class NodeState:
         }
 
 
+def own_attributes(node: Any) -> dict[str, Any]:
+    """Return a node's attributes, except for those that rclpy gave it, and its parameters."""
+    rclpys = _attributes_of_rclpy(type(node))  # type: ignore[arg-type]
+    found = {name: value for name, value in vars(node).items() if name not in rclpys}
+    found.update({f"parameter {name}": one.value for name, one in node._parameters.items()})
+    return dict(sorted(found.items()))
+
+
 class NodeStates:
     """The states of the nodes of one run; ``policy`` is that of nodes without their own."""
 

@@ -1,0 +1,276 @@
+"""A debugging session, from Python: what runs user code is a process of its own.
+
+>>> import rsltrace
+>>> with rsltrace.DebugSession("run.mcap") as session:    # doctest: +SKIP
+...     session.go_to("2.5s")
+...     session.evaluate('node("ekf").P[0][0]')
+...     session.reverse_step()
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from rsltrace import errors
+from rsltrace.debug.lines import Lines, Message
+from rsltrace.debug.positions import Breakpoint, Position, Stopped, position_of, stopped_of
+from rsltrace.errors import DebugError, RsltraceError
+
+_END_S = 10.0
+
+
+class DebugSession:
+    """A run of a trace's job (or of a job file) that can be stopped, gone back in and asked.
+
+    Use as a context manager, or ``close`` it. It begins before the first event. Indices count
+    events from 0; a position with index 812 is the one in which events 0 to 811 have ended.
+
+    ``events`` is how many the run has, None if nobody knows (a job). ``notes`` are texts for
+    people: what is not as it was when the trace was recorded.
+    """
+
+    def __init__(
+        self,
+        source: str | Path,
+        *,
+        job_folder: str | Path | None = None,
+        trust: bool = False,
+        checkpoints: int = 64,
+        memory_mib: int = 2048,
+        echo: bool = False,
+        overrides: Sequence[str] = (),
+        on_notice: Callable[[Message], object] | None = None,
+    ) -> None:
+        """Open a trace or a job.
+
+        ``job_folder`` and ``trust`` are those of ``rsltrace.replay``. There are ``checkpoints`` at
+        most (0: none; going back is then running again from the beginning), in ``memory_mib`` at
+        most. ``echo`` has nodes' log records printed; what they print comes as notices of kind
+        ``output`` to ``on_notice``, which is called with every notice (docs/debug-protocol.md).
+        ``overrides`` are settings for a job, as ``--set`` of ``rsltrace record``.
+
+        :raises ReplayError, TraceError: the trace cannot be replayed here, or is not trusted.
+        :raises JobError, SetupError, BagError: its job cannot run.
+        :raises DebugError: the processes of the session cannot be made.
+        """
+        self.on_notice = on_notice or (lambda notice: None)
+        spec = {
+            "source": os.fspath(source),
+            "job_folder": None if job_folder is None else os.fspath(job_folder),
+            "trust": trust,
+            "checkpoints": max(int(checkpoints), 0),
+            "memory_mib": memory_mib,
+            "echo": echo,
+            "overrides": list(overrides),
+        }
+        self._last_id = 0
+        self._lock = threading.Lock()
+        self._sending = threading.Lock()
+        ours, theirs = socket.socketpair()
+        command = [sys.executable, "-m", "rsltrace.debug.supervisor", str(theirs.fileno())]
+        try:
+            self._process = subprocess.Popen(
+                [*command, json.dumps(spec)],
+                pass_fds=[theirs.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+            )
+        except OSError as error:
+            ours.close()
+            raise DebugError(f"no process can be made for the session: {error}") from error
+        finally:
+            theirs.close()
+        self._lines = Lines(ours)
+        try:
+            ready = self._until(lambda message: message.get("notice") == "ready")
+        except BaseException:
+            self.close()
+            raise
+        self.events: int | None = ready["events"]
+        self.notes: tuple[str, ...] = tuple(ready["notes"])
+        self.start_ns = int(ready["start_ns"])
+
+    def __enter__(self) -> DebugSession:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        where: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the session with all its processes. A second call does nothing."""
+        self._lines.close()
+        try:
+            self._process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    # -- where it stands ---------------------------------------------------------------------------
+
+    @property
+    def position(self) -> Position:
+        """Where the session stands."""
+        return position_of(self._ask("position"))
+
+    # -- forward -----------------------------------------------------------------------------------
+
+    def step(self, count: int = 1) -> Stopped:
+        """Run so many events."""
+        return stopped_of(self._ask("step", count=count))
+
+    def next(self, node: str | None = None) -> Stopped:
+        """Run to the end of the next event of a node: by default the one of the last event."""
+        return stopped_of(self._ask("next", node=node))
+
+    def finish(self) -> Stopped:
+        """Run to the end of the present time step."""
+        return stopped_of(self._ask("finish"))
+
+    def run_to(self, place: int | str) -> Stopped:
+        """Run to an index, or to the end of a simulated time (``"2.5s"``), or to a breakpoint."""
+        return stopped_of(self._ask("run_to", to=place))
+
+    def go_on(self) -> Stopped:
+        """Run to the next breakpoint, or to the end."""
+        return stopped_of(self._ask("go_on"))
+
+    def pause(self) -> None:
+        """Stop a run that another thread waits for, after its present event."""
+        self._send({"id": 0, "do": "pause"})
+
+    # -- back --------------------------------------------------------------------------------------
+
+    def reverse_step(self, count: int = 1) -> Stopped:
+        """Go back so many events."""
+        return stopped_of(self._ask("reverse_step", count=count))
+
+    def reverse_next(self, node: str | None = None) -> Stopped:
+        """Go back to the end of the event before the present one of a node."""
+        return stopped_of(self._ask("reverse_next", node=node))
+
+    def reverse_go_on(self) -> Stopped:
+        """Go back to the last place before this at which a breakpoint stops, or to the begin."""
+        return stopped_of(self._ask("reverse_go_on"))
+
+    def go_to(self, place: int | str) -> Stopped:
+        """Go to an index, or to the end of a simulated time, ahead or back. No breakpoint stops."""
+        return stopped_of(self._ask("go_to", to=place))
+
+    # -- breakpoints -------------------------------------------------------------------------------
+
+    def break_at(self, text: str) -> Breakpoint:
+        """Set a breakpoint.
+
+        :raises ConditionError: naming the place in the text.
+        """
+        found = self._ask("break", at=text)
+        return Breakpoint(found["number"], found["text"])
+
+    def clear(self, number: int) -> None:
+        """Remove a breakpoint."""
+        self._ask("clear", number=number)
+
+    @property
+    def breakpoints(self) -> tuple[Breakpoint, ...]:
+        """The breakpoints, in the order in which they were set."""
+        return tuple(Breakpoint(one["number"], one["text"]) for one in self._ask("breakpoints"))
+
+    # -- questions ---------------------------------------------------------------------------------
+
+    def evaluate(self, expression: str, node: str | None = None) -> Any:
+        """Return the value of an expression: as it is if JSON has such values, else its ``repr``.
+
+        ``node("ekf")`` is a node; the attributes of ``node`` are names. It is evaluated in a copy
+        of the simulation, so whatever it does changes nothing.
+        """
+        answer = self._ask("evaluate", expression=expression, node=node)
+        return answer["value"] if "value" in answer else answer["repr"]
+
+    def node(self, name: str) -> dict[str, str]:
+        """Return the attributes of a node and its parameters, as Python shows them."""
+        return dict(self._ask("node", name=name))
+
+    def inspect(self, what: str) -> Any:
+        """Return ``nodes``, ``queues``, ``timers``, ``stacks``, ``graph``, the ``message`` of the
+        present event, or the ``source`` of its callback."""
+        return self._ask("inspect", what=what)
+
+    def event(self, index: int) -> dict[str, Any]:
+        """Return an event that is known: of a trace, or that has run."""
+        return dict(self._ask("event", index=index))
+
+    def last_changed(self, node: str, attribute: str) -> Position:
+        """Return where a node's attribute (``P[0][0]``) was changed last, up to this place."""
+        return position_of(self._ask("last_changed", node=node, attribute=attribute))
+
+    def sent_by(self, index: int) -> Position:
+        """Return the position after the event that sent what event ``index`` received."""
+        return position_of(self._ask("sent_by", index=index))
+
+    def first_true(self, condition: str) -> Position:
+        """Return the first position up to this one at which a condition is true."""
+        return position_of(self._ask("first_true", condition=condition))
+
+    def checkpoints(self) -> dict[str, Any]:
+        """Return ``indices`` of the checkpoints, the ``bytes`` of memory that they take (PSS), and
+        ``why_not``: why there are none, if that is so."""
+        return dict(self._ask("checkpoints"))
+
+    # -- talking -----------------------------------------------------------------------------------
+
+    def _ask(self, do: str, **values: Any) -> Any:
+        with self._lock:
+            self._last_id += 1
+            number = self._last_id
+            self._send({"id": number, "do": do, **values})
+            answer = self._until(lambda message: message.get("id") == number)
+        if "error" in answer:
+            raise _error(answer["error"])
+        return answer["ok"]
+
+    def _send(self, request: Message) -> None:
+        try:
+            with self._sending:
+                self._lines.send(request)
+        except OSError:
+            raise DebugError("the session is over") from None
+
+    def _until(self, is_it: Callable[[Message], bool]) -> Message:
+        """Return the message that is waited for; notices on the way are passed on."""
+        while True:
+            message = self._lines.receive()
+            if message is None:
+                with suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_END_S)
+                raise DebugError("the session is over: its processes have ended")
+            if is_it(message):
+                return message
+            if message.get("notice") == "failed":
+                raise _error(message["error"])
+            if "notice" in message:
+                self.on_notice(message)
+
+
+def _error(said: Message) -> RsltraceError:
+    """Return the error that an answer tells of, of its own class where that takes a message."""
+    cls = getattr(errors, str(said.get("kind")), None)
+    if isinstance(cls, type) and issubclass(cls, RsltraceError):
+        error = cls.__new__(cls)
+        Exception.__init__(error, said.get("message", ""))
+        return error
+    return DebugError(str(said.get("message", "")))

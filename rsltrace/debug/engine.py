@@ -1,0 +1,413 @@
+"""The simulation's side of a debugging session: runs between events, stops, answers, forks.
+
+It stands where an event has ended (``Dispatcher.end_event``), or where a callback is about to be
+called. To stop is to read requests there instead of going back to the loop; whatever stack that is
+on stays as it is.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.debug import inspection
+from rsltrace.debug.conditions.message_fields import loaded_fields
+from rsltrace.debug.conditions.names import Names, names_of
+from rsltrace.debug.conditions.text import parse_condition
+from rsltrace.debug.forking import end_process, fork_beside, why_not
+from rsltrace.debug.goal import Goal, Watched, goal_of
+from rsltrace.debug.ledger import Ledger, described
+from rsltrace.debug.lines import Lines, Message, moved_high
+from rsltrace.debug.view import View
+from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.guard.guard import engage
+from rsltrace.guard.redirect import copy_of
+from rsltrace.model.event import EventKind
+
+if TYPE_CHECKING:
+    from rsltrace.run.session import Session
+
+_LOOK_EVERY = 64
+_NEVER = 1 << 62
+_cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-type]
+_getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
+
+
+class Engine:
+    """One process of a debugged run, and where it stands."""
+
+    def __init__(
+        self,
+        session: Session,
+        ledger: Ledger,
+        lines: Lines,
+        *,
+        supervisor: int,
+        checkpoints: bool,
+        idle: frozenset[int],
+    ) -> None:
+        """``idle`` are threads of the middleware that do nothing here, and need not be copied."""
+        self.session = session
+        self.ledger = ledger
+        self.lines = lines
+        self.event = session.world.domain.event
+        self.diverged = False
+        self.over = ""
+        """Why nothing follows any more, once that is so."""
+        self.is_next = False
+        self._supervisor = supervisor
+        self._forks = checkpoints
+        self._idle = idle
+        self.view = View(session, ledger)
+        self._goal = Goal()
+        self._mark = _NEVER
+        self._checkpoint_s = 0.0
+        self._next_checkpoint_s = 0.0
+        self._hit: Message | None = None
+        dispatcher = session.world.domain.dispatcher
+        self._end_event = dispatcher.end_event
+        self._execute = dispatcher.execute
+        dispatcher.end_event = self._ended  # type: ignore[method-assign]
+        dispatcher.execute = self._executed  # type: ignore[method-assign, assignment]
+        ledger.on_difference = self._differs
+
+    # -- where it is called ------------------------------------------------------------------------
+
+    def _ended(self) -> None:
+        """Stand in for ``Dispatcher.end_event``."""
+        self._end_event()
+        if self.ledger.events >= self._mark:
+            self._attend()
+
+    def _executed(self, handle: Any, entity: int, node: Any, kind: int, *rest: Any) -> None:
+        """Stand in for ``Dispatcher.execute``."""
+        self.view.callback, self.view.args = rest[:2]
+        if self._goal.asks_before:
+            event = self.event
+            event.handle, event.entity, event.node, event.kind = handle, entity, node, kind
+            self._about_to_run()
+        self._execute(handle, entity, node, kind, *rest)
+
+    def _differs(self) -> None:
+        self.diverged = True
+        self._mark = 0
+
+    def _attend(self) -> None:
+        """See what is to be done after an event: stop, answer, fork."""
+        index, goal = self.ledger.events, self._goal
+        with engage(None):
+            if self.diverged:
+                self.over = "the run did not do in this event what it did the first time"
+                self._stop("diverged", text=self.over)
+                return
+            if goal.after and self._ask(goal.after, index):
+                return
+            limit = self.ledger.history.limit
+            if limit is not None and index >= limit:
+                self.over = self._why_over()
+                self._stop("end", text=self.over)
+            elif goal.is_reached(index):
+                self._stop("step")
+            else:
+                self._meanwhile(index)
+                self._set_mark(index)
+
+    def _meanwhile(self, index: int) -> None:
+        """Do what is to be done on the way."""
+        goal = self._goal
+        if goal.ladder and index >= goal.ladder[0]:
+            while goal.ladder and index >= goal.ladder[0]:
+                goal.ladder.pop(0)
+            self._leave_checkpoint()
+        elif goal.interval_s and _cpu_s() >= self._next_checkpoint_s:
+            self._leave_checkpoint()
+        if self.lines.has_more():
+            self._stop("paused")
+
+    def _set_mark(self, index: int) -> None:
+        goal = self._goal
+        if goal.after:
+            self._mark = 0
+            return
+        mark = index + _LOOK_EVERY
+        for one in (goal.until, self.ledger.history.limit, *goal.ladder[:1]):
+            if one is not None and one < mark:
+                mark = one
+        self._mark = mark
+
+    def _about_to_run(self) -> None:
+        """See whether to stop before a callback."""
+        goal, index = self._goal, self.ledger.events
+        with engage(None):
+            now_ns = self.session.loop.now_ns
+            is_late = goal.until_ns is not None and now_ns > goal.until_ns
+            if goal.is_next_at == index or (is_late and self.session.has_begun):
+                self.is_next = True
+                self._stop("step")
+            else:
+                self.view.is_next = True
+                if self._ask(goal.before, index):
+                    return
+                self.view.is_next = False
+
+    def _ask(self, watched: list[Watched], index: int) -> bool:
+        """Ask conditions; True if one of them has stopped the run."""
+        is_next = self.view.is_next
+        for one in watched:
+            ask = one.armed.before if is_next else one.armed.after
+            try:
+                why = ask(self.view)
+            except RsltraceError as error:
+                why = str(error)
+            if not why:
+                continue
+            hit = {"number": one.number, "text": one.text}
+            if not self._goal.searches:
+                self.is_next = is_next
+                self._stop("breakpoint", breakpoint=hit, text=why)
+                return True
+            if index < self._goal.below:
+                self._hit = {
+                    "index": index,
+                    "is_next": is_next,
+                    "breakpoint": hit,
+                    "text": why,
+                    "position": self.position(),
+                }
+        return False
+
+    def _why_over(self) -> str:
+        history = self.ledger.history
+        if history.ended is not None:
+            return history.ended.reason
+        trace = history.trace
+        return "the end of the run" if trace is None else trace.result.get("stop_reason", "")
+
+    # -- stopping ----------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Run the whole session, stopping as requests say. Does not return."""
+        session = self.session
+        with engage(None):
+            self._serve()
+        try:
+            session.begin()
+            if not session.ended:
+                session.go_on()
+            result = session.finish()
+            self.over = str(result.error) if result.error is not None else result.stop_reason
+        except RsltraceError as error:
+            self.over = str(error)
+        with engage(None):
+            while True:
+                self._stop("end", text=self.over)
+
+    def position(self) -> Message:
+        """Return where the run stands, as an answer has it."""
+        found: Message = {
+            "index": self.ledger.events,
+            "stamp_ns": self.session.loop.now_ns,
+            "event": self.ledger.event(),
+            "is_next": self.is_next,
+            "over": bool(self.over),
+        }
+        if self.is_next:
+            view = self.view
+            view.is_next = True
+            found["next"] = {
+                "kind": EventKind(view.kind).label,
+                "node": view.node,
+                "entity": view.entity_name,
+                "entity_kind": view.entity_kind,
+            }
+        return found
+
+    def _stop(self, reason: str, **more: Any) -> None:
+        """Answer the request to run, and serve others until there is another one."""
+        answer = {"reason": reason, "position": self.position(), **more}
+        if self._hit is not None:
+            answer["hit"], self._hit = self._hit, None
+        notes = self._goal.notes()
+        if notes:
+            answer["notes"] = notes
+        self._answer(ok=answer)
+        self._serve()
+
+    def _serve(self) -> None:
+        """Answer requests until one says to run."""
+        while True:
+            request = self.lines.receive()
+            if request is None:
+                end_process(0)
+                return
+            self._id = request.get("id")
+            try:
+                if request["do"] == "run":
+                    if self._begin(request):
+                        return
+                else:
+                    self._do(request)
+            except (Exception, RecursionError) as error:
+                self._answer(error=said(error))
+
+    def _begin(self, request: Message) -> bool:
+        """Set off for a goal; False if nothing follows any more, or it is here."""
+        if self.diverged:
+            self._answer(ok={"reason": "diverged", "position": self.position(), "text": self.over})
+            return False
+        if self.over:
+            self._answer(ok={"reason": "end", "position": self.position(), "text": self.over})
+            return False
+        was_next = self.is_next
+        self.view.is_next = False
+        goal = goal_of(request, self.view, self.names)
+        index = self.ledger.events
+        if goal.is_reached(index) or (was_next and goal.is_next_at == index):
+            self._answer(ok={"reason": "step", "position": self.position()})
+            return False
+        self.is_next = False
+        self._goal, self._hit = goal, None  # a copy may have been made in the middle of a search
+        self._next_checkpoint_s = _cpu_s() + goal.interval_s
+        self._set_mark(index)
+        return True
+
+    def _answer(self, **what: Any) -> None:
+        try:
+            self.lines.send({"id": self._id, **what})
+        except OSError:
+            end_process(0)
+
+    def _do(self, request: Message) -> None:
+        do = request["do"]
+        if do == "fork":
+            self._fork_for(request)
+        elif do == "position":
+            self._answer(ok=self.position())
+        elif do == "pause":
+            pass  # it stands already
+        elif do == "inspect":
+            self._answer(ok=inspection.inspected(self, request["what"]))
+        elif do == "evaluate":
+            expression, node = request["expression"], request.get("node")
+            self._apart(lambda: inspection.evaluate(self, expression, node))
+        elif do == "event":
+            self._answer(ok=self._event(int(request["index"])))
+        elif do == "node name":
+            self._answer(ok=inspection.full_name(self, request["name"]))
+        elif do == "check":
+            self._answer(ok=parse_condition(request["text"], self.names()).text)
+        elif do == "node":
+            self._apart(lambda: inspection.attributes(self, request["name"]))
+        else:
+            raise DebugError(f"there is no request {do!r}")
+
+    # -- copies ------------------------------------------------------------------------------------
+
+    def _fork_for(self, request: Message) -> None:
+        """Answer with a copy of this process that stands where this one does."""
+        other = self._forked()
+        if other is not None:
+            with other:
+                self.lines.send({"id": self._id, "ok": {}}, other.fileno())
+
+    def _leave_checkpoint(self) -> None:
+        """Leave a copy asleep here, and go on."""
+        began_s = _cpu_s()
+        try:
+            other = self._forked()
+        except DebugError as error:
+            self._goal.interval_s, self._goal.ladder = 0.0, []
+            self.lines.send({"notice": "no checkpoint", "text": str(error)})
+            return
+        if other is None:
+            self._serve()
+            return
+        with other:
+            self.lines.send({"notice": "checkpoint", "position": self.position()}, other.fileno())
+        now_s = _cpu_s()
+        # Checkpoints shall not take more than a fraction of the time, dear ones not either.
+        self._checkpoint_s = max(now_s - began_s, self._checkpoint_s * 0.75)
+        self._next_checkpoint_s = now_s + max(self._goal.interval_s, 8 * self._checkpoint_s)
+
+    def _forked(self) -> socket.socket | None:
+        """Fork; return the socket to the copy, or None in the copy, whose ``lines`` are new.
+
+        :raises DebugError: why there can be no copy.
+        """
+        if not self._forks:
+            raise DebugError("checkpoints are off")
+        reason = why_not([self.lines.fileno()], self._idle)
+        if reason:
+            raise DebugError(f"this process cannot be copied: {reason}")
+        ours, theirs = socket.socketpair()
+        try:
+            is_copy = fork_beside(self._supervisor)
+        except BaseException:
+            ours.close()
+            theirs.close()
+            raise
+        if not is_copy:
+            theirs.close()
+            return ours
+        ours.close()
+        self.lines.close()
+        self.lines = Lines(moved_high(theirs))
+        pid = _getpid()
+        self.session.changes_process(pid)
+        self.lines.send({"notice": "copy", "pid": pid})
+        return None
+
+    def _apart(self, work: Callable[[], Any]) -> None:
+        """Do what runs a user's code in a copy, so that it changes nothing here."""
+        try:
+            ours = self._forked()
+        except DebugError:
+            self._answer(ok=work())  # then here: better than not at all
+            return
+        if ours is None:
+            try:
+                answer = {"ok": work()}
+            except BaseException as error:
+                answer = {"error": said(error)}
+            with suppress(BaseException):
+                self.lines.send(answer)
+            end_process(0)
+        assert ours is not None
+        with ours:
+            self.lines.send({"id": self._id, "ok": {"apart": True}}, ours.fileno())
+
+    def _event(self, index: int) -> Message:
+        """Return an event that is known.
+
+        :raises DebugError: it is not.
+        """
+        history = self.ledger.history
+        trace = history.trace
+        try:
+            rest, chain_hash = history.row(index)
+        except IndexError:
+            raise DebugError(
+                f"there is no event {index} (yet): {history.known} are known"
+            ) from None
+        return described(
+            rest, chain_hash, self.ledger.entities if trace is None else trace.entities
+        )
+
+    def names(self) -> Names:
+        """Return the names in the run: those of its trace, or as far as it has come."""
+        trace = self.ledger.history.trace
+        entities = self.ledger.entities if trace is None else trace.entities
+        return names_of(entities.values(), are_all=trace is not None, fields=loaded_fields)
+
+
+def said(error: BaseException) -> Message:
+    """Return an error as an answer has it."""
+    kind = type(error).__name__
+    text = str(error)
+    if not isinstance(error, RsltraceError):
+        text = f"{kind}: {text}" if text else kind
+    return {"kind": kind if isinstance(error, RsltraceError) else "DebugError", "message": text}

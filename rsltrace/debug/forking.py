@@ -1,0 +1,159 @@
+"""Copies of the process of a simulation: exact ones, and why there can be none.
+
+The C library's ``fork`` is called, not Python's: that one makes the copy a process of its own in
+many ways (locks, threads, random generators, event loops), and a checkpoint is to be the same
+process once more. That takes a process with a single thread, which a simulation is, unless a
+library has started real ones.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import stat
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+
+from rsltrace.errors import DebugError
+
+_PR_SET_PDEATHSIG = 1
+_SIGKILL = 9
+_LOOK_US = 200
+_c = ctypes.PyDLL(None, use_errno=True)  # keeps Python's lock, which nobody else would release
+_KEPT_FLAGS = os.O_APPEND | os.O_NONBLOCK
+
+
+def end_process(status: int) -> None:
+    """End this process at once, whatever a node has put in the place of ``os._exit``."""
+    _c._exit(status)
+
+
+def die_with_parent(parent: int, between: int = 0) -> None:
+    """Have the kernel kill this process when ``parent`` ends, whose child it is, or will be as soon
+    as the process ``between`` them has ended."""
+    while between and os.getppid() == between:
+        _c.usleep(_LOOK_US)
+    _c.prctl(_PR_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
+    if os.getppid() != parent:
+        end_process(0)
+
+
+def why_not(kept: Iterable[int], idle: frozenset[int]) -> str:
+    """Return why this process cannot be copied, "" if it can. ``kept`` are descriptors of ours,
+    ``idle`` the threads that do nothing in a simulation."""
+    names = [name for thread, name in _threads() if thread not in idle]
+    if names:
+        return (
+            f"{len(names)} real thread{'s' * (len(names) > 1)} of a library run in it "
+            f"({', '.join(sorted(set(names))[:4])}), which no copy would have"
+        )
+    ours = set(kept)
+    for number, target, mode in _open_descriptors():
+        if number in ours or number < 3:
+            continue
+        if target.startswith("/dev/nvidia"):
+            return "it uses a GPU, which cannot be copied"
+        if stat.S_ISSOCK(mode):
+            return f"a node has a socket open (descriptor {number}), which both copies would share"
+        if stat.S_ISFIFO(mode) and _waiting_bytes(number):
+            return f"a node has a pipe open with bytes in it (descriptor {number})"
+        if stat.S_ISREG(mode) and _is_read_and_written(number):
+            return (
+                f"a node has {target} open for reading and writing: what it writes there would not "
+                "be taken back"
+            )
+    children = _children()
+    if children:
+        return f"a node has started a process ({', '.join(map(str, children[:4]))})"
+    return ""
+
+
+def fork_beside(parent: int) -> bool:
+    """Fork a process that is a child of ``parent`` (a subreaper); True in the new one.
+
+    Both go on from here with files of their own: what one reads moves no position of the other's.
+
+    :raises DebugError: if no process can be made.
+    """
+    pid = _fork()
+    if pid == 0:
+        # Between the two: with its end ``parent`` becomes the new process's parent.
+        second, between = -1, os.getpid()
+        with suppress(BaseException):
+            _reopen_files()
+            second = int(_c.fork())
+        if second:
+            end_process(int(second < 0))
+        die_with_parent(parent, between)
+        return True
+    with suppress(ChildProcessError):
+        _, status = os.waitpid(pid, 0)
+        if status:
+            raise DebugError("no process can be made for a checkpoint (see ulimit -u)")
+    return False
+
+
+def _fork() -> int:
+    pid: int = _c.fork()
+    if pid < 0:
+        code = ctypes.get_errno()
+        raise DebugError(f"no process can be made for a checkpoint: {os.strerror(code)}")
+    return pid
+
+
+# -- what there is ---------------------------------------------------------------------------------
+
+
+def other_threads() -> frozenset[int]:
+    """Return the threads beside the one that calls."""
+    return frozenset(thread for thread, _ in _threads())
+
+
+def _threads() -> Iterator[tuple[int, str]]:
+    """Yield the threads beside the one that calls, with their names."""
+    own = os.getpid()
+    for name in os.listdir("/proc/self/task"):
+        if int(name) != own:
+            with suppress(OSError), open(f"/proc/self/task/{name}/comm") as file:
+                yield int(name), file.read().strip()
+
+
+def _children() -> list[int]:
+    with suppress(OSError), open(f"/proc/self/task/{os.getpid()}/children") as file:
+        return [int(word) for word in file.read().split()]
+    return []
+
+
+def _open_descriptors() -> Iterator[tuple[int, str, int]]:
+    """Yield number, target and mode of what is open."""
+    for name in os.listdir("/proc/self/fd"):
+        number = int(name)
+        with suppress(OSError):
+            yield number, os.readlink(f"/proc/self/fd/{name}"), os.fstat(number).st_mode
+
+
+def _waiting_bytes(number: int) -> bool:
+    count = ctypes.c_int(0)
+    with suppress(OSError):
+        fcntl.ioctl(number, 0x541B, count)  # FIONREAD
+    return count.value > 0
+
+
+def _is_read_and_written(number: int) -> bool:
+    return fcntl.fcntl(number, fcntl.F_GETFL) & os.O_ACCMODE == os.O_RDWR
+
+
+def _reopen_files() -> None:
+    """Give this process descriptors of its own of all files, at the same positions."""
+    for number, _, mode in list(_open_descriptors()):
+        if number < 3 or not stat.S_ISREG(mode):
+            continue
+        with suppress(OSError):
+            flags = fcntl.fcntl(number, fcntl.F_GETFL)
+            kept = flags & (os.O_ACCMODE | _KEPT_FLAGS)
+            own = os.open(f"/proc/self/fd/{number}", kept | os.O_CLOEXEC)
+            if not flags & os.O_APPEND:
+                os.lseek(own, os.lseek(number, 0, os.SEEK_CUR), os.SEEK_SET)
+            os.dup2(own, number, inheritable=os.get_inheritable(number))
+            os.close(own)

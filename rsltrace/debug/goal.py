@@ -1,0 +1,96 @@
+"""How far to run: what a request to run says, understood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from rsltrace.debug.conditions.condition import Armed, Condition
+from rsltrace.debug.conditions.names import Names
+from rsltrace.debug.conditions.text import parse_condition
+from rsltrace.debug.conditions.view import EventView
+from rsltrace.debug.lines import Message
+from rsltrace.debug.view import View
+
+NOWHERE = 1 << 62
+
+
+@dataclass
+class Watched:
+    """A condition that counts in a run, with the number of its breakpoint (0: of a request)."""
+
+    number: int
+    text: str
+    armed: Armed
+
+
+@dataclass
+class Goal:
+    """Where a run stops: at ``until`` events, before the first event after ``until_ns``, where the
+    callback of event ``is_next_at`` begins, and where one of the conditions is true.
+
+    A goal that ``searches`` does not stop for conditions, but remembers the last of them that was
+    true at an index ``below`` so many. ``ladder`` are indices at which to leave checkpoints,
+    ``interval_s`` says after how much CPU time to leave others (0: none).
+    """
+
+    until: int | None = None
+    until_ns: int | None = None
+    is_next_at: int | None = None
+    before: list[Watched] = field(default_factory=list)
+    after: list[Watched] = field(default_factory=list)
+    searches: bool = False
+    below: int = NOWHERE
+    ladder: list[int] = field(default_factory=list)
+    interval_s: float = 0.0
+
+    @property
+    def asks_before(self) -> bool:
+        """Whether to look at events that are about to run."""
+        return bool(self.before) or self.until_ns is not None or self.is_next_at is not None
+
+    def is_reached(self, index: int) -> bool:
+        """Say whether so many events are enough."""
+        return self.until is not None and index >= self.until and self.is_next_at is None
+
+    def notes(self) -> list[str]:
+        """Say of conditions which could not be evaluated why."""
+        found = {one.number: one for one in (*self.before, *self.after)}
+        return [f"{one.text}: {one.armed.note}" for one in found.values() if one.armed.note]
+
+
+class AfterNode(Armed):
+    """After an event of a node."""
+
+    def __init__(self, node: str) -> None:
+        self._node = node
+
+    def after(self, view: EventView) -> str:
+        """Compare names."""
+        return self._node if view.node == self._node else ""
+
+
+def goal_of(request: Message, view: View, names: Callable[[], Names]) -> Goal:
+    """Return the goal of a request; its conditions count from where the run stands now.
+
+    :raises ConditionError: a condition is wrong.
+    """
+    goal = Goal(
+        until=request.get("until"),
+        until_ns=request.get("until_ns"),
+        is_next_at=request.get("is_next_at"),
+        searches=bool(request.get("searches")),
+        below=int(request.get("below", NOWHERE)),
+        ladder=list(request.get("ladder", ())),
+        interval_s=float(request.get("interval_s", 0.0)),
+    )
+    for one in request.get("breakpoints", ()):
+        condition: Condition = parse_condition(one["text"], names())
+        watched = Watched(int(one["number"]), condition.text, condition.arm(view))
+        if condition.before:
+            goal.before.append(watched)
+        if condition.after:
+            goal.after.append(watched)
+    if "node" in request:
+        goal.after.append(Watched(0, request["node"], AfterNode(request["node"])))
+    return goal

@@ -1,0 +1,242 @@
+"""What a run that stands still is asked: its nodes, queues, timers, stacks, graph and messages."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import reprlib
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rsltrace.debug.conditions.expressions import parse_expression
+from rsltrace.debug.conditions.names import nodes_called, short_name
+from rsltrace.errors import DebugError, did_you_mean
+from rsltrace.middleware.overview import overview
+from rsltrace.middleware.receiver import Receiver
+
+if TYPE_CHECKING:
+    from rsltrace.debug.conditions.names import Names
+    from rsltrace.debug.view import View
+    from rsltrace.run.session import Session
+
+_JSON_BYTES_MAX = 1 << 20
+_SOURCE_LINES_MAX = 400
+
+_short = reprlib.Repr()
+_short.maxstring = _short.maxother = 2000
+_short.maxlist = _short.maxtuple = _short.maxset = _short.maxdict = _short.maxdeque = 100
+_short.maxlevel = 6
+
+
+class Standing(Protocol):
+    """A run that stands still."""
+
+    view: View
+    session: Session
+
+    def names(self) -> Names:
+        """Return the names in the run."""
+
+
+def node_named(run: Standing, name: str) -> Any:
+    """Return a node by its full name, or its last part.
+
+    :raises DebugError: there is none, or several.
+    """
+    return run.view.nodes()[full_name(run, name)]
+
+
+def full_name(run: Standing, name: str) -> str:
+    """Return the full name of the node that is meant.
+
+    :raises DebugError: there is none, or several.
+    """
+    nodes = run.view.nodes()
+    found = nodes_called(name, nodes)
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise DebugError(f"{name!r} may be any of {', '.join(found)}: give the full name")
+    there = ", ".join(nodes) or "none yet"
+    hint = did_you_mean(name, [*nodes, *map(short_name, nodes)], f"there are {there}")
+    raise DebugError(f"no node is called {name!r}; {hint}")
+
+
+def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]:
+    """Return the value of an expression as JSON, and how Python shows it.
+
+    :raises ConditionError: it is no expression, or names what is not there.
+    :raises DebugError: it raised.
+    """
+    owner = None if node is None else node_named(run, node)
+    received = run.view.received()
+    message = None if received is None else received[1]
+    parsed = parse_expression(expression, run.names(), has_own=True)
+    try:
+        value = parsed.value(run.view, message=message, node=owner)
+    except Exception as error:
+        raise DebugError(f"{expression}: {type(error).__name__}: {error}") from error
+    answer: dict[str, Any] = {"repr": text_of(value), "type": type(value).__qualname__}
+    try:
+        text = json.dumps(plain(value), allow_nan=False)
+        if len(text) <= _JSON_BYTES_MAX:
+            answer["value"] = json.loads(text)
+    except (TypeError, ValueError, RecursionError):
+        pass
+    return answer
+
+
+def text_of(value: object) -> str:
+    """Return how Python shows a value, cut where it is long."""
+    try:
+        return _short.repr(value)
+    except Exception as error:
+        return f"<{type(value).__qualname__} whose repr raised {type(error).__name__}: {error}>"
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: arrays are lists, messages objects.
+
+    :raises TypeError: it cannot be.
+    """
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if hasattr(value, "get_fields_and_field_types"):
+        return {name: plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
+    if hasattr(value, "tolist"):  # of numpy, array.array
+        return plain(value.tolist())
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bytes, bytearray)):
+        return list(value)
+    raise TypeError(f"{type(value).__qualname__} is not JSON")
+
+
+def attributes(run: Standing, name: str) -> dict[str, str]:
+    """Return a node's own attributes and parameters as Python shows them."""
+    from rsltrace.doors.rclpy.handles.node_state import own_attributes
+
+    return {name: text_of(value) for name, value in own_attributes(node_named(run, name)).items()}
+
+
+# -- what there is ---------------------------------------------------------------------------------
+
+
+def nodes(run: Standing) -> list[dict[str, Any]]:
+    """Return the nodes there are."""
+    return [
+        {"name": name, "class": f"{type(node).__module__}.{type(node).__qualname__}"}
+        for name, node in run.view.nodes().items()
+    ]
+
+
+def queues(run: Standing) -> list[dict[str, Any]]:
+    """Return what waits in the queues of subscriptions, services and clients."""
+    graph = run.session.world.domain.graph
+    found = []
+    for node in graph.nodes:
+        for endpoint in graph.endpoints_of(node):
+            if isinstance(endpoint, Receiver):
+                found.append(
+                    {
+                        "node": node.fully_qualified_name,
+                        "kind": endpoint.kind.label,
+                        "name": endpoint.trace_name(),
+                        "type": endpoint.trace_type(),
+                        "waiting": len(endpoint.queue),
+                    }
+                )
+    return found
+
+
+def timers(run: Standing) -> list[dict[str, Any]]:
+    """Return the timers, those that are due first before others; cancelled ones come last."""
+    found = []
+    for node in run.session.world.domain.graph.nodes:
+        for timer in _timers_of(node):
+            state = timer.state
+            found.append(
+                {
+                    "node": node.fully_qualified_name,
+                    "name": timer.trace_name(),
+                    "period_ns": state.period_ns,
+                    "due_ns": None if state.canceled else state.deadline_ns,
+                }
+            )
+    return sorted(found, key=lambda one: (one["due_ns"] is None, one["due_ns"] or 0))
+
+
+def _timers_of(node: Any) -> list[Any]:
+    wrapper = getattr(node, "wrapper", None)
+    return list(node.timers) if wrapper is None else [one.handle for one in wrapper.timers]
+
+
+def stacks(run: Standing) -> list[str]:
+    """Return who waits for what, with the lines of user code that led there."""
+    stacks = run.session.world.stacks
+    waits = [one.waits_for() for one in stacks.coroutines.suspended]
+    return waits + [blocked.waits_for() for blocked in stacks.runners.blocked]
+
+
+def graph(run: Standing) -> dict[str, Any]:
+    """Return nodes, topics, services and actions with their ends."""
+    values = asdict(overview(run.session.world.domain.graph, ()))
+    del values["waiting"]
+    return values
+
+
+def message(run: Standing) -> dict[str, Any] | None:
+    """Return what the callback of the present event gets: the next one's, if it is about to run."""
+    received = run.view.received()
+    if received is None:
+        return None
+    name, content = received
+    return {
+        "name": name,
+        "type": "/".join([*type(content).__module__.split(".")[:2], type(content).__name__]),
+        "content": plain(content),
+    }
+
+
+def source(run: Standing) -> dict[str, Any] | None:
+    """Return file, first line, name and lines of the callback of the present event."""
+    found: Any = run.view.callback
+    found = getattr(found, "func", found)
+    found = inspect.unwrap(getattr(found, "__func__", found))
+    code = getattr(found, "__code__", None)
+    if code is None:
+        return None
+    try:
+        lines, first = inspect.getsourcelines(code)
+    except (OSError, TypeError):
+        lines, first = [], code.co_firstlineno
+    return {
+        "file": code.co_filename,
+        "line": first,
+        "name": getattr(found, "__qualname__", code.co_name),
+        "lines": [line.rstrip("\n") for line in lines[:_SOURCE_LINES_MAX]],
+    }
+
+
+INSPECTED = {
+    "nodes": nodes,
+    "queues": queues,
+    "timers": timers,
+    "stacks": stacks,
+    "graph": graph,
+    "message": message,
+    "source": source,
+}
+
+
+def inspected(run: Standing, what: str) -> Any:
+    """Return the answer to a request to inspect.
+
+    :raises DebugError: there is no such thing to see.
+    """
+    if what not in INSPECTED:
+        there = ", ".join(INSPECTED)
+        raise DebugError(f"nothing is called {what!r}; {did_you_mean(what, INSPECTED, there)}")
+    return INSPECTED[what](run)

@@ -1,0 +1,217 @@
+"""What a debugged run has done: the event that has ended last, and whether it was as before.
+
+A run is recorded as always, but to here instead of a file: what it sends is kept for one event, so
+that conditions can look at it, and its chain hash is compared with the one of that event when it
+ran the first time.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable, Iterator, Mapping
+from itertools import islice
+from typing import Any
+
+from rsltrace.debug.history import History
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, OutputKind
+from rsltrace.model.finding import Finding
+from rsltrace.trace.format import EVENT_REST, OUTPUT_CONTENT
+from rsltrace.trace.reader import RUN
+from rsltrace.trace.writer import TraceWriter
+from rsltrace.words.outputs import counted, output_text
+
+Payload = tuple[int, bytes]
+"""The channel of a message, and its canonical CDR."""
+
+_ENOUGH = 1 << 62
+DID_MAX = 100
+
+
+class Ledger(TraceWriter):
+    """Stands in for the writer of a trace. ``on_difference`` is called when an event differs.
+
+    ``entities`` and ``channels`` (topic and type) are those so far, by id. Of the last event there
+    are ``rest`` (packed), ``chain_hash``, ``outputs`` (packed), ``payloads``, ``details`` and
+    ``findings``. ``events`` is how many have ended.
+    """
+
+    def __init__(self, history: History, *, ends_at_size_after: int | None = None) -> None:
+        # Nothing of the writer's own: there is no file.
+        self.history = history
+        self.events = 0
+        self.rest = b""
+        self.chain_hash = 0
+        self.outputs: list[bytes] = []
+        self.payloads: list[Payload | str] = []
+        self.findings: list[Finding] = []
+        self.entities: dict[int, Entity] = {RUN.id: RUN}
+        self.channels: dict[int, tuple[str, str]] = {}
+        self.on_difference: Callable[[], None] = lambda: None
+        self._sequences_under_way = array("I")
+        self.sequences = array("I")
+        self._outputs_under_way: list[bytes] = []
+        self._payloads_under_way: list[Payload | str] = []
+        self._findings_under_way: list[Finding] = []
+        self.add_output = self._add_output
+        self.add_sequence = self._add_sequence
+        self._ends_at_size_after = ends_at_size_after
+        self._known: Iterator[int] = history.hashes(0)
+        self._ids: dict[tuple[str, str], int] = {}
+
+    def _add_output(self, packed: bytes) -> None:
+        self._outputs_under_way.append(packed)
+
+    def _add_sequence(self, sequence: int) -> None:
+        self._sequences_under_way.append(sequence)
+
+    def add_event(self, rest: bytes, chain_hash: int) -> None:
+        """Take the event that has ended, and compare it with what it was before."""
+        outputs = self.outputs
+        self.outputs, self._outputs_under_way = self._outputs_under_way, outputs
+        outputs.clear()
+        sequences = self.sequences
+        self.sequences, self._sequences_under_way = self._sequences_under_way, sequences
+        if sequences:
+            del sequences[:]
+        payloads = self.payloads
+        self.payloads, self._payloads_under_way = self._payloads_under_way, payloads
+        payloads.clear()
+        if self.findings or self._findings_under_way:
+            self.findings, self._findings_under_way = self._findings_under_way, []
+        self.rest, self.chain_hash = rest, chain_hash
+        index = self.events
+        self.events = index + 1
+        known = next(self._known, None)
+        if known is None:
+            known = self._on_new_ground(index, rest, chain_hash)
+        if known != chain_hash:
+            self.on_difference()
+
+    def _on_new_ground(self, index: int, rest: bytes, chain_hash: int) -> int | None:
+        """Have the history learn an event that it does not know."""
+        self._known = self.history.hashes(index)  # another process may have been here meanwhile
+        known = next(self._known, None)
+        if known is None and self.history.learn(index, rest, chain_hash):
+            return chain_hash
+        return known
+
+    # -- what is kept for one event ----------------------------------------------------------------
+
+    def add_payload(self, channel_id: int, stamp_ns: int, data: bytes) -> int:
+        """Keep a message until the next event has ended."""
+        self._payloads_under_way.append((channel_id, data))
+        return len(self._payloads_under_way) - 1
+
+    def add_detail(self, event: int, output: int, stamp_ns: int, text: str) -> int:
+        """Keep a text."""
+        self._payloads_under_way.append(text)
+        return len(self._payloads_under_way) - 1
+
+    def add_finding(self, finding: Finding, stamp_ns: int) -> int:
+        """Keep a finding."""
+        self._findings_under_way.append(finding)
+        return 0
+
+    def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
+        """Keep nothing: whoever wants to know asks the node."""
+        return 0
+
+    # -- what is kept ------------------------------------------------------------------------------
+
+    def add_entity(self, entity: Entity) -> int:
+        """Keep an entity."""
+        self.entities[entity.id] = entity
+        return 0
+
+    def add_channel(
+        self,
+        topic: str,
+        type_name: str,
+        schema_text: str,
+        *,
+        qos_yaml: str = "",
+        type_hash: str = "",
+    ) -> int:
+        """Return the id of a topic's channel."""
+        key = (topic, type_name)
+        found = self._ids.get(key)
+        if found is None:
+            found = self._ids[key] = len(self._ids) + 1
+            self.channels[found] = key
+        return found
+
+    def add_metadata(self, name: str, mapping: Mapping[str, str]) -> None:
+        """Keep nothing: there is no file."""
+
+    def add_attachment(self, name: str, media_type: str, data: bytes) -> None:
+        """Keep nothing: there is no file."""
+
+    def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
+        """Do nothing: there is no file."""
+
+    def abort(self) -> None:
+        """Do nothing: there is no file."""
+
+    @property
+    def event_count(self) -> int:
+        """How many events have ended."""
+        return self.events
+
+    @property
+    def size(self) -> int:
+        """What ends a run that ends with the size of its trace: there, and not before."""
+        after = self._ends_at_size_after
+        return _ENOUGH if after is not None and self.events >= after else 0
+
+    @property
+    def output_hash(self) -> int:
+        """The hash of the outputs of the last event."""
+        return int(EVENT_REST.unpack(self.rest)[4]) if self.rest else 0
+
+    # -- in words ----------------------------------------------------------------------------------
+
+    def event(self) -> dict[str, Any] | None:
+        """Return the last event as an answer has it, None before the first."""
+        if not self.rest:
+            return None
+        event = described(self.rest, self.chain_hash, self.entities)
+        event["did"] = list(islice(counted(map(self._output_text, self.outputs)), DID_MAX))
+        return event
+
+    def _output_text(self, packed: bytes) -> str:
+        _, entity_id, kind = OUTPUT_CONTENT.unpack(packed)
+        entity = self.entities.get(entity_id, RUN)
+        return output_text(kind, entity.name, entity.kind.label)
+
+    def outputs_of_last(self) -> Iterator[tuple[int, int, int, Payload | str | None]]:
+        """Yield (kind, entity, hash, payload) of the outputs of the last event."""
+        numbers = iter(self.sequences)
+        for packed in self.outputs:
+            content_hash, entity, kind = OUTPUT_CONTENT.unpack(packed)
+            sequence = NO_SEQUENCE if kind == OutputKind.DRAW else next(numbers, NO_SEQUENCE)
+            kept = self.payloads[sequence] if sequence < len(self.payloads) else None
+            yield kind, entity, content_hash, kept
+
+
+def described(rest: bytes, chain_hash: int, entities: Mapping[int, Entity]) -> dict[str, Any]:
+    """Return a packed event as an answer has it."""
+    index, stamp, cause, _, _, state, entity_id, cause_output, outputs, kind, flags = (
+        EVENT_REST.unpack(rest)
+    )
+    entity = entities.get(entity_id, RUN)
+    owner = entities.get(entity.node, RUN)
+    return {
+        "index": index,
+        "stamp_ns": stamp,
+        "kind": EventKind(kind).label,
+        "node": owner.name if owner.id else "",
+        "entity": entity.name if entity.id else "",
+        "entity_kind": entity.kind.label if entity.id else "",
+        "flags": flags,
+        "cause_event": None if cause == NO_EVENT else cause,
+        "cause_output": cause_output,
+        "outputs": outputs,
+        "state_hash": f"{state:016x}",
+        "chain_hash": f"{chain_hash:016x}",
+    }

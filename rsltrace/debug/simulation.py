@@ -1,0 +1,131 @@
+"""The process of a simulation that is debugged: opens a trace or a job, and does as it is told.
+
+Run as ``python -m rsltrace.debug.simulation DESCRIPTOR SPEC`` by the supervisor, which it serves on
+that descriptor. SPEC is a JSON object.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+from contextlib import ExitStack, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.debug.forking import die_with_parent, end_process
+from rsltrace.debug.lines import Lines, moved_high
+from rsltrace.errors import ReplayError, RsltraceError
+from rsltrace.guard.pin import pin, unpin
+
+if TYPE_CHECKING:
+    from rsltrace.debug.history import History
+    from rsltrace.job import Job
+
+
+def main() -> None:
+    """Serve the supervisor until it is gone."""
+    pin()
+    number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
+    die_with_parent(spec["supervisor"])
+    with ExitStack() as stack:
+        try:
+            job, history, notes = _opened(spec, stack)
+            if not job.guard.pins:
+                unpin()
+            lines = Lines(moved_high(socket.socket(fileno=number)))
+            _serve(job, history, notes, spec, lines, stack)
+        except (RsltraceError, OSError) as error:
+            from rsltrace.debug.engine import said
+
+            Lines(socket.socket(fileno=number)).send({"notice": "failed", "error": said(error)})
+            end_process(2)
+
+
+def _opened(spec: dict[str, Any], stack: ExitStack) -> tuple[Job, History, list[str]]:
+    """Return the job to run, and what is known of its run.
+
+    :raises RsltraceError: it cannot be run here.
+    """
+    from rsltrace.debug.history import RunHistory, TraceHistory
+    from rsltrace.diff.file_kind import is_trace
+
+    source = spec["source"]
+    if not is_trace(source):
+        from rsltrace.job import load_job
+
+        return load_job(Path(source), overrides=spec["overrides"]), RunHistory(), []
+    from rsltrace.replay.preparation import prepared
+
+    folder = spec["job_folder"]
+    plan = stack.enter_context(prepared(source, None if folder is None else Path(folder)))
+    if plan.distrust and not spec["trust"]:
+        raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
+    changed = [f"{one.name} {one.change}" for one in plan.code if one.change]
+    return plan.job, TraceHistory(plan.trace), [*plan.notes, *changed]
+
+
+def _serve(
+    job: Job,
+    history: History,
+    notes: list[str],
+    spec: dict[str, Any],
+    lines: Lines,
+    stack: ExitStack,
+) -> None:
+    from rsltrace.debug.engine import Engine
+    from rsltrace.debug.ledger import Ledger
+    from rsltrace.run.process import Observer
+    from rsltrace.run.session import Session
+
+    idle = _middleware_threads()
+    trace = history.trace
+    recorded = None
+    if trace is not None and job.guard.enabled:
+        recorded = Path(os.path.abspath(trace.name))
+    ledger = Ledger(history, ends_at_size_after=None if trace is None else trace.ended_after)
+    session = stack.enter_context(
+        Session(
+            job,
+            None,
+            echo=spec["echo"],
+            replay=recorded,
+            writer=ledger,
+            observer=Observer(note=notes.append),
+        )
+    )
+    engine = Engine(
+        session,
+        ledger,
+        lines,
+        supervisor=spec["supervisor"],
+        checkpoints=spec["checkpoints"] > 0,
+        idle=idle,
+    )
+    lines.send(
+        {
+            "notice": "ready",
+            "events": history.limit,
+            "is_trace": trace is not None,
+            "notes": notes,
+            "start_ns": session.start_ns,
+        }
+    )
+    engine.run()
+
+
+def _middleware_threads() -> frozenset[int]:
+    """Return the threads that DDS starts when it is loaded, and nobody uses in a simulation."""
+    from rsltrace.debug.forking import other_threads
+    from rsltrace.doors.rclpy.boundary.installation import check_free
+
+    check_free()
+    with suppress(ImportError):  # the session says what is missing
+        import_module("rclpy")
+    return other_threads()
+
+
+if __name__ == "__main__":
+    main()

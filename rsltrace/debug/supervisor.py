@@ -1,0 +1,236 @@
+"""Between the client and the processes of the simulation: who stands where, and who is woken.
+
+Run as ``python -m rsltrace.debug.supervisor DESCRIPTOR SPEC`` by the client, which it serves on
+that descriptor until the client is gone. It runs no user code, so it can always answer.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from rsltrace.debug.lines import Lines, Message
+from rsltrace.debug.tree import ClientGone, Tree
+from rsltrace.errors import DebugError, RsltraceError
+
+
+class Supervisor:
+    """Answers requests of one client."""
+
+    def __init__(self, client: Lines, spec: dict[str, Any]) -> None:
+        self.client = client
+        self.waiting: deque[Message] = deque()
+        self.tree = Tree(spec, client, self.waiting)
+        self._breakpoints: dict[int, str] = {}
+        self._last_number = 0
+        self._do: dict[str, Callable[[Message], Any]] = {
+            "position": lambda request: self.tree.position,
+            "step": self._step,
+            "next": self._next,
+            "finish": self._finish,
+            "run_to": self._run_to,
+            "go_on": self._go_on,
+            "reverse_step": self._reverse_step,
+            "reverse_next": self._reverse_next,
+            "reverse_go_on": self._reverse_go_on,
+            "go_to": self._go_to,
+            "break": self._break,
+            "clear": self._clear,
+            "breakpoints": lambda request: self._listed(),
+            "inspect": self._pass_on,
+            "evaluate": self._pass_on_apart,
+            "node": self._pass_on_apart,
+            "event": self._pass_on,
+            "sent_by": self._sent_by,
+            "last_changed": self._last_changed,
+            "first_true": self._first_true,
+            "checkpoints": lambda request: self.tree.described(),
+            "pause": lambda request: self.tree.position,
+        }
+
+    def serve(self) -> None:
+        """Answer until the client is gone; then end everything."""
+        try:
+            self.client.send({"notice": "ready", **self.tree.start()})
+            while True:
+                request = self.tree.next_request()
+                if request is None or request.get("do") == "quit":
+                    break
+                self.client.send({"id": request.get("id"), **self._answer(request)})
+        except RsltraceError as error:
+            if not isinstance(error, ClientGone):
+                self.client.send({"notice": "failed", "error": _said(error)})
+        except BrokenPipeError:
+            pass
+        finally:
+            self.tree.family.kill_all()
+
+    def _answer(self, request: Message) -> Message:
+        try:
+            do = self._do.get(str(request.get("do")))
+            if do is None:
+                raise DebugError(f"there is no request {request.get('do')!r}")
+            return {"ok": do(request)}
+        except ClientGone:
+            raise
+        except RsltraceError as error:
+            return {"error": _said(error)}
+        except (KeyError, TypeError, ValueError) as error:
+            text = f"not a request of this protocol: {type(error).__name__}: {error}"
+            return {"error": {"kind": "DebugError", "message": text}}
+
+    # -- forward -----------------------------------------------------------------------------------
+
+    @property
+    def _index(self) -> int:
+        return int(self.tree.position["index"])
+
+    def _conditions(self) -> list[Message]:
+        return [{"number": n, "text": text} for n, text in self._breakpoints.items()]
+
+    def _forward(self, **goal: Any) -> Message:
+        return self.tree.run({"breakpoints": self._conditions(), **goal})
+
+    def _step(self, request: Message) -> Message:
+        return self.tree.run({"until": self._index + _count(request)})
+
+    def _next(self, request: Message) -> Message:
+        answer = self._forward(node=self._node(request))
+        if answer["reason"] == "breakpoint" and answer["breakpoint"]["number"] == 0:
+            answer = {"reason": "step", "position": answer["position"]}
+        return answer
+
+    def _node(self, request: Message) -> str:
+        """Return the full name of the node that is meant: by default that of the last event."""
+        name = request.get("node")
+        if name is not None:
+            return str(self.tree.ask_cursor({"do": "node name", "name": name}))
+        event = self.tree.position["event"]
+        if event is None or not event["node"]:
+            raise DebugError("the last event is no node's: say which node is meant")
+        return str(event["node"])
+
+    def _finish(self, request: Message) -> Message:
+        return self._forward(until_ns=self.tree.position["stamp_ns"])
+
+    def _run_to(self, request: Message) -> Message:
+        goal = _place(request["to"])
+        here = self._index if "until" in goal else int(self.tree.position["stamp_ns"])
+        if next(iter(goal.values())) < here:
+            raise DebugError(f"{request['to']} is behind: go_to goes back")
+        return self._forward(**goal)
+
+    def _go_on(self, request: Message) -> Message:
+        return self._forward()
+
+    # -- back --------------------------------------------------------------------------------------
+
+    def _reverse_step(self, request: Message) -> Message:
+        goal = self._index - _count(request)
+        if self.tree.position["is_next"]:
+            goal += 1  # it stands in the middle: first back to between the events
+        answer = self.tree.go_to({"until": max(goal, 0)})
+        if goal <= 0:
+            answer["reason"] = "begin"
+        return answer
+
+    def _go_to(self, request: Message) -> Message:
+        return self.tree.go_to(_place(request["to"]))
+
+    def _reverse_next(self, request: Message) -> Message:
+        return self.tree.go_back({"node": self._node(request)})
+
+    def _reverse_go_on(self, request: Message) -> Message:
+        return self.tree.go_back({"breakpoints": self._conditions()})
+
+    # -- searches ----------------------------------------------------------------------------------
+
+    def _sent_by(self, request: Message) -> Message:
+        event = self.tree.ask_cursor({"do": "event", "index": int(request["index"])})
+        cause = event["cause_event"]
+        if cause is None:
+            raise DebugError(f"nothing in the run caused event {event['index']}")
+        sender = self.tree.ask_cursor({"do": "event", "index": cause})
+        return {"index": cause + 1, "stamp_ns": sender["stamp_ns"], "event": sender}
+
+    def _last_changed(self, request: Message) -> Message:
+        name = self._node(request)
+        text = f"watch node({name!r}).{request['attribute']}"
+        hit = self.tree.last_hit({"breakpoints": [{"number": 0, "text": text}]}, self._index + 1)
+        if hit is None:
+            raise DebugError(f"{request['attribute']} of {name} has not changed so far")
+        return dict(hit["position"])
+
+    def _first_true(self, request: Message) -> Message:
+        conditions = [{"number": 0, "text": str(request["condition"])}]
+        found = self.tree.first_hit({"breakpoints": conditions}, self._index)
+        if found is None:
+            raise DebugError(f"{request['condition']} has not been true so far")
+        return found
+
+    # -- breakpoints -------------------------------------------------------------------------------
+
+    def _break(self, request: Message) -> Message:
+        text = str(request["at"])
+        self.tree.ask_cursor({"do": "check", "text": text})
+        self._last_number += 1
+        self._breakpoints[self._last_number] = text
+        return {"number": self._last_number, "text": text}
+
+    def _clear(self, request: Message) -> None:
+        if self._breakpoints.pop(request["number"], None) is None:
+            raise DebugError(f"there is no breakpoint {request['number']}")
+
+    def _listed(self) -> list[Message]:
+        return self._conditions()
+
+    # -- what the simulation answers itself --------------------------------------------------------
+
+    def _pass_on(self, request: Message) -> Any:
+        return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
+
+    def _pass_on_apart(self, request: Message) -> Any:
+        return self.tree.ask_apart({k: v for k, v in request.items() if k != "id"})
+
+
+def _count(request: Message) -> int:
+    count = int(request.get("count", 1))
+    if count < 1:
+        raise DebugError(f"{count} events are no step")
+    return count
+
+
+def _place(place: int | str) -> Message:
+    """Return the goal of an index (an int, or digits) or a simulated time."""
+    text = str(place).strip()
+    if text.isascii() and text.isdigit():
+        return {"until": int(text)}
+    from rsltrace.words.times import parse_stamp
+
+    try:
+        return {"until_ns": parse_stamp(text)}
+    except ValueError as error:
+        raise DebugError(f"{text!r} is neither an index (812) nor a time (2.5s): {error}") from None
+
+
+def _said(error: RsltraceError) -> Message:
+    kind = getattr(error, "kind", None) or type(error).__name__
+    return {"kind": kind, "message": str(error)}
+
+
+def main() -> None:
+    """Serve a client."""
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
+    os.set_inheritable(number, False)
+    Supervisor(Lines(socket.socket(fileno=number)), spec).serve()
+
+
+if __name__ == "__main__":
+    main()

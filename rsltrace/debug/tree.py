@@ -1,0 +1,423 @@
+"""The processes of a session by what they are for: the cursor, and checkpoints asleep behind it."""
+
+from __future__ import annotations
+
+import os
+import select
+from collections import deque
+from typing import Any
+
+from rsltrace.debug.checkpoints import Checkpoint, Checkpoints
+from rsltrace.debug.lines import Lines, Message
+from rsltrace.debug.processes import Family, Lost, SimProcess, memory_bytes
+from rsltrace.errors import DebugError
+
+_INTERVAL_S = 0.05
+_APART_LIMIT_S = 20.0
+_WEIGHED_EVERY = 8
+_PIECE_BYTES = 1 << 16
+
+
+class ClientGone(DebugError):
+    """Nobody is there to answer."""
+
+
+class Refused(DebugError):
+    """An error that a process of the simulation has answered; ``kind`` is the class it names."""
+
+    def __init__(self, message: str, kind: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class Tree:
+    """Where a session stands, and how it gets elsewhere. ``position`` is that of the cursor."""
+
+    def __init__(self, spec: dict[str, Any], client: Lines, waiting: deque[Message]) -> None:
+        self.family = Family()
+        self.position: Message = {}
+        self._spec = {**spec, "supervisor": os.getpid()}
+        self._client = client
+        self._waiting = waiting
+        self._checkpoints = Checkpoints(int(spec["checkpoints"]))
+        self._memory_max = int(spec["memory_mib"]) << 20
+        self._since_weighed = 0
+        self._cursor: SimProcess
+        self._is_quiet = False
+        self._why_no_checkpoints = ""
+        self._output, self._output_end = os.pipe()
+        os.set_blocking(self._output, False)
+
+    # -- beginning ---------------------------------------------------------------------------------
+
+    def start(self) -> Message:
+        """Open the source; return what is known of it.
+
+        :raises DebugError: it cannot be run; ``kind`` says why.
+        """
+        root, ready = self._new_root()
+        try:
+            self._cursor = self._copy_of(root)
+        except Refused as error:
+            self._no_checkpoints(str(error))
+            self._cursor = root
+        else:
+            self._checkpoints.add(Checkpoint(0, int(ready["start_ns"]), root))
+        self.position = self._ask(self._cursor, {"do": "position"})
+        return {key: value for key, value in ready.items() if key != "notice"}
+
+    def _new_root(self) -> tuple[SimProcess, Message]:
+        """Start a process at the begin of the run."""
+        root = self.family.start(self._spec, self._output_end)
+        try:
+            while True:
+                message = self._message_of(root)
+                if message.get("notice") == "ready":
+                    return root, message
+                if message.get("notice") == "failed":
+                    error = message["error"]
+                    raise Refused(error["message"], error["kind"])
+        except DebugError:
+            self.family.kill(root)
+            raise
+
+    # -- the cursor --------------------------------------------------------------------------------
+
+    def ask_cursor(self, request: Message) -> Any:
+        """Ask the process that stands where the session does."""
+        return self._ask(self._cursor, request)
+
+    def ask_apart(self, request: Message) -> Any:
+        """Ask for what runs a user's code: a copy does it, and may be killed."""
+        answer = self._ask(self._cursor, request, whole=True)
+        if "with" not in answer:
+            return answer["ok"]
+        copy = SimProcess(Lines(_socket(answer["with"][0])))
+        try:
+            return self._ask(copy, None, limit_s=_APART_LIMIT_S)
+        finally:
+            self.family.kill(copy)
+
+    def run(self, goal: Message) -> Message:
+        """Run the cursor forward; return where and why it stopped.
+
+        :raises Lost: its process has ended; the session is back where it was.
+        """
+        before = self.position
+        request = {"do": "run", "interval_s": self._interval(), **goal}
+        if "until" in goal:
+            request["ladder"] = self._checkpoints.ladder(int(before["index"]), goal["until"])
+        try:
+            answer: Message = self._ask(self._cursor, request)
+        except Lost as error:
+            raise self._come_back(before, error) from None
+        self.position = answer["position"]
+        self._thin()
+        return answer
+
+    def _come_back(self, before: Message, error: Lost) -> DebugError:
+        """Put the session back where it was before its process ended."""
+        self.family.kill(self._cursor)
+        index = int(before["index"])
+        where = f"somewhere after event {index - 1}" if index else "at the begin"
+        try:
+            self._cursor, answer = self._at({"until": index})
+        except DebugError as again:
+            return ClientGone(f"the simulation cannot go on: {error}; nor again: {again}")
+        self.position = answer["position"]
+        return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
+
+    # -- going back --------------------------------------------------------------------------------
+
+    def go_to(self, goal: Message) -> Message:
+        """Go to an index or a time, wherever that is."""
+        if "until" in goal:
+            here = int(self.position["index"])
+            if goal["until"] == here and not self.position["is_next"]:
+                return {"reason": "step", "position": self.position}
+            is_ahead = goal["until"] > here
+        else:
+            is_ahead = goal["until_ns"] >= int(self.position["stamp_ns"])
+        if is_ahead and not self._jumps_ahead(goal):
+            return self.run(goal)
+        cursor, answer = self._at(goal)
+        self._leave_cursor()
+        self._cursor, self.position = cursor, answer["position"]
+        self._thin()
+        return answer
+
+    def _jumps_ahead(self, goal: Message) -> bool:
+        """Say whether a checkpoint lies between here and a goal ahead."""
+        found = self._bases(goal)
+        return bool(found) and found[0].index > int(self.position["index"])
+
+    def _leave_cursor(self) -> None:
+        """Have the process that stood here sleep as a checkpoint, or end."""
+        position = self.position
+        if self._checkpoints.count_max and self._copies and not position["is_next"]:
+            one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), self._cursor)
+            if not self._is_over and self._checkpoints.add(one):
+                return
+        self.family.kill(self._cursor)
+
+    def _at(self, goal: Message) -> tuple[SimProcess, Message]:
+        """Return a new process at a goal, and its answer."""
+        process, index = self._awake(self._bases(goal))
+        request = {"do": "run", "interval_s": self._interval(), **goal}
+        if "until" in goal:
+            request["ladder"] = self._checkpoints.ladder(index, goal["until"])
+        try:
+            return process, self._quietly(process, request)
+        except DebugError:
+            self.family.kill(process)
+            raise
+
+    def _bases(self, goal: Message) -> list[Checkpoint]:
+        if "until" in goal:
+            return self._checkpoints.before(goal["until"])
+        return self._checkpoints.before_time(goal["until_ns"])
+
+    def _awake(self, bases: list[Checkpoint]) -> tuple[SimProcess, int]:
+        """Return a copy of the first checkpoint that can be woken, or a process at the begin."""
+        for one in bases:
+            try:
+                return self._copy_of(one.process), one.index
+            except Lost:
+                self._forget(one)
+            except Refused as error:
+                self._no_checkpoints(str(error))
+                break
+        if not bases or self._why_no_checkpoints:
+            self._tell({"notice": "again", "text": "running again from the beginning"})
+        root, _ = self._new_root()
+        return root, 0
+
+    def go_back(self, conditions: Message) -> Message:
+        """Go back to the last place at which one of the conditions was true; else to the begin."""
+        # Where it stands before a callback, what ended just before that is behind, too.
+        hit = self.last_hit(conditions, int(self.position["index"]) + self.position["is_next"])
+        if hit is None:
+            answer = self.go_to({"until": 0})
+            return {**answer, "reason": "begin"}
+        goal = {"until": hit["index"]}
+        if hit["is_next"]:
+            goal["is_next_at"] = hit["index"]
+        answer = self.go_to(goal)
+        if hit["breakpoint"]["number"]:
+            answer = {**answer, "reason": "breakpoint", "breakpoint": hit["breakpoint"]}
+            answer["text"] = hit["text"]
+        return answer
+
+    def last_hit(self, conditions: Message, below: int) -> Message | None:
+        """Return the last place at an index ``below`` so many where a condition was true."""
+        end = min(below, int(self.position["index"]))
+        while True:
+            bases = self._checkpoints.before(max(end - 1, 0))
+            process, index = self._awake(bases)
+            try:
+                answer = self._quietly(
+                    process,
+                    {
+                        "do": "run",
+                        "until": end,
+                        "below": below,
+                        "searches": True,
+                        "interval_s": self._interval(),
+                        **conditions,
+                    },
+                )
+            finally:
+                self.family.kill(process)
+            hit: Message | None = answer.get("hit")
+            if hit is not None or index == 0:
+                return hit
+            end, below = index, index + 1
+
+    def first_hit(self, conditions: Message, end: int) -> Message | None:
+        """Return the first place up to index ``end`` where a condition was true."""
+        process, _ = self._awake(self._checkpoints.before(0))
+        try:
+            answer = self._quietly(process, {"do": "run", "until": end, **conditions})
+        finally:
+            self.family.kill(process)
+        return answer["position"] if answer["reason"] == "breakpoint" else None
+
+    # -- checkpoints -------------------------------------------------------------------------------
+
+    @property
+    def _copies(self) -> bool:
+        return not self._why_no_checkpoints
+
+    @property
+    def _is_over(self) -> bool:
+        return bool(self.position.get("over"))
+
+    def _interval(self) -> float:
+        return _INTERVAL_S if self._checkpoints.count_max else 0.0
+
+    def _copy_of(self, process: SimProcess) -> SimProcess:
+        """Return a copy of a process, which stands where it does.
+
+        :raises Refused: there can be none.
+        """
+        answer = self._ask(process, {"do": "fork"}, whole=True)
+        return SimProcess(Lines(_socket(answer["with"][0])))
+
+    def _no_checkpoints(self, why: str) -> None:
+        if why != self._why_no_checkpoints:
+            self._why_no_checkpoints = why
+            self._tell({"notice": "no checkpoints", "text": why})
+
+    def _forget(self, one: Checkpoint) -> None:
+        self._checkpoints.remove(one)
+        self.family.kill(one.process)
+
+    def _thin(self) -> None:
+        """Keep number and memory of checkpoints within their bounds."""
+        cursor = int(self.position["index"])
+        while len(self._checkpoints) > self._checkpoints.count_max:
+            if not self._drop_one(cursor):
+                return
+        self._since_weighed += 1
+        if self._since_weighed >= _WEIGHED_EVERY:
+            self._since_weighed = 0
+            while self.memory() > self._memory_max and self._drop_one(cursor):
+                pass
+
+    def _drop_one(self, cursor: int) -> bool:
+        worst = self._checkpoints.least_useful(cursor)
+        if worst is not None:
+            self._forget(worst)
+        return worst is not None
+
+    def memory(self) -> int:
+        """Return how much memory the checkpoints take, in bytes (PSS)."""
+        return sum(memory_bytes(one.process.pid) for one in self._checkpoints.all())
+
+    def described(self) -> Message:
+        """Return what checkpoints there are, as an answer has it."""
+        return {
+            "indices": [one.index for one in self._checkpoints.all()],
+            "bytes": self.memory(),
+            "why_not": self._why_no_checkpoints,
+        }
+
+    # -- talking -----------------------------------------------------------------------------------
+
+    def next_request(self) -> Message | None:
+        """Wait for the client's next request; None once it is gone."""
+        while not self._waiting:
+            if self._client.ended:
+                return None
+            self._wait_for(None, None)
+        return self._waiting.popleft()
+
+    def _quietly(self, process: SimProcess, request: Message) -> Message:
+        """Ask a process that repeats what has been seen: what it prints is dropped."""
+        self._is_quiet = True
+        try:
+            answer: Message = self._ask(process, request)
+            return answer
+        finally:
+            self._pass_output_on()
+            self._is_quiet = False
+
+    def _ask(
+        self,
+        process: SimProcess,
+        request: Message | None,
+        *,
+        whole: bool = False,
+        limit_s: float | None = None,
+    ) -> Any:
+        """Send a request to a process and wait for its answer.
+
+        :raises Refused: the error that it answered.
+        :raises Lost: it has ended, or does not answer in time.
+        """
+        if request is not None:
+            try:
+                process.lines.send({"id": 0, **request})
+            except OSError:
+                raise Lost(self.family.how_ended(process)) from None
+        while True:
+            message = self._message_of(process, limit_s)
+            if "error" in message:
+                raise Refused(message["error"]["message"], message["error"]["kind"])
+            if "ok" in message:
+                return message if whole else message["ok"]
+
+    def _message_of(self, process: SimProcess, limit_s: float | None = None) -> Message:
+        """Wait for what a process says that is no notice to us."""
+        while True:
+            message = process.lines.next()
+            if message is None:
+                if process.lines.ended:
+                    self._pass_output_on()
+                    raise Lost(self.family.how_ended(process))
+                self._wait_for(process, limit_s)
+            elif message.get("notice") == "copy":
+                process.pid = message["pid"]
+            elif message.get("notice") == "checkpoint":
+                self._add(message)
+            elif message.get("notice") == "no checkpoint":
+                self._no_checkpoints(message["text"])
+            else:
+                return message
+
+    def _add(self, message: Message) -> None:
+        copy = SimProcess(Lines(_socket(message["with"][0])))
+        position = message["position"]
+        one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), copy)
+        if not self._checkpoints.add(one):
+            self.family.kill(copy)
+        elif len(self._checkpoints) > self._checkpoints.count_max:
+            worst = self._checkpoints.least_useful(one.index)
+            if worst is not None:
+                self._forget(worst)
+
+    def _wait_for(self, process: SimProcess | None, limit_s: float | None) -> None:
+        """Wait until somebody says something: a process, the client, a node that prints."""
+        ends: list[Any] = [self._output]
+        if process is not None:
+            ends.append(process.lines)
+        if not self._client.ended:
+            ends.append(self._client)
+        ready = select.select(ends, [], [], limit_s)[0]
+        if not ready:
+            raise Lost(f"it has not come back for {limit_s:g} s, and was ended")
+        if self._output in ready:
+            self._pass_output_on()
+        if self._client in ready:
+            self._hear_client(process)
+        if process is not None and process.lines in ready:
+            process.lines.read()
+        self.family.reap()
+
+    def _hear_client(self, process: SimProcess | None) -> None:
+        self._client.read()
+        while (request := self._client.next()) is not None:
+            if process is not None and request.get("do") == "pause":
+                process.lines.send({"id": 0, "do": "pause"})
+            self._waiting.append(request)
+        if self._client.ended and process is not None:
+            raise ClientGone("the client is gone")
+
+    def _pass_output_on(self) -> None:
+        """Give the client what nodes have printed."""
+        while True:
+            try:
+                data = os.read(self._output, _PIECE_BYTES)
+            except BlockingIOError:
+                return
+            if not self._is_quiet:
+                self._tell({"notice": "output", "text": data.decode("utf-8", "replace")})
+
+    def _tell(self, notice: Message) -> None:
+        self._client.send(notice)
+
+
+def _socket(number: int) -> Any:
+    import socket
+
+    return socket.socket(fileno=number)

@@ -1,0 +1,123 @@
+"""The event that is about to run, or has just ended, as conditions see it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.debug.conditions.view import Sent
+from rsltrace.doors.rclpy.wire.codec import codec_for
+from rsltrace.doors.rclpy.wire.interfaces import get_message_class
+from rsltrace.model.event import OutputKind
+from rsltrace.words.logs import parse_log
+
+if TYPE_CHECKING:
+    from rsltrace.debug.ledger import Ledger, Payload
+    from rsltrace.run.session import Session
+
+
+class View:
+    """An ``EventView``: ``is_next`` says that the event is about to run, else it has just ended.
+
+    One object serves a whole run; what it says is what is true when it is asked.
+    ``callback`` is what is called then, with ``args``.
+    """
+
+    def __init__(self, session: Session, ledger: Ledger) -> None:
+        self._domain = session.world.domain
+        self._event = self._domain.event
+        self._ledger = ledger
+        self.is_next = False
+        self.callback: Any = None
+        self.args: tuple[Any, ...] = ()
+
+    @property
+    def stamp_ns(self) -> int:
+        """Simulated time."""
+        return self._domain.loop.now_ns
+
+    def nodes(self) -> Mapping[str, object]:
+        """Return the nodes there are, by their full names."""
+        found = {}
+        for handle in self._domain.graph.nodes:
+            node = getattr(handle, "wrapper", None)
+            if node is not None:
+                found[handle.fully_qualified_name] = node
+        return found
+
+    @property
+    def index(self) -> int:
+        """Its number, counted from 0."""
+        return self._ledger.events - (not self.is_next)
+
+    @property
+    def kind(self) -> int:
+        """Its ``EventKind``."""
+        return self._event.kind
+
+    @property
+    def entity(self) -> int:
+        """The id of what runs."""
+        return self._event.entity
+
+    @property
+    def entity_name(self) -> str:
+        """Its name: a topic, a service, a timer's callback."""
+        entity = self._ledger.entities.get(self._event.entity)
+        return entity.name if entity is not None else ""
+
+    @property
+    def entity_kind(self) -> str:
+        """``subscription``, ``timer``, …; empty for none."""
+        entity = self._ledger.entities.get(self._event.entity)
+        return entity.kind.label if entity is not None and entity.id else ""
+
+    @property
+    def node(self) -> str:
+        """The full name of its node, empty for the run itself."""
+        node = self._event.node
+        return "" if node is None else str(node.fully_qualified_name)
+
+    @property
+    def output_hash(self) -> int:
+        """The hash of its outputs; of an event that is about to run, 0."""
+        return 0 if self.is_next else self._ledger.output_hash
+
+    def received(self) -> tuple[str, object] | None:
+        """Return topic (or service) and message of its input, None if it has no message."""
+        message = self.args[0] if self.args else None
+        if not hasattr(message, "get_fields_and_field_types"):
+            return None
+        return self.entity_name, message
+
+    def sent(self) -> Sequence[Sent]:
+        """Return its outputs, in order; of an event that is about to run, none."""
+        if self.is_next:
+            return ()
+        return [self._sent(*output) for output in self._ledger.outputs_of_last()]
+
+    def _sent(
+        self, kind: int, entity_id: int, content_hash: int, kept: Payload | str | None
+    ) -> Sent:
+        entity = self._ledger.entities.get(entity_id)
+        name = entity.name if entity is not None else ""
+        if isinstance(kept, str):
+            lines = kept.strip().splitlines() or [""]
+            return Sent(kind, name, content_hash, lines[-1])
+        if kept is None:
+            return Sent(kind, name, content_hash)
+        if kind == OutputKind.LOG:
+            record = parse_log(kept[1])
+            return Sent(kind, name, content_hash, record.text, record.level)
+        type_name = self._ledger.channels[kept[0]][1]
+        return Sent(kind, name, content_hash, message=partial(_decoded, type_name, kept[1]))
+
+    def findings(self) -> Sequence[str]:
+        """Return what the guard found in it (``clock``, ``random``); before it runs, nothing."""
+        return () if self.is_next else [one.source.value for one in self._ledger.findings]
+
+
+def _decoded(type_name: str, data: bytes) -> object:
+    decode: Callable[[bytes], object] = codec_for(get_message_class(type_name)).deserialize
+    return decode(data)

@@ -1,0 +1,199 @@
+"""A debugging session from Python: forwards, backwards, questions, breakpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rsltrace import DebugSession
+from rsltrace.errors import ConditionError, DebugError, ReplayError
+from rsltrace.trace.reader import Trace
+
+
+@pytest.fixture(scope="module")
+def shared(folder: Path) -> Iterator[DebugSession]:
+    with DebugSession(folder / "run.mcap", trust=True) as session:
+        yield session
+
+
+@pytest.fixture
+def session(shared: DebugSession) -> DebugSession:
+    """The session of this module, at its begin and without breakpoints."""
+    for one in shared.breakpoints:
+        shared.clear(one.number)
+    shared.go_to(0)
+    return shared
+
+
+@pytest.fixture(scope="module")
+def trace(folder: Path) -> Iterator[Trace]:
+    with Trace.open(folder / "run.mcap") as opened:
+        yield opened
+
+
+def test_a_step_is_an_event_of_the_trace(session: DebugSession, trace: Trace) -> None:
+    assert session.position.index == 0
+    assert session.position.event is None
+    for index in range(6):
+        stopped = session.step()
+        event = trace.event(index)
+        assert (stopped.reason, stopped.position.index) == ("step", index + 1)
+        assert stopped.position.event is not None
+        assert stopped.position.event["chain_hash"] == f"{event.chain_hash:016x}"
+        assert stopped.position.event["stamp_ns"] == event.stamp_ns
+    assert session.step(10).position.index == 16
+
+
+def test_going_back_gives_the_states_that_were_there(session: DebugSession) -> None:
+    session.run_to(500)
+    forward = {}
+    for _ in range(6):
+        position = session.step().position
+        forward[position.index] = (position, session.evaluate("filter.state"))
+    for index in (506, 505, 504, 503, 502):
+        position = session.reverse_step().position if index < 506 else session.position
+        assert (position, session.evaluate("filter.state")) == forward[index]
+    assert session.reverse_step(4).position.index == 498
+    assert session.go_to(503).position == forward[503][0]
+
+
+def test_time_steps_and_times(session: DebugSession, trace: Trace) -> None:
+    stopped = session.run_to("1.005s")
+    assert stopped.position.is_next
+    stamps = [int(s) for rows in trace.events() for s in rows["stamp"]]
+    assert stopped.position.index == sum(stamp <= 1_005_000_000 for stamp in stamps)
+    ended = session.finish().position
+    assert stamps[ended.index - 1] < stamps[ended.index]
+    assert stamps[ended.index - 2] == stamps[ended.index - 1]
+    back = session.go_to("0.5").position
+    assert back.index == sum(stamp <= 500_000_000 for stamp in stamps)
+    with pytest.raises(DebugError, match="behind"):
+        session.run_to("0.2s")
+    with pytest.raises(DebugError, match="neither an index"):
+        session.go_to("soon")
+
+
+def test_next_and_reverse_next_stay_in_a_node(session: DebugSession) -> None:
+    session.run_to(200)
+    places = []
+    for _ in range(3):
+        stopped = session.next("filter")
+        assert stopped.reason == "step"
+        assert stopped.position.event is not None
+        assert stopped.position.event["node"] == "/filter"
+        places.append(stopped.position)
+    assert session.reverse_next().position == places[1]
+    assert session.reverse_next().position == places[0]
+    with pytest.raises(DebugError, match="did you mean 'filter'"):
+        session.next("filtr")
+
+
+def test_breakpoints_stop_forwards_and_backwards(session: DebugSession) -> None:
+    too_fast = session.break_at("log warn /fast/")
+    stopped = session.go_on()
+    assert stopped.breakpoint == too_fast
+    warned = stopped.position
+    assert session.evaluate("filter.state") > 100
+    session.clear(too_fast.number)
+    message = session.break_at("/smooth: data > 150")
+    first = session.go_on()
+    assert first.breakpoint == message
+    second = session.go_on()
+    assert (second.position.index, second.position.is_next) == (first.position.index, True)
+    assert "receives" in second.text
+    third = session.go_on()
+    assert third.position.index == first.position.index + 3
+    assert session.reverse_go_on().position == second.position
+    assert session.reverse_go_on().position == first.position
+    back = session.reverse_go_on()
+    assert (back.reason, back.position.index) == ("begin", 0)
+    session.clear(message.number)
+    at = session.break_at(str(warned.index))
+    assert session.breakpoints == (at,)
+    stopped = session.go_on()
+    assert (stopped.position.index, stopped.position.is_next) == (warned.index, True)
+    assert session.go_on().reason == "end"
+    assert session.reverse_go_on().position == stopped.position
+    with pytest.raises(ConditionError, match="did you mean '/smooth'"):
+        session.break_at("/smoth: data > 1")
+
+
+def test_the_end_is_an_end_from_which_one_can_go_back(session: DebugSession, trace: Trace) -> None:
+    stopped = session.go_on()
+    assert (stopped.reason, stopped.position.index) == ("end", trace.event_count)
+    assert session.step().reason == "end"
+    assert session.reverse_step().position.index == trace.event_count - 1
+    assert session.step().reason == "end"
+
+
+def test_who_changed_sent_and_when_it_became_true(session: DebugSession) -> None:
+    session.go_to(700)
+    changed = session.last_changed("filter", "warned")
+    session.go_to(changed.index)
+    assert session.evaluate("warned", "filter") == changed.stamp_ns
+    session.reverse_step()
+    assert session.evaluate("warned", "filter") is None
+    made = session.last_changed("filter", "warned")
+    assert made.event is not None
+    assert made.event["kind"] == "construct"
+    with pytest.raises(DebugError, match="has not changed"):
+        session.last_changed("filter", "nothing")
+    session.go_to(700)
+    true = session.first_true("when filter.state > 100")
+    assert true == changed
+    assert session.position.index == 700
+    event = session.event(changed.index - 1)
+    sent = session.sent_by(event["index"])
+    assert sent.index == event["cause_event"] + 1
+    assert sent.event is not None
+    assert sent.event["node"] == "/source"
+
+
+def test_questions(session: DebugSession) -> None:
+    session.run_to(100)
+    session.next("filter")
+    assert session.node("filter")["warned"] == "None"
+    assert [node["name"] for node in session.inspect("nodes")] == ["/source", "/filter", "/watch"]
+    message = session.inspect("message")
+    assert message["name"] == "/speed"
+    assert message["content"] == {"data": 1.5 * session.evaluate("source.count")}
+    queues = {(one["node"], one["name"]): one["waiting"] for one in session.inspect("queues")}
+    assert queues["/watch", "/smooth"] == 1
+    assert queues["/filter", "/speed"] == 0
+    (timer,) = session.inspect("timers")
+    assert (timer["name"], timer["period_ns"]) == ("Source.tick", 10_000_000)
+    assert timer["due_ns"] > session.position.stamp_ns
+    assert "got" in session.inspect("source")["name"]
+    links = {link["name"] for link in session.inspect("graph")["links"]}
+    assert {"/speed", "/smooth", "/reset"} <= links
+    assert session.inspect("stacks") == []
+    with pytest.raises(DebugError, match="nothing is called 'queus'; did you mean 'queues'"):
+        session.inspect("queus")
+    with pytest.raises(DebugError, match="ZeroDivisionError"):
+        session.evaluate("1 / 0")
+
+
+def test_an_expression_changes_nothing(session: DebugSession) -> None:
+    session.run_to(100)
+    assert session.evaluate("vars(filter).update(state=1e9)") is None
+    assert session.evaluate("filter.state") < 1e6
+    assert session.go_on().reason == "end"
+
+
+def test_a_job_that_was_never_recorded(folder: Path) -> None:
+    with DebugSession(folder / "job.yaml") as session, Trace.open(folder / "run.mcap") as trace:
+        assert session.events is None
+        stopped = session.run_to(300)
+        assert stopped.position.event is not None
+        assert stopped.position.event["chain_hash"] == f"{trace.event(299).chain_hash:016x}"
+        assert session.reverse_step().position.index == 299
+        assert session.go_on().reason == "end"
+        assert session.position.index == trace.event_count
+        assert session.go_to(10).position.index == 10
+
+
+def test_a_trace_that_nobody_trusts_is_not_run(folder: Path) -> None:
+    with pytest.raises(ReplayError, match="would run code"):
+        DebugSession(folder / "run.mcap")
