@@ -103,14 +103,18 @@ def _finish_process(stacks: Stacks, program: Program, error: BaseException | Non
 
 
 def _wait_for_threads(stacks: Stacks, program: Program) -> None:
-    """Wait for all threads that are no daemons, as a process does when its main has returned."""
-    own = [t for t in stacks.threads.alive if t.program is program and not t.ended]
+    """Wait for all threads that are no daemons, as a process does when its main has returned; they
+    may start more of them meanwhile."""
     with contextlib.suppress(RunEnded, KeyboardInterrupt):
-        for thread in own:
-            thread.dismiss()
-        for thread in own:
-            if not thread.daemon:
-                thread.join(None)
+        while True:
+            own = [t for t in stacks.threads.alive if t.program is program and not t.ended]
+            for thread in own:
+                thread.dismiss()
+            if all(thread.daemon for thread in own):
+                break
+            for thread in own:
+                if not thread.daemon:
+                    thread.join(None)
 
 
 def _stop_threads(stacks: Stacks, program: Program) -> None:

@@ -1,9 +1,11 @@
 """Threads that user code starts run as cooperative ones, in the one thread of the simulation.
 
-A thread is a stack of its own that runs until it blocks or spins; then somebody else goes on. It
-begins right after the event that started it. ``threading``, ``queue`` and ``concurrent.futures``
-stay what they are: only ``Thread.start`` and its like, and the locks below everything, are
-exchanged while a run lasts. What real threads (of libraries in C) start or lock stays real.
+A thread is a stack of its own that runs until it blocks or spins; then somebody else goes on. As
+CPython's, ``Thread.start`` waits until the thread has begun, and goes on when that blocks; a thread
+of ``start_new_thread`` begins after the event that started it. ``threading``, ``queue`` and
+``concurrent.futures`` stay what they are: only ``Thread.start`` and its like, and the locks below
+everything, are exchanged while a run lasts. What real threads (of libraries in C) start or lock
+stays real.
 """
 
 from __future__ import annotations
@@ -75,6 +77,7 @@ class SimThread:
         stacks.domain.entities.pending.append(self)
         self._body: Callable[[], object] | None = body
         self._joining: list[Wait] = []
+        self._starting: Wait | None = None
         self._cause = (
             stacks.loop.events,
             stacks.dispatcher.note(OutputKind.TASK, self.entity_id, 3),
@@ -120,6 +123,8 @@ class SimThread:
 
         body, self._body = self._body, None
         assert body is not None
+        if self._starting is not None:
+            self._starting.wake()
         try:
             body()
         except (RunEnded, SystemExit, ExternalShutdownException):
@@ -129,6 +134,20 @@ class SimThread:
                 raise
         finally:
             self.end()
+
+    def wait_for_begin(self) -> None:
+        """Let the thread run until it blocks, or ends: whoever starts it goes on after that.
+
+        Where nobody can wait (while modules are imported, when the run is over) it begins later.
+        """
+        stacks = self.stacks
+        if stacks.event.handle is None or stacks.ending.unwinding or self.program.ended:
+            return
+
+        def begun(blocked: Wait) -> None:
+            self._starting = blocked
+
+        wait(stacks, f"thread {self.name} to begin", until=begun, quiet=True)
 
     def end(self) -> None:
         """Take note that the thread has ended: whoever joins it goes on."""
@@ -221,6 +240,7 @@ def _start(self: Any) -> None:
     self._ident = self._native_id = thread.ident
     threading._active[thread.ident] = self  # type: ignore[attr-defined]
     self._started.set()
+    thread.wait_for_begin()
 
 
 _default_hook = threading.excepthook

@@ -1,0 +1,110 @@
+"""Who runs first when a thread is started or woken: as in CPython, which runs the same program."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+from rclpy.node import Node
+
+from rsltrace import NodeSpec
+
+pytestmark = pytest.mark.ros
+
+PROGRAM = Path(__file__).with_name("thread_order_program.py")
+
+
+def test_threads_take_turns_as_natively(simulate: Any, capfd: Any) -> None:
+    done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=True)
+    natively = json.loads(done.stdout)
+    assert len(natively) == 16
+    assert natively["start"] == ["child", "parent"]
+    assert natively["start_new_thread"] == ["parent", "child"]
+    simulate(NodeSpec(script=PROGRAM))
+    assert json.loads(capfd.readouterr().out) == natively
+
+
+def test_a_thread_that_is_started_in_a_callback(simulate: Any) -> None:
+    log: list[Any] = []
+
+    class Starts(Node):
+        def __init__(self) -> None:
+            super().__init__("starts")
+            self.create_timer(1.0, self.tick)
+            self.create_timer(1.0, lambda: log.append("other timer"))
+
+        def tick(self) -> None:
+            self.ready = False
+            threading.Thread(target=self.work).start()
+            assert self.ready
+            log.append("callback")
+            self.get_logger().info("callback")
+
+        def work(self) -> None:
+            self.ready = True
+            log.append("thread")
+            self.get_logger().info("thread")
+            threading.Event().wait(0.5)
+            log.append("thread later")
+
+    recorded = simulate(Starts, duration=1.6)
+    assert log == ["thread", "callback", "other timer", "thread later"]
+    ticks = [e for e in recorded.events() if e.stamp_ns == 1_000_000_000]
+    assert [e.kind.label for e in ticks] == ["timer", "task", "resume", "timer"]
+    assert ticks[1].cause_event == ticks[0].index
+    assert recorded.logs() == ["thread", "callback"]
+
+
+def test_threads_that_start_each_other_for_ever_do_not_nest(simulate: Any) -> None:
+    log: list[int] = []
+
+    def program() -> None:
+        def run(number: int) -> None:
+            log.append(number)
+            if number < 2000:
+                next_one = threading.Thread(target=run, args=(number + 1,))
+                next_one.start()
+                next_one.join()
+
+        def tick(left: int) -> None:
+            if left:
+                threading.Timer(0.01, tick, (left - 1,)).start()
+            else:
+                log.append(-1)
+
+        tick(2000)
+        run(0)
+
+    simulate(NodeSpec(main=program))
+    assert log == [*range(2001), -1]
+
+
+def test_a_thread_that_is_started_under_asyncio_has_no_event_loop(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+
+        async def work() -> None:
+            log.append("own loop")
+
+        async def main() -> None:
+            loop = asyncio.get_running_loop()
+            thread = threading.Thread(target=lambda: asyncio.run(work()))
+            thread.start()
+            assert asyncio.get_running_loop() is loop
+            log.append(await asyncio.to_thread(threading.current_thread))
+            thread.join()
+
+        asyncio.run(main())
+
+    simulate(NodeSpec(main=program))
+    assert log[0] == "own loop"
+    assert log[1].name.startswith("asyncio")
