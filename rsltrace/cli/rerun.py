@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from rsltrace.terminal import say
+from rsltrace.terminal import say, tell
 
 
 @click.command()
@@ -53,6 +53,7 @@ def rerun(
     traces = [trace] if other is None else [trace, other]
     if output is not None:
         done = export(traces, output, force=force)
+        _tell_what_is_left_out(done.left_out)
         if not quiet:
             say(
                 f"wrote {output}: {done.events} events, {done.bytes / 1e6:.1f} MB "
@@ -62,5 +63,10 @@ def rerun(
             show.open_viewer(output, how)
     elif how is not None:
         with show.temporary_recording() as target:
-            export(traces, target)
+            _tell_what_is_left_out(export(traces, target).left_out)
             show.open_viewer(target, how)
+
+
+def _tell_what_is_left_out(lines: tuple[str, ...]) -> None:
+    for line in lines:
+        tell(f"rsltrace: note: {line}")

@@ -14,6 +14,9 @@ from rsltrace.replay.code import file_of
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 
+_NAME_MAX = 255
+"""Bytes that the name of a file can have."""
+
 
 def job_in_trace(trace: Trace, folder: Path) -> Job:
     """Return the job that a trace holds, as if its file were in ``folder``. Nothing is run.
@@ -57,7 +60,7 @@ def _let_follow(trace: Trace, resolved: dict[str, Any], folder: Path) -> None:
 def job_name(trace: Trace) -> str:
     """Return the name of the file that a trace's job was read from, empty if it was none."""
     name = Path(trace.job.get("name", "")).name
-    return "" if name == "<python>" else name
+    return "" if name == "<python>" or len(name.encode("utf-8", "replace")) > _NAME_MAX else name
 
 
 def folder_of(trace: Trace, given: Path | None) -> Path:

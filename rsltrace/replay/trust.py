@@ -22,18 +22,22 @@ from rsltrace.run.plans.executables import why_not
 from rsltrace.trace.reader import Trace
 
 _LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
-_RUNS_OR_READS = (
-    "nodes",
-    "hooks",
-    "search_path",
-    "ros_arguments",
-    "bags",
-    "guard",
-    "delay",
-    "progress",
-    "clocks",
+_MAY_DIFFER = frozenset(
+    (
+        "start_ns",
+        "construct_time_ns",
+        "stop",
+        "seed",
+        "timer_ties",
+        "livelock_limit",
+        "policy",
+        "min_time_step_ns",
+        "executors",
+        "execution",
+        "record",
+    )
 )
-"""Keys of a job with which somebody could make nodes do what they do not do otherwise."""
+"""Keys of a job that say when, in which order and for how long its nodes run, and what is kept."""
 
 
 def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str:
@@ -83,9 +87,10 @@ def _differing(own: Job, job: Job) -> list[str]:
 
 def _values(job: Job) -> dict[str, Any]:
     resolved = json.loads(json.dumps(job.resolved()))
-    values = {key: resolved[key] for key in _RUNS_OR_READS}
+    values = {key: value for key, value in resolved.items() if key not in _MAY_DIFFER}
     values["guard"] = {key: value for key, value in values["guard"].items() if key != "pin"}
     policy = resolved["policy"] or {}
     values["stop.function"] = resolved["stop"]["function"]
     values["policy"] = policy.get("function"), policy.get("recorded")
+    values["files"] = sorted(job.model_files())
     return values

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
 
-from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.errors import OutputError, RsltraceError, TraceError
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
@@ -60,7 +61,8 @@ def assert_matches_golden(
     Returns whether the golden trace was written.
 
     :raises GoldenMismatch: they diverge; the message is the report.
-    :raises RsltraceError: there is nothing to compare: the run failed or a file is unreadable.
+    :raises RsltraceError: there is nothing to compare: the run failed, a file is unreadable or
+        cannot be written.
     """
     __tracebackhide__ = True
     target = Path(golden)
@@ -122,9 +124,15 @@ def _write(run: Path, golden: Path) -> bool:
                 return False
     except RsltraceError:
         pass  # missing, damaged or of an older format: what the update is for
-    golden.parent.mkdir(parents=True, exist_ok=True)
     # Beside the target first: an interrupted copy must not leave half a golden trace.
     part = golden.with_name(golden.name + ".part")
-    shutil.copyfile(run, part)
-    part.replace(golden)
+    try:
+        golden.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(run, part)
+        part.replace(golden)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+        reason = error.strerror or error
+        raise OutputError(f"the golden trace {golden} cannot be written: {reason}") from error
     return True

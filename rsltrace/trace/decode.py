@@ -41,7 +41,7 @@ _MISFITS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, Me
 
 
 class Decoder:
-    """Decodes the messages of one channel's schema."""
+    """Decodes the messages of one channel's schema: type ``name``, defined in ``types``."""
 
     def __init__(self, channel: ChannelInfo) -> None:
         """Check the schema and make the decoder. Raises TraceError if the schema is unusable."""
@@ -54,11 +54,13 @@ class Decoder:
             raise self._unusable(f"{channel.type!r} is no name of a type")
         # Types named without a package are looked up beside the type: those a service names are in
         # the package's msg folder, as if the request or response stood there itself.
-        self._name = normalize_msgtype(channel.type.replace("/srv/", "/msg/", 1))
+        self.name = normalize_msgtype(channel.type.replace("/srv/", "/msg/", 1))
         try:
-            types = get_types_from_msg(channel.schema_text, self._name)
-            checked: dict[str, Any] = {name: ([], _checked_fields(name, types)) for name in types}
-            self.items = sum(map(_unrolled, checked.values()))
+            types = get_types_from_msg(channel.schema_text, self.name)
+            self.types: dict[str, Any] = {
+                name: ([], _checked_fields(name, types)) for name in types
+            }
+            self.items = sum(map(_unrolled, self.types.values()))
             if self.items > limits.SCHEMA_ITEMS_MAX:
                 raise _UnsafeSchema(f"its fixed arrays have {self.items} strings or messages")
             depths: dict[str, int] = {}
@@ -66,8 +68,8 @@ class Decoder:
                 _nesting(name, types, depths)
             # A store of its own per schema: two channels may define one type in different ways.
             self._store = Typestore()
-            self._store.register(checked)
-            self._store.get_msgdef(self._name)
+            self._store.register(self.types)
+            self._store.get_msgdef(self.name)
         except (TypesysError, _UnsafeSchema, RecursionError, KeyError) as error:
             raise self._unusable(error) from error
 
@@ -78,7 +80,7 @@ class Decoder:
         (with an underscore behind those that Python reserves).
         """
         try:
-            return self._store.deserialize_cdr(data, self._name)
+            return self._store.deserialize_cdr(data, self.name)
         except _MISFITS as error:
             raise TraceError(
                 f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "

@@ -28,6 +28,7 @@ OUTPUT_BYTES_MAX = 16 * MIB
 """No more is read of what a command prints."""
 
 _POLL_S = 0.004
+LEFT_S = 30.0
 
 
 def entry_point() -> Callable[[], object]:
@@ -70,9 +71,15 @@ def run(command: Command, scratch: Path) -> Ran:
     pid = os.fork()
     if pid == 0:
         _in_child(command, places)
+    client = _start_client(command, pid) if command.client else 0
     status, usage, timed_out, killed = _wait(pid, command, grown_from)
+    left = 0 if command.words[:1] == ("record",) else _left_behind(pid)  # nodes may leave some
     with contextlib.suppress(ProcessLookupError, PermissionError):
-        os.killpg(pid, signal.SIGKILL)  # what it left behind
+        os.killpg(pid, signal.SIGKILL)
+    if client:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(client, signal.SIGKILL if timed_out else 0)
+        os.waitpid(client, 0)
     return Ran(
         command,
         os.waitstatus_to_exitcode(status),
@@ -83,7 +90,47 @@ def run(command: Command, scratch: Path) -> Ran:
         time.monotonic() - started,
         timed_out,
         killed,
+        left,
     )
+
+
+def _start_client(command: Command, pid: int) -> int:
+    """Start what attacks a command while it runs; return its process id."""
+    assert command.client is not None
+    client = os.fork()
+    if client == 0:
+        try:
+            command.client(pid)
+        except BaseException:
+            traceback.print_exc()
+        os._exit(0)
+    return client
+
+
+def _left_behind(group: int) -> int:
+    """Return how many processes of a group go on after its leader's end, whatever they were told.
+
+    Half a minute is for those that look now and then whether they are still wanted.
+    """
+    until = time.monotonic() + LEFT_S
+    while left := _members(group):
+        if time.monotonic() > until:
+            break
+        time.sleep(0.05)
+    return left
+
+
+def _members(group: int) -> int:
+    try:
+        os.killpg(group, 0)
+    except (ProcessLookupError, PermissionError):
+        return 0
+    count = 0
+    for place in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError, ValueError, IndexError):
+            state, _, of_group = place.read_text().rpartition(")")[2].split()[:3]
+            count += int(of_group) == group and state not in "ZX"
+    return count
 
 
 def call(function: Callable[[], bytes], scratch: Path, *, cpu_s: int = 20) -> bytes | None:

@@ -27,6 +27,7 @@ class Wrong(str, Enum):
     FORGED = "forged"  # the same, although --check says that it has read everything
     BROKEN = "broken"  # the attack itself failed
     LOST = "lost"  # what was said to be kept is not there
+    LEFT = "left"  # a process that goes on after its command
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,8 @@ class Command:
 
     ``stdout`` and ``stderr`` are "file" (and read by the oracle), "full" (/dev/full) or "closed".
     ``allowed`` are the exit statuses that are documented for it; negative ones are signals.
-    ``program`` is run instead of rsltrace, where something has to be around it.
+    ``program`` is run instead of rsltrace, where something has to be around it. ``client`` is
+    called in a process of its own, with the command's id, while that runs: it attacks and ends it.
     """
 
     words: tuple[str, ...]
@@ -73,11 +75,15 @@ class Command:
     environment: tuple[tuple[str, str], ...] = ()
     program: tuple[str, ...] = ()
     user: int | None = None
+    client: Callable[[int], None] | None = None
 
 
 @dataclass(frozen=True)
 class Ran:
-    """How a command ended. A negative ``status`` is the signal it died of."""
+    """How a command ended. A negative ``status`` is the signal it died of.
+
+    ``left`` is how many processes it has left behind, half a minute after its end.
+    """
 
     command: Command
     status: int
@@ -88,6 +94,7 @@ class Ran:
     wall_s: float
     timed_out: bool = False
     killed: bool = False
+    left: int = 0
 
     @property
     def line(self) -> str:

@@ -63,6 +63,8 @@ def _judge_run(case: Case, ran: Ran) -> list[Complaint]:
         found.append(Complaint(Wrong.STATUS, f"{ran.status}: {_tail(ran.stderr)}"))
     if ran.rss_mib > limits.rss_mib:
         found.append(Complaint(Wrong.MEMORY, f"{ran.rss_mib:.0f} MiB, limit {limits.rss_mib}"))
+    if ran.left:
+        found.append(Complaint(Wrong.LEFT, f"{ran.left} processes go on after it"))
     for name, data in (("stdout", ran.stdout), ("stderr", ran.stderr)):
         text = data.decode("utf-8", "replace")
         found += _judge_text(case, name, text)

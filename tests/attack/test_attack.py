@@ -28,8 +28,8 @@ from tests.attack.reading import content
 pytestmark = pytest.mark.ros
 
 HALVES = (
-    ("traces", "records", "schemas", "texts", "pasted", "servers"),
-    ("bags", "jobs", "nodes", "kills", "disks"),
+    ("traces", "records", "schemas", "texts", "pasted", "servers", "golden"),
+    ("bags", "jobs", "nodes", "kills", "disks", "serving", "replays"),
 )
 """Two processes, so that two cores share the work; each loads what it attacks once."""
 
@@ -94,7 +94,20 @@ def _made(family: Family, seed: int, folder: Path, corpus: Corpus) -> dict[str, 
 
 
 @pytest.mark.parametrize(
-    "name", ["traces", "records", "schemas", "texts", "pasted", "bags", "jobs", "nodes", "kills"]
+    "name",
+    [
+        "traces",
+        "records",
+        "schemas",
+        "texts",
+        "pasted",
+        "bags",
+        "jobs",
+        "nodes",
+        "kills",
+        "golden",
+        "replays",
+    ],
 )
 def test_a_seed_always_makes_the_same_case(name: str, tmp_path: Path, corpus: Corpus) -> None:
     family = families()[name]
@@ -160,6 +173,7 @@ _SABOTAGE: dict[Wrong, str] = {
     Wrong.HANG: "import time; time.sleep(60)",
     Wrong.EXECUTED: "open('canary', 'w').write('x')",
     Wrong.SECRET: "print('password-of-mine')",
+    Wrong.LEFT: "import os, time\nif os.fork() == 0: time.sleep(600)",
 }
 _TIGHT = Limits(cpu_s=2, rss_mib=200, wall_s=100)
 
@@ -170,13 +184,16 @@ def _case(folder: Path) -> Case:
 
 def _run(case: Case, code: str, allowed: frozenset[int] = oracle.READING) -> Ran:
     program = (sys.executable, "-c", code)
-    limits = dataclasses.replace(_TIGHT, wall_s=2) if "sleep" in code else _TIGHT
+    limits = dataclasses.replace(_TIGHT, wall_s=2) if "sleep(60)" in code else _TIGHT
     command = Command(("info", "x.mcap"), allowed, case.folder, limits=limits, program=program)
     return execution.run(command, case.folder.parent / "streams")
 
 
 @pytest.mark.parametrize("wrong", _SABOTAGE, ids=lambda wrong: wrong.value)
-def test_the_oracle_sees_sabotage(wrong: Wrong, tmp_path: Path) -> None:
+def test_the_oracle_sees_sabotage(
+    wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "LEFT_S", 0.5)
     (tmp_path / "case").mkdir()
     case = _case(tmp_path / "case")
     allowed = oracle.READING | {1} if wrong in (Wrong.TRACEBACK, Wrong.UNNAMED) else oracle.READING

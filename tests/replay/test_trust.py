@@ -62,12 +62,14 @@ def test_a_trace_of_it_with_another_seed_or_end(
         ('ros_arguments=["-p", "a:=1"]', "ros_arguments"),
         ("guard.clock=allow", "guard"),
         ('search_path=[".", ".."]', "search_path"),
+        ('launch.+={"file": "evil.launch.xml", "arguments": {}}', "launch"),
     ],
 )
 def test_a_trace_that_names_other_code_or_other_input(
     here: Path, tmp_path: Path, override: str, key: str
 ) -> None:
     """Its text may be that of the job file here: what counts is the job that would run."""
+    (tmp_path / "evil.launch.xml").write_text("<launch></launch>")
     write_hostile(tmp_path / "run.mcap", overrides=(override,))
     with pytest.raises(ReplayError, match=f"would run code, and its job differs .* in .*{key}"):
         rsltrace.replay(here)

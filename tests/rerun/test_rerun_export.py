@@ -9,9 +9,12 @@ from typing import Any
 import pytest
 import rerun_gallery as gallery
 import trace_maker
+from mcap.opcode import Opcode
+from mcap.records import Schema
 
 from rsltrace.errors import OutputError, TraceError
 from rsltrace.model.event import NO_EVENT, OutputKind
+from tests.attack import mcap_parts
 
 pytest.importorskip("rerun")
 
@@ -296,6 +299,46 @@ def test_a_service_call_is_below_services(tmp_path: Path) -> None:
     assert answered == [event + 1 for event in calls]
     assert recording.static["/services/check/response"]["SeriesLines:names"] == ["success"]
     assert "SeriesLines:names" not in recording.static["/services/check/request"]
+
+
+def test_what_was_there_stays_until_the_recording_is_whole(tmp_path: Path) -> None:
+    trace_maker.write_run(tmp_path / "run.mcap", 300)
+    data = bytearray((tmp_path / "run.mcap").read_bytes())
+    data[len(data) // 3] ^= 1
+    (tmp_path / "damaged.mcap").write_bytes(data)
+    output = tmp_path / "run.rrd"
+    output.write_bytes(b"precious")
+    with pytest.raises(TraceError):
+        export([tmp_path / "damaged.mcap"], output, force=True)
+    assert output.read_bytes() == b"precious"
+    export([tmp_path / "run.mcap"], output, force=True)
+    assert Recording(output).blueprints
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+@pytest.mark.parametrize(
+    ("schema", "why"),
+    [
+        ("p/E[] all\n====\nMSG: p/E\n", "a sequence of p/msg/E, which has no fields"),
+        ("p/T[2000] t\n====\nMSG: p/T\np/U[2000] u\n====\nMSG: p/U\nint8 x\n", "4000000 values"),
+        ("nowhere/Type t\n", "is not usable"),
+    ],
+)
+def test_topics_whose_types_ask_for_everything_are_left_out(
+    schema: str, why: str, tmp_path: Path
+) -> None:
+    trace_maker.write_run(tmp_path / "run.mcap", 300)
+    parts = mcap_parts.take_apart((tmp_path / "run.mcap").read_bytes())
+    for part in parts:
+        record = part.record if part.opcode == Opcode.SCHEMA else None
+        if isinstance(record, Schema) and record.name.startswith("std_msgs/"):
+            record.data = schema.replace("====", "=" * 80).encode()
+            part.record = record
+    (tmp_path / "hostile.mcap").write_bytes(mcap_parts.put_together(parts))
+    done = export([tmp_path / "hostile.mcap"], tmp_path / "run.rrd")
+    assert done.left_out
+    assert all(why in line for line in done.left_out)
+    assert len(Recording(tmp_path / "run.rrd").rows["/events"]) == done.events
 
 
 def fails_as_folder(folder: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import OutputError, TraceError
 from rsltrace.testing import GoldenMismatch, assert_matches_golden
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
@@ -85,6 +85,14 @@ def test_update_writes_only_what_is_another_run(tmp_path: Path) -> None:
     golden.write_bytes(b"rubbish")
     assert assert_matches_golden(A, golden, update=True)
     assert [path.name for path in golden.parent.iterdir()] == ["golden.mcap"]
+
+
+def test_a_golden_trace_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:
+    golden = tmp_path / "golden.mcap"
+    golden.mkdir()
+    with pytest.raises(OutputError, match=r"golden trace .*golden\.mcap cannot be written: Is a"):
+        assert_matches_golden(A, golden, update=True)
+    assert list(tmp_path.iterdir()) == [golden]
 
 
 def test_a_run_that_was_not_recorded_cannot_be_compared() -> None:

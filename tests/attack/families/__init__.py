@@ -18,6 +18,9 @@ NAMES = (
     "kills",
     "disks",
     "servers",
+    "serving",
+    "golden",
+    "replays",
 )
 
 

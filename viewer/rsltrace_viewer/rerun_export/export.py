@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -23,20 +24,24 @@ from rsltrace_viewer.rerun_export.sdk import APPLICATION_ID
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """What was written: events and bytes, of the traces and of the recording."""
+    """What was written: events and bytes, of the traces and of the recording.
+
+    ``left_out`` says of which topics it has no messages, and why.
+    """
 
     path: Path
     events: int
     trace_bytes: int
     bytes: int
+    left_out: tuple[str, ...]
 
 
 def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Exported:
     """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
 
-    Two traces are compared, and where they diverge is explained and marked. What was written so far
-    is removed when something goes wrong. Raises TraceError for damaged traces and OutputError if
-    ``output`` exists (without ``force``) or cannot be written.
+    Two traces are compared, and where they diverge is explained and marked. The recording appears
+    when it is complete, or not at all: then what was there before stays. Raises TraceError for
+    damaged traces, and OutputError if ``output`` exists (without ``force``) or cannot be written.
     """
     assert len(traces) in (1, 2)
     _check_output(output, traces, force=force)
@@ -50,27 +55,35 @@ def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Expo
         )
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
+        work = output.with_name(f".{output.name}.part-{os.getpid()}")
         try:
-            recording.save(output)
+            recording.save(work)
         except RuntimeError as error:
             raise OutputError(f"{output} cannot be written: {error}") from error
         try:
-            _send(opened, recording, diff)
+            left_out = _send(opened, recording, diff)
             recording.flush()
-        except BaseException:
+            recording.disconnect()  # this writes the index at the end of the file
+            size = work.stat().st_size
+            work.replace(output)
+        except BaseException as error:
             recording.disconnect()
-            output.unlink(missing_ok=True)
+            work.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                reason = error.strerror or error
+                raise OutputError(f"{output} cannot be written: {reason}") from error
             raise
-        recording.disconnect()  # this writes the index at the end of the file
         return Exported(
             output,
             sum(trace.event_count for trace in opened),
             sum(trace.size for trace in opened),
-            output.stat().st_size,
+            size,
+            tuple(left_out),
         )
 
 
-def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None) -> None:
+def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None) -> list[str]:
+    """Send it all; return what is left out."""
     clock = clock_for([trace.start_ns for trace in opened])
     labels = ("",) if len(opened) == 1 else ("a", "b")
     names = " and ".join(f"{Path(trace.name).name} {trace.digest}" for trace in opened)
@@ -88,6 +101,11 @@ def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | N
         start_ns = min(trace.start_ns for trace in opened)
         recording.send_chunks(divergence_chunks(diff, start_ns, clock))
     recording.send_blueprint(blueprint(shown, marks), make_active=True, make_default=True)
+    return [
+        f"{trace.name}: no messages on {topic}: {why}"
+        for trace, run in zip(opened, shown, strict=True)
+        for topic, why in run.left_out.items()
+    ]
 
 
 def _check_output(output: Path, traces: Sequence[Path], *, force: bool) -> None:

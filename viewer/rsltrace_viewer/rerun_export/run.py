@@ -9,6 +9,7 @@ from itertools import islice
 import rerun as rr
 from rerun.chunk import Chunk
 
+from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import Clock
 from rsltrace_viewer.rerun_export.events.chunks import EventRows
@@ -29,6 +30,8 @@ class Shown:
     log_records: int
     mean_gap_ns: int
     """Simulated time per event, on average."""
+    left_out: dict[str, str]
+    """Topics whose messages are not in it, and why."""
 
 
 def export_run(trace: Trace, label: str, clock: Clock, recording: rr.RecordingStream) -> Shown:
@@ -36,12 +39,20 @@ def export_run(trace: Trace, label: str, clock: Clock, recording: rr.RecordingSt
     paths = Paths(label, trace)
     events = EventRows(trace, paths, clock)
     _send(recording, events.chunks())
-    logs = LogRows(trace, paths, clock)
-    _send(recording, logs.chunks())
     messages = MessageRows(trace, paths, clock, recording)
+    logs = LogRows(trace, paths, clock)
+    if TOPIC_ROSOUT not in messages.left_out:
+        _send(recording, logs.chunks())
     _send(recording, messages.chunks())
     gap_ns = max(trace.end_ns - trace.start_ns, 1) // max(trace.event_count, 1)
-    return Shown(paths, messages.seen, tuple(events.active_nodes), logs.count, max(gap_ns, 1))
+    return Shown(
+        paths,
+        messages.seen,
+        tuple(events.active_nodes),
+        logs.count,
+        max(gap_ns, 1),
+        messages.left_out,
+    )
 
 
 def _send(recording: rr.RecordingStream, chunks: Iterator[Chunk]) -> None:

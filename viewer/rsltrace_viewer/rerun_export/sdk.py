@@ -24,7 +24,8 @@ def require() -> None:
     """Raise SetupError unless Rerun's SDK is installed in the version this was written for.
 
     Also turns off Rerun's usage statistics, unless ``RERUN_ANALYTICS_ENABLED`` says otherwise:
-    looking at a trace should not open a connection to anybody.
+    looking at a trace should not open a connection to anybody. And its log, unless ``RUST_LOG``
+    says otherwise: names from the trace would reach the terminal as they are.
     """
     try:
         found = importlib.metadata.version("rerun-sdk")
@@ -36,6 +37,7 @@ def require() -> None:
             f"install that with: {INSTALL}"
         )
     os.environ.setdefault("RERUN_ANALYTICS_ENABLED", "0")
+    os.environ.setdefault("RUST_LOG", "off")
     try:
         import rerun  # noqa: F401 - whether it loads is the question
     except ImportError as error:

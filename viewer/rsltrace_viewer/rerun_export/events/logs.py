@@ -23,6 +23,7 @@ from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, make_ch
 from rsltrace_viewer.rerun_export.moments import Moments
 from rsltrace_viewer.rerun_export.paths import NO_NODE, Paths
 
+_LOG_TIME = "message_log_time"
 _COLUMNS = ("TextLog:text", "TextLog:level")
 
 
@@ -53,7 +54,10 @@ class LogRows:
             )
             for chunk in reader.stream():
                 batch = chunk.to_record_batch()
-                if set(_COLUMNS) <= set(batch.schema.names):
+                names = set(batch.schema.names)
+                if set(_COLUMNS) <= names:
+                    if _LOG_TIME not in names:
+                        raise ValueError("one does not fit its type")
                     yield from self._split(batch, moments)
         except (RuntimeError, ValueError, OSError) as error:
             raise TraceError(
@@ -62,7 +66,7 @@ class LogRows:
 
     def _split(self, batch: pa.RecordBatch, moments: Moments) -> Iterator[Chunk]:
         """Yield one chunk per node."""
-        stamps = batch.column("message_log_time").cast(pa.int64()).to_numpy()
+        stamps = batch.column(_LOG_TIME).cast(pa.int64()).to_numpy()
         events, senders = moments.of_messages(TOPIC_ROSOUT, TOPIC_ROSOUT, stamps)
         self.count += len(stamps)
         texts, levels = (batch.column(name) for name in _COLUMNS)

@@ -38,6 +38,7 @@ from rsltrace_viewer.rerun_export.columns import (
 from rsltrace_viewer.rerun_export.frames import FrameTree
 from rsltrace_viewer.rerun_export.messages.fields import Curves, curves_of
 from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerRows
+from rsltrace_viewer.rerun_export.messages.readable import left_out
 from rsltrace_viewer.rerun_export.messages.rows import (
     LoadedColumns,
     Rows,
@@ -88,10 +89,14 @@ class Seen:
 
 
 class MessageRows:
-    """Makes chunks of the messages of one trace; memory is that of a chunk of the file."""
+    """Makes chunks of the messages of one trace; memory is that of a chunk of the file.
+
+    ``left_out`` are topics without their messages, and why.
+    """
 
     def __init__(self, trace: Trace, paths: Paths, clock: Clock, recording: rr.RecordingStream):
         self.seen = Seen()
+        self.left_out = left_out(trace)
         self._trace = trace
         self._paths = paths
         self._clock = clock
@@ -105,13 +110,13 @@ class MessageRows:
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
-        own = [f"^{re.escape(topic)}$" for topic in _OWN]
+        not_read = [f"^{re.escape(topic)}$" for topic in (*_OWN, *self.left_out)]
         try:
             reader = McapReader(
                 self._trace.name,
                 timeline_type=self._clock.timeline_type,
                 decoders=_DECODERS,
-                exclude_topic_regex=own,
+                exclude_topic_regex=not_read,
                 recover=not self._trace.complete,
             )
             for chunk in reader.stream():
