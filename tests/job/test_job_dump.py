@@ -164,7 +164,7 @@ jobs = st.fixed_dictionaries(
 
 
 @given(jobs)
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=60)
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=40)
 @example({"nodes": [NodeSpec(node="m:N", arguments={"a": {"\x85": "\u2028 \ufeff\n"}})]})
 @example({"nodes": [NodeSpec(node="m:N", parameters={"a": "$(x) \\$(y) $($(", "b": ["$(z)"]})]})
 def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:

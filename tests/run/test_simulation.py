@@ -129,7 +129,7 @@ def drive_by(sim: Simulation, pieces: list[Any]) -> None:
 
 
 @settings(
-    max_examples=25,
+    max_examples=15,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
     derandomize=True,

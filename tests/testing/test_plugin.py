@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
@@ -119,16 +120,20 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture
 def team(tmp_path: Path) -> Run:
-    """A team's repository with a robot and a test, and a way to run its pytest."""
+    """A team's repository with a robot and a test, and a way to run its pytest.
+
+    Our plugin is the only one: all those of this environment take a second to load.
+    """
     (tmp_path / "counting.py").write_text(NODES)
     (tmp_path / "job.yaml").write_text(JOB)
+    ours = ["-p", "rsltrace.testing.plugin", "-p", "no:cacheprovider"]
+    alone = {"PYTEST_ADDOPTS": "", "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
 
     def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
-        plugin = [] if _is_registered() else ["-p", "rsltrace.testing.plugin"]
         return subprocess.run(
-            [sys.executable, "-m", "pytest", *plugin, "-p", "no:cacheprovider", *arguments],
+            [sys.executable, "-m", "pytest", *ours, *arguments],
             cwd=tmp_path,
-            env={**os.environ, **environment, "PYTEST_ADDOPTS": ""},
+            env={**os.environ, **environment, **alone},
             capture_output=True,
             text=True,
             check=False,
@@ -138,11 +143,9 @@ def team(tmp_path: Path) -> Run:
     return run
 
 
-def _is_registered() -> bool:
-    """Whether this environment's rsltrace was installed with the plugin's entry point."""
-    from importlib.metadata import entry_points
-
-    return any(entry.value == "rsltrace.testing.plugin" for entry in entry_points(group="pytest11"))
+def test_pytest_finds_the_plugin_by_itself() -> None:
+    found = [entry for entry in entry_points(group="pytest11") if entry.name == "rsltrace"]
+    assert {entry.value for entry in found} == {"rsltrace.testing.plugin"}
 
 
 @pytest.mark.ros

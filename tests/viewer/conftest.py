@@ -183,7 +183,7 @@ def drive_fixture() -> object:
 
 @pytest.fixture(scope="session")
 def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A trace with all that is odd: fan-out, a 50 MB message, types that cannot be decoded, names
+    """A trace with all that is odd: fan-out, a 10 MB message, types that cannot be decoded, names
     with wide characters and with what steers terminals, a payload that was not kept, a warning."""
     from trace_maker import CDR, LOG_SCHEMA, Opened, cdr_string, log_message
 
@@ -215,7 +215,7 @@ def odd(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for created in (node, evil):
             feeder.output(OutputKind.ENTITY, created, b"identity")
         feeder.event(EventKind.CONSTRUCT, 0, 0)
-        data = CDR + (50_000_000).to_bytes(4, "little") + bytes(50_000_000)
+        data = CDR + (10_000_000).to_bytes(4, "little") + bytes(10_000_000)
         feeder.output(OutputKind.MESSAGE, big, data, feeder.payload(channels["big"], 5, data))
         cause = feeder.event(EventKind.TIMER, timer, 5)
         for subscription in subs:

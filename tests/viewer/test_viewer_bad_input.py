@@ -111,7 +111,7 @@ def test_odd_things_are_shown_as_what_they_are(odd: Path, drive: Drive) -> None:
         await viewer.press("j")
         assert viewer.place == 1
         seen += viewer.text
-        assert "50000000: [0, 0, 0" in viewer.text
+        assert "10000000: [0, 0, 0" in viewer.text
         await viewer.press("e")
         assert isinstance(viewer.app.screen, PickScreen)
         seen += viewer.text
