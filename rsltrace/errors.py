@@ -6,6 +6,7 @@
     ├── BagError                     2  a bag cannot be read or played
     ├── TraceError                   2  a trace cannot be read or compared
     │   ├── TraceFormatError         2  not a trace, or one of another format version
+    │   ├── EditError                2  an edit that cannot be understood, or that cannot be made
     │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
     ├── BisectError                  2  the revisions of a job cannot be searched, or not judged
     ├── DebugError                   2  a debugging session cannot do what it is asked
@@ -80,6 +81,10 @@ class BisectError(RsltraceError):
 
 class DebugError(RsltraceError):
     """A debugging session cannot do what it is asked; it goes on unless the message says not."""
+
+
+class EditError(TraceError):
+    """An edit that cannot be understood, or that cannot be made where it should be."""
 
 
 class OutputError(RsltraceError):

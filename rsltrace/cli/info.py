@@ -15,6 +15,7 @@ from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
@@ -72,6 +73,8 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
             lines += ["", title, *table(rows)]
+    if edits := edits_of(trace):
+        lines += ["", "edits, as a branch of another run", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
     lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
     return lines
@@ -168,6 +171,7 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
         "output_kinds": _counts_by_kind(counts.output_kinds, OutputKind),
         "result": trace.result,
         "job": trace.job,
+        "edits": list(edits_of(trace)),
         "environment": trace.environment,
         "guard": [
             {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
+    from rsltrace.replay.edits import Edit
     from rsltrace.replay.preparation import Preparation
     from rsltrace.replay.result import ReplayResult
 
@@ -41,6 +42,13 @@ _SHOWN_MAX = 12
     "first",
     metavar="INDEX|TIME",
     help="Verify what comes before quietly: progress and the nodes' log records begin here.",
+)
+@click.option(
+    "--edit",
+    "edits",
+    multiple=True,
+    metavar="EDIT",
+    help="Go on otherwise from there: '812: message.data = 3.0' (docs/what-if.md).",
 )
 @click.option(
     "-o", "--output", type=click.Path(path_type=Path), help="Keep the replay's own trace there."
@@ -71,6 +79,7 @@ def replay(
     trace: Path,
     until: str | None,
     first: str | None,
+    edits: tuple[str, ...],
     output: Path | None,
     force: bool,
     job_folder: Path | None,
@@ -97,16 +106,23 @@ def replay(
     at their recorded times and in their recorded order, and its outputs are compared: all of them
     are the same as long as its code is, and after a change of its code one sees what changes.
 
+    With --edit, what comes before the first edit is verified; the run then goes on as a branch of
+    its own (-o), whose trace holds the edits, and is compared with TRACE.
+
     The exit status is 0 if every event was as recorded (of a run that failed: the failure, too), 1
-    if the replay diverged, 2 for trouble, 130, 143 or 129 if it was interrupted.
+    if the replay diverged or the edits changed something, 2 for trouble, 130, 143 or 129 if it was
+    interrupted.
     """
+    from rsltrace.replay.edits import check_edits, parse_edit
     from rsltrace.replay.preparation import count_to, prepared
 
-    check_options(node, until, first, (until_diverged, everything, bool(ignore)))
+    check_options(node, until, first, edits, (until_diverged, everything, bool(ignore)))
+    changes = [parse_edit(text) for text in edits]
     with prepared(trace, job_folder) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
         count = None if until is None else count_to(plan.trace, until)
+        check_edits(changes, plan.trace)
         begin = 0 if first is None else count_to(plan.trace, first) - 1
         if not as_json:
             for line in _told(plan, node):
@@ -124,7 +140,9 @@ def replay(
                 as_json=as_json,
                 everything=everything,
             )
-        result = _replayed(plan, count, max(begin, 0), output, force=force, quiet=quiet or as_json)
+        result = _replayed(
+            plan, count, max(begin, 0), changes, output, force=force, quiet=quiet or as_json
+        )
         reopen_standard_streams()
         status = result.exit_code
         try:
@@ -160,6 +178,7 @@ def _replayed(
     plan: Preparation,
     until: int | None,
     first: int,
+    edits: Sequence[Edit],
     output: Path | None,
     *,
     force: bool,
@@ -177,6 +196,7 @@ def _replayed(
             force=force,
             echo=not quiet,
             observer=Observer(progress=_from(first, show), interrupt=on_interrupt),
+            edits=edits,
         )
 
 
@@ -214,6 +234,8 @@ def _told(plan: Preparation, node: str | None) -> Iterator[str]:
         changed = [name for name, _, change in code[_SHOWN_MAX:] if change]
         more = f" (changed or not here: {', '.join(changed[:_SHOWN_MAX])})" if changed else ""
         yield printable(f"  and {len(code) - _SHOWN_MAX} more{more}")
+    if plan.edits:
+        yield printable(f"with the edits {'; '.join(edit.text for edit in plan.edits)}")
     if plan.job.bags and node is None:
         yield printable(f"and the bags {', '.join(bag.path for bag in plan.job.bags)}")
     if plan.changes:
@@ -228,12 +250,26 @@ def _near(file: Path) -> Path:
 
 def _print(result: ReplayResult) -> None:
     tell_of_run(result.error, result.diverged, result.notes, result.path)
+    if result.edits:
+        _print_branch(result)
+        return
     if result.diff is not None:
         print_diffs([result.diff], "text", DiffOptions(), None)
         say(f"\nnext: {_next(result)}")
         return
     say(result.sentence)
     say(f"digest {result.digest}  events {result.verified}  sim {format_seconds(result.end_ns)}")
+
+
+def _print_branch(result: ReplayResult) -> None:
+    for edit in result.edits:
+        say(f"edit {edit}")
+    if result.diff is None:
+        say(result.sentence)
+    else:
+        say(f"the first {result.verified} events are those of {result.trace}")
+        print_diffs([result.diff], "text", DiffOptions(), None)
+    say(f"digest {result.digest}  ended: {result.ended}, at {format_seconds(result.end_ns)} s")
 
 
 def _next(result: ReplayResult) -> str:
@@ -263,6 +299,7 @@ def _values(result: ReplayResult, plan: Preparation) -> dict[str, Any]:
         "error": None if result.error is None else str(result.error),
         "path": None if result.path is None else str(result.path),
         "notes": list(result.notes),
+        "edits": list(result.edits),
         "code": [
             {"name": one.name, "file": str(one.file) if one.file else None, "change": one.change}
             for one in plan.code

@@ -19,7 +19,11 @@ if TYPE_CHECKING:
 
 
 def check_options(
-    node: str | None, until: str | None, first: str | None, of_node: tuple[bool, ...]
+    node: str | None,
+    until: str | None,
+    first: str | None,
+    edits: tuple[str, ...],
+    of_node: tuple[bool, ...],
 ) -> None:
     """Refuse options that have nothing to do.
 
@@ -29,6 +33,8 @@ def check_options(
         raise click.UsageError("--until-diverged, --all and --ignore go with --node")
     if node is not None and (until is not None or first is not None):
         raise click.UsageError("--from and --until go without --node; it has --until-diverged")
+    if node is not None and edits:
+        raise click.UsageError("--edit goes without --node: the other nodes are to see the change")
 
 
 def replay_one(

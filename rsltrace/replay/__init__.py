@@ -9,6 +9,7 @@ This package is also that function, as ``rsltrace.diff`` is. Importing it loads 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -32,6 +33,7 @@ def replay_trace(
     job_folder: str | Path | None = None,
     trust: bool = False,
     echo: bool = False,
+    edits: str | Sequence[str] = (),
 ) -> ReplayResult: ...
 
 
@@ -64,6 +66,7 @@ def replay_trace(
     job_folder: str | Path | None = None,
     trust: bool = False,
     echo: bool = False,
+    edits: str | Sequence[str] = (),
 ) -> ReplayResult | NodeReplayResult:
     """Run the job of a trace again, and stop at the first event that is not as recorded.
 
@@ -80,14 +83,21 @@ def replay_trace(
     This runs the code that the trace names. Unless the job file in the present folder (or in
     ``job_folder``) says the same, that takes ``trust=True``.
 
+    ``edits`` say what is to be other than in the trace, each at an event or a time
+    (``'812: message.data = 3.0'``; see ``rsltrace.replay.edits``). The run is then verified up to
+    the first of them and goes on as a branch, which is compared with the trace and whose own trace
+    (``output``) holds the edits: replaying it makes them again. ``until`` ends the branch, too.
+
     Returns a ``rsltrace.ReplayResult``, with ``node`` a ``NodeReplayResult``. A run that fails as
     the recorded one did is verified.
 
     :raises ReplayError: the trace cannot be replayed here, or is not trusted.
     :raises TraceError: it is missing or damaged.
+    :raises EditError: an edit cannot be understood, or not be made.
     :raises JobError, SetupError, BagError, OutputError: its job cannot run, or not be written.
     """
     from rsltrace.errors import ReplayError
+    from rsltrace.replay.edits import parse_edit
     from rsltrace.replay.preparation import count_to, prepared
     from rsltrace.replay.replaying import replay_prepared
 
@@ -97,6 +107,8 @@ def replay_trace(
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
         place = None if output is None else Path(output)
         if node is not None:
+            if edits:
+                raise ReplayError("edits are for all nodes of a trace: give edits or a node")
             from rsltrace.replay.one_node.replaying import replay_node
 
             return replay_node(
@@ -114,6 +126,7 @@ def replay_trace(
             output=place,
             force=force,
             echo=echo,
+            edits=[parse_edit(edit) for edit in ([edits] if isinstance(edits, str) else edits)],
         )
 
 

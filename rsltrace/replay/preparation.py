@@ -11,6 +11,7 @@ from rsltrace.errors import ReplayError
 from rsltrace.job import Job
 from rsltrace.model.event import EventKind
 from rsltrace.replay.code import Code, code_of
+from rsltrace.replay.edits import Edit, edits_of, parse_edit
 from rsltrace.replay.job_folder import folder_of, job_in_trace
 from rsltrace.replay.trust import why_not_trusted
 from rsltrace.run.provenance import environment
@@ -44,6 +45,8 @@ class Preparation:
     changes: tuple[Change, ...]
     distrust: str
     notes: tuple[str, ...]
+    edits: tuple[Edit, ...] = ()
+    """What the run was told to do otherwise, of a trace that is a branch."""
 
 
 @contextmanager
@@ -75,6 +78,7 @@ def prepared(
             tuple(_changes(trace)),
             distrust,
             tuple(_notes(trace)),
+            tuple(map(parse_edit, edits_of(trace))),
         )
 
 

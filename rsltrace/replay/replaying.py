@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +13,8 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import ReplayError
+from rsltrace.replay.editing import Editing
+from rsltrace.replay.edits import Edit, as_metadata, check_edits
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.result import ReplayResult
 from rsltrace.replay.verification import Verification
@@ -20,10 +22,11 @@ from rsltrace.run import Observer, RunResult
 from rsltrace.run.process import kept_process
 from rsltrace.run.session import Session
 from rsltrace.trace.chain import digest_text
-from rsltrace.trace.format import METADATA_FED
+from rsltrace.trace.format import METADATA_EDITS, METADATA_FED
 from rsltrace.trace.reader import Trace
 
 THE_REPLAY = "the replay"
+THE_BRANCH = "the branch"
 _CONTEXT = 5
 
 
@@ -36,13 +39,16 @@ def replay_prepared(
     force: bool = False,
     echo: bool = False,
     observer: Observer | None = None,
+    edits: Sequence[Edit] = (),
 ) -> ReplayResult:
     """Run a job as its trace says, ``until`` so many events are verified (None: to the end).
 
     This runs user code: see ``trust``. ``echo`` prints what the nodes log from event number
-    ``first`` on.
+    ``first`` on. With ``edits`` it is verified up to the first of them, and then goes on as a
+    branch of its own, which is compared with the trace.
 
     :raises ReplayError: it is the trace of one node alone.
+    :raises EditError: an edit cannot be made.
     :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
     """
     fed = plan.trace.metadata(METADATA_FED).get("node")
@@ -56,12 +62,17 @@ def replay_prepared(
         session.world.echo_logs(echo)
 
     verification = Verification(plan.trace, until, first=first, on_first=on_first)
+    editing = Editing((*plan.edits, *edits), known=len(plan.edits), on_new=verification.branch_off)
+    check_edits(edits, plan.trace)
     with place_for(output) as path:
-        run = _run(plan, verification, path, force=force, observer=observer)
-        compared = _diverged(plan.trace, verification)
+        run = _run(plan, verification, editing, path, force=force, observer=observer)
         place = run.path or path
+        kept = None if output is None else place
+        if verification.has_branched_off:
+            return _branch(plan, verification, editing, run, place, kept)
+        compared = _diverged(plan.trace, verification)
         difference = _difference(plan.trace, place, kept=output is not None) if compared else None
-    return _result(plan, verification, run, difference, None if output is None else place)
+    return _result(plan, verification, run, difference, kept)
 
 
 @contextmanager
@@ -77,21 +88,37 @@ def place_for(output: Path | None) -> Iterator[Path]:
 def _run(
     plan: Preparation,
     verification: Verification,
+    editing: Editing,
     path: Path,
     *,
     force: bool,
     observer: Observer | None,
 ) -> RunResult:
     recorded = Path(os.path.abspath(plan.trace.name)) if plan.job.guard.enabled else None
+    edits = editing.unmade
+    metadata = {METADATA_EDITS: as_metadata(edits, plan.trace)} if edits else {}
     with (
         kept_process(),
-        Session(plan.job, path, force=force, observer=observer, replay=recorded) as session,
+        Session(
+            plan.job, path, force=force, observer=observer, replay=recorded, metadata=metadata
+        ) as session,
     ):
         verification.attach(session)
+        editing.attach(session)
+        if editing.branches and (end := verification.end_of_branch()) is not None:
+            session.loop.stop_conditions += (end,)
         session.begin()
         if not session.ended:
             session.go_on()
-        return session.finish()
+        error = editing.error
+        if error is None and not (verification.diverged or verification.interrupted):
+            error = editing.failure()
+        if error is None:
+            return session.finish()
+        place = session.place
+    if place is not None:  # no half of a branch
+        place.unlink(missing_ok=True)
+    raise error
 
 
 def _diverged(trace: Trace, verification: Verification) -> bool:
@@ -114,6 +141,37 @@ def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:
         resync_index=None,
         notes=tuple(note for note in found.notes if not note.startswith("b ")),
         divergences=tuple(replace(one, next_step="", reaches=()) for one in found.divergences[:1]),
+    )
+
+
+def _branch(
+    plan: Preparation,
+    verification: Verification,
+    editing: Editing,
+    run: RunResult,
+    place: Path,
+    kept: Path | None,
+) -> ReplayResult:
+    """Compare a branch with the run that it branches off."""
+    trace = plan.trace
+    with Trace.open(place) as branch:
+        found = diff_traces(trace, branch, DiffOptions(context=_CONTEXT))
+    name = THE_BRANCH if kept is None else str(kept)
+    found = replace(found, b=replace(found.b, path=name))
+    return ReplayResult(
+        trace=trace.name,
+        verified=verification.verified,
+        events=trace.event_count,
+        digest=run.digest,
+        end_ns=run.end_ns,
+        ended=run.stop_reason,
+        is_whole=False,
+        path=kept,
+        diff=None if found.identical else found,
+        error=run.error,
+        notes=tuple(dict.fromkeys([*plan.notes, *run.notes])),
+        interrupted=verification.interrupted,
+        edits=tuple(edit.text for edit in editing.all),
     )
 
 

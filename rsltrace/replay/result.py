@@ -27,6 +27,10 @@ class ReplayResult:
     which ends with the event that differs, number ``verified``. ``path`` is the replay's own trace,
     None if none was asked for. ``error`` is what went wrong in the run, which is no divergence if
     it did in the recorded run, too. ``notes`` are texts for people.
+
+    With ``edits``, the run was verified up to the first of them and went on as a branch: ``digest``
+    and ``end_ns`` are the branch's, and ``diff`` compares all of it with the trace, None if the
+    edits have changed nothing.
     """
 
     trace: str
@@ -42,10 +46,11 @@ class ReplayResult:
     notes: tuple[str, ...] = ()
     interrupted: int = 0
     """The exit status of a replay that was itself interrupted (130: Ctrl-C), else 0."""
+    edits: tuple[str, ...] = ()
 
     @property
     def diverged(self) -> bool:
-        """Whether the run did something else than the trace says."""
+        """Whether the run did something else than the trace says (of a branch: because of it)."""
         return self.diff is not None
 
     @property
@@ -56,6 +61,10 @@ class ReplayResult:
     @property
     def sentence(self) -> str:
         """The result in one sentence."""
+        if self.edits:
+            if self.diff is None:
+                return f"the edits change nothing: the branch has the digest {self.digest}, too"
+            return f"a branch from event {self.verified} on: {self.diff.sentence}"
         if self.diff is not None:
             how_far = f"the first {self.verified} events of {self.events} agree"
             return f"diverged at event {self.verified} ({how_far}): {self.diff.sentence}"

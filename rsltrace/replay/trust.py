@@ -17,6 +17,7 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.launch import expand, ros_launch
 from rsltrace.model.finding import Mode
+from rsltrace.replay.edits import edits_of
 from rsltrace.replay.job_folder import job_name
 from rsltrace.run.plans.executables import why_not
 from rsltrace.trace.reader import Trace
@@ -59,6 +60,8 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str
     differing = _differing(own, job)
     if differing:
         return f"its job differs from {folder / name} in {', '.join(differing)}"
+    if edits_of(trace):
+        return "it holds edits, which the nodes would run with"
     if any(found.mode is Mode.RECORD for one in trace.findings.values() for found in one):
         return "it holds answers from outside (of files, sockets, …) that the nodes would be given"
     return ""

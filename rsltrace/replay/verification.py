@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rsltrace.loop.stop import Stop
+from rsltrace.loop.stop import Stop, StopCondition, stop_at
 from rsltrace.model.event import EventKind
+from rsltrace.replay.edits import edits_of
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 DIVERGED = Stop("the replay stopped at the first event that differs", 1)
 _INTERRUPTIONS = {129: "hung up", 130: "interrupted", 143: "terminated"}
+BRANCH_END = "as far as the run that it branches off"
 _BY_DRIVER = "the driver of the simulation"
 
 
@@ -46,6 +48,7 @@ class Verification:
         self.stop: Stop | None = None
         self.is_last = False
         """Whether the run was ended where the trace's was, by somebody outside of the job."""
+        self.has_branched_off = False
         self._trace = trace
         self._limit, self._at_limit = limit_of(trace, until)
         self._on_first = on_first
@@ -63,6 +66,17 @@ class Verification:
         recorder.end_event = self._compared  # type: ignore[method-assign, assignment]
         if self._first == 0 and self._on_first is not None:
             self._on_first(self._session)
+
+    def branch_off(self) -> None:
+        """Compare nothing from now on: what follows is to be something else."""
+        self.has_branched_off = True
+        self._recorder.end_event = self._end_event  # type: ignore[method-assign]
+
+    def end_of_branch(self) -> StopCondition | None:
+        """Return what ends a branch where the run would not end by itself, or is not to go on."""
+        if self._limit < 0:
+            return None
+        return stop_at(self._trace.event(self._limit - 1).stamp_ns, BRANCH_END)
 
     def _compared(self, stamp_ns: int, *event: int) -> None:
         """Stand in for ``Recorder.end_event``: end the event, then see whether it was right."""
@@ -117,7 +131,8 @@ def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:
     count, found = trace.event_count, []
     if until is not None and until < count:
         found.append((until, Stop("as far as asked for")))
-    if (outside := _first_outside(trace, until)) is not None:
+    outside = None if edits_of(trace) else _first_outside(trace, until)  # else they are edits
+    if outside is not None:
         why = f"event {outside} was done by {_BY_DRIVER}, and no trace says how to do it again"
         found.append((outside, Stop(why)))
     if not trace.complete:
@@ -132,7 +147,7 @@ def _from_outside(trace: Trace) -> Stop | None:
     reason, code = trace.result.get("stop_reason", ""), trace.result.get("exit_code", "")
     if reason in _INTERRUPTIONS.values() and code in map(str, _INTERRUPTIONS):
         return Stop(reason, int(code))
-    if reason.endswith(f"by {_BY_DRIVER}") or reason.startswith(_BY_DRIVER):
+    if reason == BRANCH_END or reason.endswith(f"by {_BY_DRIVER}") or reason.startswith(_BY_DRIVER):
         return Stop(reason, int(code) if code.isdecimal() else 0)
     return None
 

@@ -6,7 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -114,11 +114,14 @@ class Session:
         observer: Observer | None = None,
         replay: Path | None = None,
         writer: TraceWriter | None = None,
+        metadata: Mapping[str, Mapping[str, str]] | None = None,
     ) -> None:
         """``writer`` takes what is recorded where there is no ``output``, and stays open: who gives
         it looks after the run, too, so that nobody else watches for callbacks that hang.
+        ``metadata`` is written into the trace besides what a run writes.
         """
         self.job = job
+        self._metadata = metadata or {}
         self._replay = replay
         self._recorded_by = writer
         self.stop: Stop | None = None
@@ -274,6 +277,8 @@ class Session:
         write_job(writer, job)
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
         writer.add_metadata(METADATA_SOURCES, sources(job))
+        for name, values in self._metadata.items():
+            writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)
         note_choices(self.loop)
         if job.stop.size is not None:
@@ -295,6 +300,11 @@ class Session:
     def ended(self) -> bool:
         """Whether the run is over, for whatever reason."""
         return self.stop is not None or self.loop.stopped is not None
+
+    @property
+    def place(self) -> Path | None:
+        """Where the trace is being written, None if there is none."""
+        return None if self._writer is None else self._writer.place
 
     @property
     def error(self) -> RunError | None:

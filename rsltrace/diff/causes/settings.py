@@ -7,15 +7,17 @@ from __future__ import annotations
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
 from rsltrace.diff.result.traces import Setting
-from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.format import METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 
 _ENTITIES_MAX = 50
 
 
 def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
-    """Return the modules of the nodes whose code differs, and the versions that differ."""
+    """Return edits that differ, modules of the nodes whose code differs, versions that differ."""
     found = []
+    if (edits_a := _edits(a)) != (edits_b := _edits(b)):
+        found.append(Setting("edits", edits_a, edits_b))
     for label, record in (("code of module", METADATA_SOURCES), ("environment:", None)):
         of_a = a.environment if record is None else a.metadata(record)
         of_b = b.environment if record is None else b.metadata(record)
@@ -24,6 +26,12 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
                 place = name.replace("file:", "file ") if name[:5] == "file:" else f"{label} {name}"
                 found.append(Setting(place, of_a.get(name), of_b.get(name)))
     return tuple(found)
+
+
+def _edits(trace: Trace) -> str | None:
+    """Return the edits of a branch (see ``rsltrace.replay.edits``)."""
+    found = trace.metadata(METADATA_EDITS)
+    return "; ".join(found[key] for key in sorted(found) if key != "of") or None
 
 
 def entity_settings(matching: EntityMatching) -> tuple[Setting, ...]:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rsltrace.diff.options import DiffOptions
+from rsltrace.errors import ReplayError
 from rsltrace.loop.stop import Stop
 from rsltrace.replay.one_node.columns import Columns
 from rsltrace.replay.one_node.outputs import changes, outputs_of_node
@@ -41,6 +42,8 @@ def replay_node(
     :raises JobError, SetupError, OutputError: the run cannot start or be written.
     """
     trace = plan.trace
+    if plan.edits:
+        raise ReplayError(f"{trace.name} is a branch with edits, which replays as a whole only")
     columns = Columns(trace)
     unit = Unit(columns, plan.job, node, entries_of(trace, columns))
     check_payloads(columns, unit)
