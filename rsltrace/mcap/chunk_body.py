@@ -29,22 +29,35 @@ Waiting = list[Any]
 of the second, and so on. One flat list holds nothing that the garbage collector has to visit."""
 
 WAITING_FIELDS = 4
+LARGE_BYTES = 1 << 20
+"""From here on a message's data are left where they are."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkBody:
     """The records of a chunk before compression, and what its indexes say.
 
+    ``parts`` are the records in pieces: large messages are not copied behind their headers.
     ``start_ns`` and ``end_ns`` are the smallest and largest log times. ``indexes`` holds, by
     ascending channel id, the channel, its number of messages and its MessageIndex record.
     ``rows`` says that all messages have one size.
     """
 
-    records: bytes
+    parts: tuple[bytes, ...]
     start_ns: int
     end_ns: int
     indexes: tuple[tuple[int, int, bytes], ...]
     rows: bool = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of the records."""
+        return sum(map(len, self.parts))
+
+    @property
+    def records(self) -> bytes:
+        """The records in one piece."""
+        return self.parts[0] if len(self.parts) == 1 else b"".join(self.parts)
 
 
 def messages_chunk(waiting: Waiting) -> ChunkBody:
@@ -68,7 +81,21 @@ def messages_chunk(waiting: Waiting) -> ChunkBody:
     for channel_id in np.unique(channels).tolist():
         chosen = channels == channel_id
         indexes.append(_message_index(channel_id, times[chosen], offsets[chosen]))
-    return ChunkBody(b"".join(pieces), int(times.min()), int(times.max()), tuple(indexes))
+    parts = _joined(pieces) if int(sizes.max()) >= LARGE_BYTES else (b"".join(pieces),)
+    return ChunkBody(parts, int(times.min()), int(times.max()), tuple(indexes))
+
+
+def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
+    """Join what lies between large pieces."""
+    parts: list[bytes] = []
+    small: list[bytes] = []
+    for piece in pieces:
+        if len(piece) < LARGE_BYTES:
+            small.append(piece)
+            continue
+        parts += [b"".join(small), piece]
+        small = []
+    return (*parts, b"".join(small)) if small else tuple(parts)
 
 
 def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
@@ -77,7 +104,7 @@ def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
     times = messages["log_time"]
     offsets = np.arange(0, len(messages) * size, size, dtype=np.uint64)
     index = _message_index(channel_id, times, offsets)
-    return ChunkBody(messages.tobytes(), int(times.min()), int(times.max()), (index,), rows=True)
+    return ChunkBody((messages.tobytes(),), int(times.min()), int(times.max()), (index,), rows=True)
 
 
 def _message_index(

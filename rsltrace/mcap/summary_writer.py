@@ -79,7 +79,7 @@ class SummaryBuilder:
             message_index_length=position - offset - length,
             message_index_offsets=index_offsets,
             message_start_time=body.start_ns,
-            uncompressed_size=len(body.records),
+            uncompressed_size=body.size,
         )
         # Kept as bytes: a long run has a million chunks, and objects would be ten times as large.
         self._chunk_indexes += record_bytes(index)

@@ -16,6 +16,7 @@ import zstandard
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
 
 from rsltrace.errors import OutputError
+from rsltrace.mcap.checksum import crc_of, joined_crc
 from rsltrace.mcap.chunk_body import ChunkBody
 from rsltrace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
 from rsltrace.mcap.sink import Sink
@@ -25,6 +26,11 @@ CHANNELS_MAX = 2**16 - 1
 _U64 = struct.Struct("<Q")
 _ZSTD_LEVEL = 1
 """Level 1 is ten times as fast as level 3's gain in size would be worth to a recorder."""
+
+_SAMPLES = 32
+_SAMPLE_BYTES = 16 << 10
+_PAYS = 0.8
+"""Of each large message so many pieces are compressed to see what it gives."""
 
 _ROWS = zstandard.ZstdCompressionParameters.from_level(
     _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
@@ -139,32 +145,59 @@ class McapWriter:
 
     def chunk(self, body: ChunkBody) -> tuple[int, int]:
         """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
-        data = body.records
-        if self._compression:
-            data = (self._row_compressor if body.rows else self._compressor).compress(data)
+        compression, data = self._packed(body)
+        crc = crc_of(body.parts)
+        size = sum(map(len, data))
         head = record_bytes(
             Chunk(
-                compression=self._compression,
+                compression=compression,
                 data=b"",
                 message_end_time=body.end_ns,
                 message_start_time=body.start_ns,
-                uncompressed_crc=crc32(body.records),
-                uncompressed_size=len(body.records),
+                uncompressed_crc=crc,
+                uncompressed_size=body.size,
             )
         )
         # The data are written as they are, not copied behind their head first.
-        size = len(data)
         head = head[:1] + _U64.pack(len(head) - 9 + size) + head[9:-8] + _U64.pack(size)
         offset, length = self._sink.offset, len(head) + size
-        self._write(head, data, b"".join(index for _, _, index in body.indexes))
+        indexes = b"".join(index for _, _, index in body.indexes)
+        whole: int | None = None
+        if not compression:  # the data have been summed already
+            whole = joined_crc(crc32(head), crc, size)
+            whole = joined_crc(whole, crc32(indexes), len(indexes))
+        self._write(head, *data, indexes, crc=whole)
         self._summary.add_chunk(
             body,
             offset=offset,
             length=length,
-            compression=self._compression,
+            compression=compression,
             compressed_size=size,
         )
         return offset, length
+
+    def _packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...]]:
+        """Return the compression of a chunk, and its data in parts.
+
+        Compressing what does not get smaller takes as long as writing it; of large messages a
+        sample tells. It is a function of their bytes, so equal runs give equal files.
+        """
+        if not self._compression:
+            return "", body.parts
+        if len(body.parts) > 1 and not self._pays(body.parts):
+            return "", body.parts
+        packer = self._row_compressor if body.rows else self._compressor
+        return self._compression, (packer.compress(body.records),)
+
+    def _pays(self, parts: tuple[bytes, ...]) -> bool:
+        total = packed = 0
+        for part in parts:
+            step = max(len(part) // _SAMPLES, _SAMPLE_BYTES)
+            for at in range(0, len(part), step):
+                sample = part[at : at + _SAMPLE_BYTES]
+                total += len(sample)
+                packed += len(self._compressor.compress(sample))
+        return packed < _PAYS * total
 
     def finish(self, *, replace: bool = True) -> None:
         """Write the end of the file, make sure that it is there, and close it.
@@ -197,11 +230,11 @@ class McapWriter:
                 "what was written before is readable up to its last whole segment"
             )
 
-    def _write(self, *parts: bytes) -> None:
+    def _write(self, *parts: bytes, crc: int | None = None) -> None:
         if self._failure is not None:
             raise self._failure  # after a gap in the file, nothing more may follow
         try:
-            self._sink.write(*parts)
+            self._sink.write(*parts, crc=crc)
         except OSError as error:
             raise self._failed(error) from error
         except OutputError as error:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import tracemalloc
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from ruamel.yaml import YAML
 from trace_maker import MS, QOS_YAML, START_NS, UINT64_HASH, Opened, boundaries, opcodes, write_run
 
 from rsltrace.errors import OutputError
+from rsltrace.mcap.checksum import crc_of, joined_crc
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace import writer as writer_module
@@ -496,3 +498,42 @@ def test_the_format_record_comes_first(tmp_path: Path) -> None:
     offsets = boundaries(data)
     assert opcodes(data, offsets)[:2] == [0x01, METADATA]
     assert b"rsltrace:format" in data[offsets[1] : offsets[2]]
+
+
+# -- large messages -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["noise", "zeros"])
+@pytest.mark.parametrize("size", [(1 << 20) - 100, 1 << 20, 5 << 20])
+def test_large_messages_are_kept_and_packed_only_if_that_pays(
+    tmp_path: Path, kind: str, size: int
+) -> None:
+    data = b"\0\1\0\0" + (np.random.default_rng(7).bytes(size) if kind == "noise" else bytes(size))
+    files = []
+    for name in ("a.mcap", "b.mcap"):
+        with Opened(tmp_path / name) as feeder:
+            channel = feeder.writer.add_channel("/image", "std_msgs/msg/String", "string data\n")
+            for n, message in enumerate((b"\0\1\0\0first", data, b"\0\1\0\0last", data[:-1])):
+                feeder.writer.add_payload(channel, START_NS + n, message)
+            feeder.writer.close(result={})
+        files.append((tmp_path / name).read_bytes())
+    assert files[0] == files[1]
+    with (tmp_path / "a.mcap").open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        found = [m.data for _, c, m in reader.iter_messages() if c.topic == "/image"]
+        summary = reader.get_summary()
+    assert found == [b"\0\1\0\0first", data, b"\0\1\0\0last", data[:-1]]
+    assert summary is not None
+    plain = [index.compression == "" for index in summary.chunk_indexes]
+    assert any(plain) == (kind == "noise" and size >= 1 << 20)
+    with Trace.open(tmp_path / "a.mcap") as trace:
+        trace.check()
+
+
+def test_a_checksum_of_pieces_is_that_of_the_whole() -> None:
+    rng = np.random.default_rng(11)
+    for first in (0, 1, 4096, 70_001):
+        for second in (0, 1, 2, 255, 65_536, 1_000_003):
+            a, b = rng.bytes(first), rng.bytes(second)
+            assert joined_crc(crc32(a), crc32(b), second) == crc32(a + b)
+            assert crc_of((a, b, a)) == crc32(a + b + a)
