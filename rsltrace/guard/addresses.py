@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from types import FrameType
+from types import FrameType, MethodType
 
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.model.finding import Source
@@ -24,6 +24,8 @@ def is_by_address(thing: object) -> bool:
         return _SEEDED
     if kind in (tuple, frozenset):
         return any(map(is_by_address, thing))  # type: ignore[call-overload]
+    if kind is MethodType:
+        return is_by_address(thing.__self__)  # type: ignore[attr-defined]
     if thing is None:
         return sys.version_info < (3, 12)
     return getattr(kind, "__hash__", None) is _ALIKE

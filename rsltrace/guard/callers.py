@@ -6,6 +6,8 @@ import os
 import sysconfig
 from types import FrameType
 
+from rsltrace.guard.libraries import is_library
+
 _HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 _GUARD = os.path.join(_HERE, "guard", "")
 _PYTHON = tuple(
@@ -37,9 +39,9 @@ def _kind_of(file: str) -> int:
             f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
         ):
             kind = _OURS  # rclpy, too: what it looks at is not the user's doing
-        elif any(part in file for part in _INSTALLED):
+        elif is_library(file):
             kind = _LIBRARY
-        elif file.startswith(("<frozen", *_PYTHON)):
+        elif file.startswith(("<frozen", *_PYTHON)) and not any(p in file for p in _INSTALLED):
             kind = _STANDARD
         else:
             kind = _USER
@@ -59,7 +61,7 @@ def is_own(module: str) -> bool:
 
 
 def is_user_file(file: str) -> bool:
-    """Return whether a source file is neither Python's nor an installed package's nor ours."""
+    """Return whether a source file is neither Python's nor a library's nor ours."""
     return _kind_of(file) == _USER
 
 
@@ -71,8 +73,8 @@ def is_of_python(frame: FrameType) -> bool:
 def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
     """Return the innermost frame of user code that led to ``frame``, or None if none did.
 
-    User code is what lies outside of Python and of the installed packages, or in ``packages``
-    (where installed nodes are), and a callback in a library. What a library does while it is
+    User code is what is neither Python's nor a library's, or in ``packages`` (where nodes are), and
+    a callback in a library. What a library does while it is
     imported is not the user's doing, nor is what rsltrace and rclpy do for themselves. A thread
     is the doing of whoever started it, even if it runs nothing but Python's own code.
     """

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
 from rsltrace.guard.descriptor_table import DescriptorTable
+from rsltrace.guard.object_numbers import ObjectNumbers
 from rsltrace.guard.random_streams import RandomStreams
 from rsltrace.guard.real_time import RealTimePace
 from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_answer, finding_value
@@ -88,6 +89,7 @@ class Guard:
         self.answers = RecordedAnswers()
         self.descriptors = DescriptorTable()
         self.pace = RealTimePace()
+        self.numbers = ObjectNumbers()
         self._policy = policy
         self._thread = _thread_id()
         self.process = _process_id()

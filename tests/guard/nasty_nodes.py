@@ -80,6 +80,16 @@ class Thing:
     """Hashed and shown by its address."""
 
 
+class Caller:
+    """Hashed by its address, and so are its methods."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+    def call(self) -> int:
+        return self.number
+
+
 class Dated(datetime):
     """A subclass of datetime."""
 
@@ -354,14 +364,28 @@ def hash_of_text(node: Any) -> object:
     return hash("a text")
 
 
-@case(DETECTED, "the order of a set of objects")
+@case(DETECTED, "the order of a set of objects that all hold the same")
 def set_of_objects(node: Any) -> object:
     things = [Thing() for _ in range(200)]
     numbers = {id(thing): number for number, thing in enumerate(things)}
     return [numbers[id(thing)] for thing in set(things)]
 
 
-@case(DETECTED, "the order of a `WeakSet`")
+@case(DETERMINISTIC, "the order of a set of objects")
+def set_of_unlike_objects(node: Any) -> object:
+    things = [Thing() for _ in range(200)]
+    for number, thing in enumerate(things):
+        thing.place = (number, [number / 2])  # type: ignore[attr-defined]
+    return [thing.place for thing in set(things)]  # type: ignore[attr-defined]
+
+
+@case(DETERMINISTIC, "the order of a set of methods")
+def set_of_methods(node: Any) -> object:
+    methods = {Caller(number).call for number in range(200)}
+    return [method() for method in methods]
+
+
+@case(DETERMINISTIC, "the order of a `WeakSet`")
 def weak_set(node: Any) -> object:
     things = [Thing() for _ in range(200)]
     for number, thing in enumerate(things):

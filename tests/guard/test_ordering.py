@@ -98,7 +98,7 @@ out = (B().take(), A().more(1, b=2), e(), list(g()), m, A.__doc__, dict(a=1), su
     other: dict[str, Any] = {}
     import rsltrace.guard.virtual.set_order as ordering
 
-    with ordering.ordered_sets([], frozenset(), {}):
+    with ordering.ordered_sets(frozenset(), {}):
         exec(rewritten(source.encode(), "x.py"), other)
     assert other["out"] == plain["out"]
 

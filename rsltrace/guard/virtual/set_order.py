@@ -11,7 +11,6 @@ from __future__ import annotations
 import ast
 import builtins
 import importlib.machinery
-import os
 import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,8 +19,8 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from rsltrace.guard.addresses import is_by_address
-from rsltrace.guard.callers import is_own
-from rsltrace.guard.guard import engaged
+from rsltrace.guard.callers import is_own, is_user_file
+from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.model.finding import Mode, Source
 
@@ -52,11 +51,8 @@ def ordered(thing: Any) -> Any:
     if mode is Mode.ALLOW or not any(map(_has_no_order, thing)):
         return thing
     if mode is Mode.VIRTUAL:
-        try:
-            in_order = sorted(thing, key=_key)
-        except TypeError:
-            pass  # objects: nothing tells them apart but their addresses
-        else:
+        in_order = _in_order(guard, thing)
+        if in_order is not None:  # else: objects that nothing tells apart but their addresses
             guard.count(Source.ORDER, mode, "order of a set", frame)
             return _Watched(thing, in_order)
     kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
@@ -64,6 +60,13 @@ def ordered(thing: Any) -> Any:
         Source.ORDER, f"order of a {kind.__name__} of {kinds}", f"{len(thing)} elements", frame
     )
     return thing
+
+
+def _in_order(guard: Guard, thing: Any) -> list[Any] | None:
+    try:
+        return sorted(thing, key=_key)
+    except TypeError:
+        return guard.numbers.in_order(thing)
 
 
 def shown(thing: Any) -> Any:
@@ -196,10 +199,16 @@ def _is_harmless(node: ast.expr) -> bool:
     return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("range", "sorted", "len")
 
 
+def order_sets(tree: ast.Module) -> None:
+    """Put sets in order wherever the code of a module goes through one."""
+    _Rewriter().visit(tree)
+
+
 def rewritten(source: bytes, path: str) -> CodeType:
     """Return a module's code with sets in order."""
     tree = ast.parse(source, path)
-    code: CodeType = compile(_Rewriter().visit(tree), path, "exec", dont_inherit=True)
+    order_sets(tree)
+    code: CodeType = compile(tree, path, "exec", dont_inherit=True)
     return code
 
 
@@ -222,15 +231,11 @@ class _Loader(importlib.machinery.SourceFileLoader):
 
 
 class _Finder:
-    """Finds the modules of user code: in the job's folders, or in the packages of its nodes."""
+    """Finds the modules of user code: wherever they are, unless they are a library's."""
 
     def __init__(
-        self,
-        folders: Sequence[str],
-        packages: frozenset[str],
-        on_loaded: Mapping[str, Callable[[], None]],
+        self, packages: frozenset[str], on_loaded: Mapping[str, Callable[[], None]]
     ) -> None:
-        self._folders = tuple(os.path.join(folder, "") for folder in folders)
         self._packages = packages
         self._on_loaded = on_loaded
 
@@ -240,18 +245,27 @@ class _Finder:
         """Return the spec of a user module with our loader, or None for any other module."""
         if name in sys.builtin_module_names or is_own(name):
             return None
-        spec = importlib.machinery.PathFinder.find_spec(name, path, target)
+        spec = self._found_otherwise(name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
             return None
         if name in self._on_loaded:
             _tell(spec.loader, self._on_loaded[name])
             return spec
-        origin = spec.origin or ""
-        inside = origin.startswith(self._folders) and "site-packages" not in origin
-        if not inside and name.partition(".")[0] not in self._packages:
-            return None
-        spec.loader = _Loader(spec.loader.name, spec.loader.path)
+        if is_user_file(spec.origin or "") or name.partition(".")[0] in self._packages:
+            spec.loader = _Loader(spec.loader.name, spec.loader.path)
         return spec
+
+    def _found_otherwise(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None
+    ) -> importlib.machinery.ModuleSpec | None:
+        """Ask those who would be asked without us: editable packages have finders of their own."""
+        for finder in sys.meta_path:
+            find_spec = getattr(finder, "find_spec", None)
+            if finder is not self and find_spec is not None:
+                spec: importlib.machinery.ModuleSpec | None = find_spec(name, path, target)
+                if spec is not None:
+                    return spec
+        return None
 
 
 def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
@@ -267,9 +281,7 @@ def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
 
 @contextmanager
 def ordered_sets(
-    folders: Sequence[str],
-    packages: frozenset[str],
-    on_loaded: Mapping[str, Callable[[], None]],
+    packages: frozenset[str], on_loaded: Mapping[str, Callable[[], None]]
 ) -> Iterator[None]:
     """Let user modules that are imported from now on go through sets in order.
 
@@ -281,7 +293,7 @@ def ordered_sets(
         _POP: pop,
         _NOW: numpy_now,
     }
-    finder = _Finder(folders, packages, on_loaded)
+    finder = _Finder(packages, on_loaded)
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
     sys.meta_path.insert(0, finder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
+from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.virtual.torch_streams import torch_streams
@@ -137,11 +138,15 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         if job.guard.pins:
             stack.enter_context(pinned_place())
         stack.enter_context(installed())
-        folders = [str(job.resolve(folder)) for folder in job.search_path]
-        on_loaded = {"torch": made.torch_loaded, "cv2": lambda: opencv_clock(stack)}
-        if "cv2" in sys.modules:
-            opencv_clock(stack)
-        stack.enter_context(ordered_sets(folders, _packages(job.nodes), on_loaded))
+        at_once: dict[str, Callable[[], None]] = {
+            "cv2": lambda: opencv_clock(stack),
+            REWRITES: lambda: ordered_in_pytest(stack),
+        }
+        for name, begin in at_once.items():
+            if name in sys.modules:
+                begin()
+        on_loaded = {"torch": made.torch_loaded, **at_once}
+        stack.enter_context(ordered_sets(_packages(job.nodes), on_loaded))
     return made
 
 

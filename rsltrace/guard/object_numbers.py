@@ -1,0 +1,131 @@
+"""An order for objects that have none: numbers, given when a set with them is gone through.
+
+Where an object lies in memory decides its place in a set. Those that are met for the first time
+together are told apart by what they hold (names, numbers, positions), and get a number each that
+they keep, whatever becomes of them. Objects that hold the same cannot be told apart.
+"""
+
+from __future__ import annotations
+
+import enum
+import itertools
+import types
+import weakref
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from rsltrace.guard.state.hashing import attributes_of
+
+_DEPTH_MAX = 4
+_PARTS_MAX = 500
+"""What is looked at of one object; what differs only beyond that cannot be told apart."""
+_CHARACTERS_MAX = 1000
+_ARRAY_BYTES_MAX = 1 << 16
+_PLAIN = (str, bytes, int, float, bool, complex, type(None))
+_address = object.__hash__  # as id(), but no audit hook is told of it
+
+
+class ObjectNumbers:
+    """Numbers of the objects of one run, kept for as long as an object lives."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, tuple[weakref.ref[Any], int]] = {}
+        self._next = itertools.count().__next__
+
+    def in_order(self, things: Iterable[Any]) -> list[Any] | None:
+        """Return things in an order that does not depend on addresses; None if there is none."""
+        known: list[tuple[int, Any]] = []
+        new: dict[str, Any] = {}
+        for thing in things:
+            number = self._number(thing)
+            if number is not None:
+                known.append((number, thing))
+                continue
+            text = self._text_of(thing)
+            if text in new:
+                return None
+            new[text] = thing
+        known.sort(key=lambda pair: pair[0])
+        first = [new[text] for text in sorted(new)]
+        for thing in first:
+            self._keep(thing)
+        return [thing for _, thing in known] + first
+
+    def _number(self, thing: Any) -> int | None:
+        kept = self._kept.get(_address(thing))
+        return kept[1] if kept is not None and kept[0]() is thing else None
+
+    def _keep(self, thing: Any) -> None:
+        if isinstance(thing, (*_PLAIN, types.MethodType)):
+            return
+        key, kept = _address(thing), self._kept
+
+        def forget(gone: weakref.ref[Any]) -> None:
+            if key in kept and kept[key][0] is gone:
+                del kept[key]
+
+        try:
+            kept[key] = weakref.ref(thing, forget), self._next()
+        except TypeError:
+            pass  # it takes no weak reference, so it is looked at each time
+
+    def _text_of(self, thing: Any) -> str:
+        parts: list[str] = []
+        self._describe(thing, parts, 0)
+        return ",".join(parts)
+
+    def _describe(self, thing: Any, parts: list[str], depth: int) -> None:
+        """Write down what tells an object apart, without asking its own code."""
+        kind = type(thing)
+        if len(parts) >= _PARTS_MAX:
+            return
+        if kind in _PLAIN:
+            start = thing[:_CHARACTERS_MAX] if kind in (str, bytes) else thing
+            parts.append(f"{kind.__name__} {start!r}")
+            if start is not thing:
+                parts.append(str(len(thing)))
+        elif kind is types.MethodType:
+            parts.append(f"method {thing.__func__.__qualname__}")
+            self._describe(thing.__self__, parts, depth + 1)
+        elif isinstance(thing, (type, types.FunctionType, types.BuiltinFunctionType)):
+            line = thing.__code__.co_firstlineno if isinstance(thing, types.FunctionType) else 0
+            parts.append(f"{kind.__name__} {thing.__module__}.{thing.__qualname__} {line}")
+        elif isinstance(thing, (types.ModuleType, enum.Enum)):
+            name = thing.__name__ if isinstance(thing, types.ModuleType) else thing.name
+            parts.append(f"{kind.__name__} {name}")
+        elif isinstance(thing, np.ndarray):
+            data = thing.tobytes().hex() if _has_plain_data(thing) else ""
+            parts.append(f"{thing.dtype.str}{thing.shape}{data}")
+        elif self._number(thing) is not None and depth:
+            parts.append(f"object {self._number(thing)}")
+        else:
+            self._describe_object(thing, parts, depth)
+
+    def _describe_object(self, thing: Any, parts: list[str], depth: int) -> None:
+        kind = type(thing)
+        parts.append(f"{kind.__module__}.{kind.__qualname__}")
+        if depth >= _DEPTH_MAX:
+            return
+        if kind in (list, tuple):
+            parts.append(str(len(thing)))
+            held: Iterable[tuple[Any, Any]] = enumerate(thing)
+        elif isinstance(thing, Mapping) and kind in (dict, types.MappingProxyType):
+            parts.append(str(len(thing)))
+            held = thing.items()
+        else:
+            held = attributes_of(thing).items()
+        for name, value in held:
+            if len(parts) >= _PARTS_MAX:
+                return
+            if isinstance(name, str):
+                parts.append(name)
+            self._describe(value, parts, depth + 1)
+
+
+def _has_plain_data(array: np.ndarray[Any, Any]) -> bool:
+    return not array.dtype.hasobject and array.nbytes <= _ARRAY_BYTES_MAX
+
+
+__all__ = ["ObjectNumbers"]

@@ -1,0 +1,180 @@
+"""The user's packages are the user's wherever they are installed; libraries are known by name."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.guard.callers import is_user_file
+from rsltrace.guard.object_numbers import ObjectNumbers
+from rsltrace.model.finding import Source
+from tests.guard.conftest import node_code
+
+pytestmark = pytest.mark.ros
+
+HELPER = """
+class Thing:
+    def __init__(self, name):
+        self.name = name
+
+class Registry:
+    def __init__(self):
+        self.things = set()
+
+    def add(self, *names):
+        self.things |= {Thing(name) for name in names}
+
+    def all(self):
+        return list(self.things)
+"""
+TICK = """
+registry = Registry()
+registry.add('delta', 'alpha', 'echo', 'bravo', 'charlie')
+first = [thing.name for thing in registry.all()]
+registry.add('aachen', 'zagreb')
+self.say(first, [thing.name for thing in registry.all()])
+"""
+ALIKE = "registry = Registry()\nregistry.add('same', 'same')\nregistry.all()"
+
+
+def install(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    (folder / name).mkdir(parents=True)
+    (folder / name / "__init__.py").write_text(HELPER)
+    monkeypatch.syspath_prepend(str(folder))
+
+
+@pytest.mark.parametrize(
+    "place", ["install/helper_a/lib/python3.12/site-packages", "venv/dist-packages", "src/beside"]
+)
+def test_objects_of_an_installed_package_are_in_order(
+    place: str, said: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = "helper_" + place.replace("/", "_").replace(".", "_").replace("-", "_")
+    install(tmp_path / place, monkeypatch, name)
+    (first, later), (again, _) = said(node_code(TICK, imports=f"from {name} import Registry"))
+    assert first == again == ["alpha", "bravo", "charlie", "delta", "echo"]
+    assert later == [*first, "aachen", "zagreb"]  # who has a place keeps it
+    assert "__pycache__" not in {path.name for path in (tmp_path / place / name).iterdir()}
+
+
+def test_what_cannot_be_put_in_order_is_found_at_its_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rsltrace.job import load_job
+    from rsltrace.run import record
+    from rsltrace.trace.reader import Trace
+
+    install(tmp_path / "site-packages", monkeypatch, "helper_alike")
+    (tmp_path / "m.py").write_text(node_code(ALIKE, imports="from helper_alike import Registry"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 0.7s}\n")
+    record(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        (found,) = [one for many in trace.findings.values() for one in many]
+    line = 1 + HELPER.splitlines().index("        return list(self.things)")
+    assert found.source is Source.ORDER
+    assert found.call == "order of a set of Thing"
+    assert f"__init__.py:{line} in" in found.stack.splitlines()[0]
+
+
+def test_a_package_with_a_finder_of_its_own(
+    said: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As setuptools installs editable packages."""
+    import importlib.util
+
+    file = tmp_path / "elsewhere" / "code.py"
+    file.parent.mkdir()
+    file.write_text(HELPER)
+
+    class Finder:
+        @staticmethod
+        def find_spec(name: str, path: Any = None, target: Any = None) -> Any:
+            found = name == "helper_editable"
+            return importlib.util.spec_from_file_location(name, file) if found else None
+
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, Finder])
+    monkeypatch.delitem(sys.modules, "helper_editable", raising=False)
+    said_ = said(node_code(TICK, imports="from helper_editable import Registry"))
+    assert said_[0][0] == ["alpha", "bravo", "charlie", "delta", "echo"]
+
+
+def test_who_is_a_library() -> None:
+    for file in (
+        "/ws/install/my_robot/lib/python3.12/site-packages/my_robot/node.py",
+        "/usr/lib/python3/dist-packages/helper.py",
+        "/venv/lib/python3.11/site-packages/numpydantic/x.py",
+        "/home/me/src/my_robot/node.py",
+    ):
+        assert is_user_file(file), file
+    for file in (
+        "/opt/ros/jazzy/lib/python3.12/site-packages/anything/x.py",
+        "/venv/lib/python3.11/site-packages/numpy/core/x.py",
+        "/venv/lib/python3.11/site-packages/_pytest/main.py",
+        "/venv/lib/python3.11/site-packages/rosidl_parser/x.py",
+        "/ws/install/my_msgs/lib/python3.12/site-packages/my_msgs/msg/_thing.py",
+        "/venv/lib/python3.11/site-packages/threadpoolctl.py",
+        sys.modules["json"].__file__,
+    ):
+        assert file is not None
+        assert not is_user_file(file), file
+
+
+def test_numbers_are_kept_for_as_long_as_an_object_lives() -> None:
+    class Thing:
+        def __init__(self, name: str, other: object = None) -> None:
+            self.name, self.other = name, other
+
+    numbers = ObjectNumbers()
+    a, b = Thing("b"), Thing("a")
+    assert numbers.in_order([a, b]) == [b, a] == numbers.in_order([b, a])
+    b.name = "z"
+    assert numbers.in_order([a, b]) == [b, a]
+    assert numbers.in_order([Thing("x", b), Thing("x", a)]) is not None  # told apart by those
+    assert numbers.in_order([Thing("same"), Thing("same")]) is None
+    circle = Thing("circle")
+    circle.other = circle
+    assert numbers.in_order([circle, a, 3, "text"]) is not None
+    del a, b, circle
+    gc.collect()
+    assert not numbers._kept
+
+
+TESTS = """
+class Thing:
+    def __init__(self, number):
+        self.number = number
+
+def test_order():
+    things = {Thing(number) for number in range(100)}
+    print([thing.number for thing in things])
+    assert len(things) == 100
+"""
+
+
+def test_modules_that_pytest_compiles(
+    tmp_path: Path, capfd: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import subprocess
+
+    (tmp_path / "test_things.py").write_text(TESTS)
+    words = "[-q, -s, -p, 'no:cacheprovider', --rootdir=., test_things.py]"
+    (tmp_path / "job.yaml").write_text(
+        f"nodes: [{{main: 'pytest:console_main', arguments: {words}}}]\n"
+    )
+    shown = set()
+    for _ in range(3):
+        done = subprocess.run(
+            [sys.executable, "-m", "rsltrace", "record", "job.yaml", "--no-pin", "-o", "run.mcap",
+             "--force"],
+            cwd=tmp_path, capture_output=True, text=True, check=True, timeout=300,
+        )  # fmt: skip
+        assert "1 passed" in done.stdout
+        shown.add(next(line for line in done.stdout.splitlines() if line.startswith("[")))
+    assert len(shown) == 1
+    cached = list(tmp_path.glob("__pycache__/*pytest*"))
+    assert not cached, "plain pytest would find our calls there"
