@@ -20,6 +20,7 @@ from rsltrace.guard.pin import pin_recording
 _COMMANDS = {
     "record": "Run a job's nodes deterministically and record their trace.",
     "replay": "Run the job of a trace again, and check every event on the way.",
+    "debug": "Stop in a run, look into its nodes, go back.",
     "init": "Write a commented first job, from bags and nodes.",
     "verify": "Record a job many times in unlike surroundings and compare.",
     "bisect": "Find the commit that changed what a job does.",
@@ -95,6 +96,7 @@ def cli() -> None:
       rsltrace view run.mcap                  step through it
       rsltrace diff run1.mcap run2.mcap       see where two runs diverge, and why
       rsltrace replay run.mcap                run it again, stop where it diverges
+      rsltrace debug run.mcap                 stop anywhere, look into nodes, go back
 
     "rsltrace COMMAND --help" explains a command.
     """

@@ -125,9 +125,9 @@ def replay(
         check_edits(changes, plan.trace)
         begin = 0 if first is None else count_to(plan.trace, first) - 1
         if not as_json:
-            for line in _told(plan, node):
+            for line in code_lines(plan, "replaying", node):
                 tell(line)
-        _agree(plan, trust=trust)
+        agree(plan, trust=trust)
         if node is not None:
             return replay_one(
                 plan,
@@ -155,7 +155,7 @@ def replay(
     return status
 
 
-def _agree(plan: Preparation, *, trust: bool) -> None:
+def agree(plan: Preparation, *, trust: bool) -> None:
     """Have somebody agree to run what a trace names, where that is not plain.
 
     :raises ReplayError: if nobody does.
@@ -218,14 +218,14 @@ def _from(first: int, show: _Show | None) -> _Show | None:
 # -- what is told --------------------------------------------------------------------------------
 
 
-def _told(plan: Preparation, node: str | None) -> Iterator[str]:
-    """Yield what will run, from where, and what is not as it was."""
+def code_lines(plan: Preparation, doing: str, node: str | None = None) -> Iterator[str]:
+    """Yield what will run (all of it, or one node), from where, and what is not as it was."""
     trace = plan.trace
     job = trace.job.get("name", "") or "a job"
     what = f"{trace.name}: {trace.event_count} events of {job} in {plan.folder}"
     if node is not None:
         what = f"{node} of {trace.name} alone ({job} in {plan.folder})"
-    yield printable(f"replaying {what}, with the code of")
+    yield printable(f"{doing} {what}, with the code of")
     code = [(one.name, str(_near(one.file)) if one.file else "-", one.change) for one in plan.code]
     width = min(max((len(name) for name, _, _ in code), default=0), 40)
     for name, file, change in code[:_SHOWN_MAX]:

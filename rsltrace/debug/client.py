@@ -201,6 +201,20 @@ class DebugSession:
         answer = self._ask("evaluate", expression=expression, node=node)
         return answer["value"] if "value" in answer else answer["repr"]
 
+    def evaluated(self, expression: str, node: str | None = None) -> str:
+        """Return the value of an expression as Python shows it (its ``repr``)."""
+        return str(self._ask("evaluate", expression=expression, node=node)["repr"])
+
+    def pdb(self, address: str) -> str:
+        """Call the next callback under ``pdb``, which speaks through the Unix socket ``address``.
+
+        It is called in a copy of the simulation: nothing that happens there changes the run, which
+        stands where it stood. Returns what the callback raised, as text, empty if nothing.
+
+        :raises DebugError: nothing follows, the run cannot be copied, or nobody listens.
+        """
+        return str(self._ask("pdb", address=address)["raised"])
+
     def node(self, name: str) -> dict[str, str]:
         """Return the attributes of a node and its parameters, as Python shows them."""
         return dict(self._ask("node", name=name))

@@ -68,6 +68,7 @@ class Engine:
         self._checkpoint_s = 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
+        self._pdb_address = ""
         dispatcher = session.world.domain.dispatcher
         self._end_event = dispatcher.end_event
         self._execute = dispatcher.execute
@@ -90,6 +91,9 @@ class Engine:
             event = self.event
             event.handle, event.entity, event.node, event.kind = handle, entity, node, kind
             self._about_to_run()
+        if self._pdb_address:
+            callback, args, *cause = rest
+            rest = (lambda *_: self._call_under_pdb(callback, args), (), *cause)
         self._execute(handle, entity, node, kind, *rest)
 
     def _differs(self) -> None:
@@ -249,6 +253,9 @@ class Engine:
                 if request["do"] == "run":
                     if self._begin(request):
                         return
+                elif request["do"] == "pdb":
+                    if self._begin_pdb(request["address"]):
+                        return
                 else:
                     self._do(request)
             except (Exception, RecursionError) as error:
@@ -340,7 +347,7 @@ class Engine:
         """
         if not self._forks:
             raise DebugError("checkpoints are off")
-        reason = why_not([self.lines.fileno()], self._idle)
+        reason = why_not([self.lines.fileno(), *self.ledger.history.descriptors], self._idle)
         if reason:
             raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
@@ -379,6 +386,34 @@ class Engine:
         assert ours is not None
         with ours:
             self.lines.send({"id": self._id, "ok": {"apart": True}}, ours.fileno())
+
+    def _begin_pdb(self, address: str) -> bool:
+        """Let a copy call the next callback under ``pdb``; True in the copy.
+
+        :raises DebugError: there can be no copy, or nothing follows.
+        """
+        if self.over:
+            raise DebugError(f"nothing follows: {self.over}")
+        ours = self._forked()
+        if ours is None:
+            self._pdb_address = address
+            self._goal, self._mark, self.is_next = Goal(), _NEVER, False
+            return True
+        with ours:
+            self.lines.send({"id": self._id, "ok": {"apart": True}}, ours.fileno())
+        return False
+
+    def _call_under_pdb(self, callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
+        """Call the callback for which this copy was made, and end."""
+        from rsltrace.debug.callback_pdb import call_under_pdb
+
+        try:
+            answer: Message = {"ok": {"raised": call_under_pdb(callback, args, self._pdb_address)}}
+        except BaseException as error:
+            answer = {"error": said(error)}
+        with engage(None), suppress(BaseException):
+            self.lines.send(answer)
+        end_process(0)
 
     def _event(self, index: int) -> Message:
         """Return an event that is known.

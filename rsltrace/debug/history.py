@@ -29,6 +29,10 @@ class History(Protocol):
     """Why the run goes no further than ``limit``, where that is known beforehand."""
 
     @property
+    def descriptors(self) -> tuple[int, ...]:
+        """What is open for it, and meant to be shared by all processes of a session."""
+
+    @property
     def limit(self) -> int | None:
         """How many events there are at most, None if nobody knows."""
 
@@ -54,6 +58,10 @@ class TraceHistory:
         self._trace = trace
         count, self.ended = limit_of(trace, None)
         self._limit = count if count >= 0 else trace.event_count
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
 
     @property
     def limit(self) -> int | None:
@@ -98,6 +106,11 @@ class RunHistory:
     def __init__(self) -> None:
         with tempfile.TemporaryFile(prefix="rsltrace-debug-") as file:
             self._number = os.dup(file.fileno())
+
+    @property
+    def descriptors(self) -> tuple[int, ...]:
+        """What is open for it, and meant to be shared."""
+        return (self._number,)
 
     @property
     def known(self) -> int:

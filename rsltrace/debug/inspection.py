@@ -41,9 +41,15 @@ class Standing(Protocol):
 def node_named(run: Standing, name: str) -> Any:
     """Return a node by its full name, or its last part.
 
-    :raises DebugError: there is none, or several.
+    :raises DebugError: there is none, or several, or it is not there now.
     """
-    return run.view.nodes()[full_name(run, name)]
+    full = full_name(run, name)
+    node = run.view.nodes().get(full)
+    if node is None:
+        raise DebugError(
+            f"{full} is not there: it has not been made yet, or it is destroyed by now"
+        )
+    return node
 
 
 def full_name(run: Standing, name: str) -> str:
@@ -51,7 +57,7 @@ def full_name(run: Standing, name: str) -> str:
 
     :raises DebugError: there is none, or several.
     """
-    nodes = run.view.nodes()
+    nodes = dict.fromkeys((*run.view.nodes(), *run.names().nodes))
     found = nodes_called(name, nodes)
     if len(found) == 1:
         return found[0]

@@ -46,6 +46,7 @@ class Supervisor:
             "inspect": self._pass_on,
             "evaluate": self._pass_on_apart,
             "node": self._pass_on_apart,
+            "pdb": self._pdb,
             "event": self._pass_on,
             "sent_by": self._sent_by,
             "last_changed": self._last_changed,
@@ -194,6 +195,12 @@ class Supervisor:
 
     def _pass_on(self, request: Message) -> Any:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
+
+    def _pdb(self, request: Message) -> Any:
+        answer = self.tree.ask_apart({"do": "pdb", "address": str(request["address"])}, None)
+        if "raised" not in answer:
+            raise DebugError(f"no callback follows: {answer.get('text', '')}")
+        return answer
 
     def _pass_on_apart(self, request: Message) -> Any:
         return self.tree.ask_apart({k: v for k, v in request.items() if k != "id"})

@@ -87,14 +87,14 @@ class Tree:
         """Ask the process that stands where the session does."""
         return self._ask(self._cursor, request)
 
-    def ask_apart(self, request: Message) -> Any:
+    def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
         """Ask for what runs a user's code: a copy does it, and may be killed."""
         answer = self._ask(self._cursor, request, whole=True)
         if "with" not in answer:
             return answer["ok"]
         copy = SimProcess(Lines(_socket(answer["with"][0])))
         try:
-            return self._ask(copy, None, limit_s=_APART_LIMIT_S)
+            return self._ask(copy, None, limit_s=limit_s)
         finally:
             self.family.kill(copy)
 

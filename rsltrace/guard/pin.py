@@ -33,6 +33,7 @@ PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 _ADDR_NO_RANDOMIZE = 0x0040000
 _ASK = 0xFFFFFFFF
 _UNPINNED = "off"
+_RUNS_NODES = frozenset(("record", "replay", "debug"))
 _NOTHING_TO_PIN = frozenset(("--no-pin", "--help", "-h"))
 
 _before = ""
@@ -41,7 +42,7 @@ _before = ""
 
 def pin_recording(words: Sequence[str]) -> None:
     """Pin the process if a command line (without the program's name) is one that runs nodes."""
-    if words[:1] and words[0] in ("record", "replay") and not _NOTHING_TO_PIN.intersection(words):
+    if _RUNS_NODES.intersection(words[:1]) and not _NOTHING_TO_PIN.intersection(words):
         pin()
 
 

@@ -1,0 +1,115 @@
+"""``pdb`` in the first line of a callback, spoken through a socket: a simulation has no terminal.
+
+The lines of the conversation are JSON: ``{"write": text}`` and ``{"read": true}`` from here,
+``{"line": text}`` (null: there are no more) from the client, in answer to the second.
+"""
+
+from __future__ import annotations
+
+import json
+import pdb
+import socket
+from bdb import BdbQuit
+from collections.abc import Callable
+from contextlib import suppress
+from types import FrameType
+from typing import Any
+
+from rsltrace.errors import DebugError
+from rsltrace.guard.guard import engage
+
+_SKIPPED = ("rsltrace", "rsltrace.*", "rclpy", "rclpy.*", "greenlet", "greenlet.*")
+"""What is neither stopped in nor stepped into: it stands between a run and its callbacks."""
+
+
+class Conversation:
+    """A terminal that is somewhere else, as far as ``pdb`` needs one."""
+
+    def __init__(self, address: str) -> None:
+        """Connect to the socket of a path.
+
+        :raises DebugError: nobody listens there.
+        """
+        self._end = socket.socket(socket.AF_UNIX)
+        try:
+            self._end.connect(address)
+        except OSError as error:
+            self._end.close()
+            raise DebugError(f"nobody listens at {address}: {error}") from error
+        self._lines = self._end.makefile("rw", encoding="utf-8")
+
+    def write(self, text: str) -> int:
+        """Have a text shown."""
+        self._send({"write": text})
+        return len(text)
+
+    def flush(self) -> None:
+        """Do nothing: every text is sent at once."""
+
+    def readline(self) -> str:
+        """Ask for a line; empty once there are no more."""
+        self._send({"read": True})
+        with suppress(OSError, ValueError):
+            line = json.loads(self._lines.readline() or '{"line": null}').get("line")
+            return "" if line is None else f"{line}\n"
+        return ""
+
+    def close(self) -> None:
+        """Hang up."""
+        with suppress(OSError):
+            self._lines.close()
+        self._end.close()
+
+    def _send(self, message: dict[str, Any]) -> None:
+        with suppress(OSError):
+            self._lines.write(json.dumps(message) + "\n")
+            self._lines.flush()
+
+
+class CallbackPdb(pdb.Pdb):
+    """Stops in the first line of what it calls that is neither ours nor rclpy's."""
+
+    def __init__(self, conversation: Conversation) -> None:
+        super().__init__(
+            stdin=conversation,  # type: ignore[arg-type]
+            stdout=conversation,  # type: ignore[arg-type]
+            skip=_SKIPPED,
+            nosigint=True,
+        )
+        self.use_rawinput = False
+        self._has_begun = False
+
+    def user_call(self, frame: FrameType, argument_list: Any) -> None:
+        """Wait for the first line: that a function is called is known."""
+        if self._has_begun:
+            super().user_call(frame, argument_list)
+
+    def user_line(self, frame: FrameType) -> None:
+        """Stop at a line."""
+        self._has_begun = True
+        super().user_line(frame)
+
+    def interaction(self, *where: Any) -> None:
+        """Talk; what is evaluated is nobody's callback."""
+        with engage(None):
+            super().interaction(*where)
+
+
+def call_under_pdb(callback: Callable[..., Any], args: tuple[Any, ...], address: str) -> str:
+    """Call a callback under ``pdb``; return what it raised, as a text, empty if nothing.
+
+    :raises DebugError: nobody listens at ``address``.
+    """
+    with engage(None):
+        conversation = Conversation(address)
+        debugger = CallbackPdb(conversation)
+    try:
+        debugger.runcall(callback, *args)
+    except BdbQuit:
+        return ""
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    finally:
+        with engage(None):
+            conversation.close()
+    return ""

@@ -1,0 +1,289 @@
+"""The commands of the prompt, by the names that gdb, rr and pdb have for them."""
+
+from __future__ import annotations
+
+import re
+
+from rsltrace.debug.prompt import show
+from rsltrace.debug.prompt.commands import Commands, Prompt
+from rsltrace.debug.prompt.pdb_terminal import talk
+from rsltrace.errors import ConditionError, DebugError, did_you_mean
+
+COMMANDS = Commands()
+_add = COMMANDS.add
+
+_CHANGED = re.compile(r"(?P<node>[\w/~]+)(?:\.|\s+)(?P<attribute>\S.*)")
+
+
+def _count(text: str, otherwise: int = 1) -> int:
+    if not text:
+        return otherwise
+    if not (text.isascii() and text.isdecimal()):
+        raise DebugError(f"{text!r} is no whole number")
+    return int(text)
+
+
+def _place(text: str) -> int | str:
+    if not text:
+        raise DebugError("where to? 812 is an event, 2.5s a simulated time")
+    return int(text) if text.isascii() and text.isdecimal() else text.removeprefix("t=")
+
+
+# -- running ---------------------------------------------------------------------------------------
+
+
+@_add("step", "s", usage="[N]", topic="running", repeats=True)
+def _step(shell: Prompt, rest: str) -> None:
+    """Run one event, or N."""
+    shell.stopped(shell.session.step(_count(rest)))
+
+
+@_add("next", "n", usage="[NODE]", topic="running", repeats=True)
+def _next(shell: Prompt, rest: str) -> None:
+    """Run to the end of the next event of this node, or of NODE."""
+    shell.stopped(shell.session.next(rest or None))
+
+
+@_add("finish", "fin", topic="running", repeats=True)
+def _finish(shell: Prompt, rest: str) -> None:
+    """Run to the end of this time step."""
+    shell.stopped(shell.session.finish())
+
+
+@_add("continue", "c", "cont", topic="running", repeats=True)
+def _continue(shell: Prompt, rest: str) -> None:
+    """Run to the next breakpoint, or to the end.
+
+    Ctrl-C stops the run after its present event.
+    """
+    shell.stopped(shell.session.go_on())
+
+
+@_add("run-to", "until", "u", usage="PLACE", topic="running")
+def _run_to(shell: Prompt, rest: str) -> None:
+    """Run to an event (812) or a time (2.5s), or to a breakpoint before it.
+
+    At 812, events 0 to 811 have ended. At 2.5s, all have that there are up to then.
+    """
+    shell.stopped(shell.session.run_to(_place(rest)))
+
+
+# -- going back ------------------------------------------------------------------------------------
+
+
+@_add("reverse-step", "rs", usage="[N]", topic="going back", repeats=True)
+def _reverse_step(shell: Prompt, rest: str) -> None:
+    """Go back one event, or N."""
+    shell.stopped(shell.session.reverse_step(_count(rest)))
+
+
+@_add("reverse-next", "rn", usage="[NODE]", topic="going back", repeats=True)
+def _reverse_next(shell: Prompt, rest: str) -> None:
+    """Go back to the end of the event before, of this node or of NODE."""
+    shell.stopped(shell.session.reverse_next(rest or None))
+
+
+@_add("reverse-continue", "rc", topic="going back", repeats=True)
+def _reverse_continue(shell: Prompt, rest: str) -> None:
+    """Go back to where a breakpoint stops last before here, or to the beginning."""
+    shell.stopped(shell.session.reverse_go_on())
+
+
+@_add("goto", "g", usage="PLACE", topic="going back")
+def _goto(shell: Prompt, rest: str) -> None:
+    """Go to an event (812) or a time (2.5s), ahead or back; no breakpoint stops."""
+    shell.stopped(shell.session.go_to(_place(rest)))
+
+
+# -- breakpoints -----------------------------------------------------------------------------------
+
+
+@_add("break", "b", usage="CONDITION", topic="breakpoints")
+def _break(shell: Prompt, rest: str) -> None:
+    """Set a breakpoint.
+
+    812                           before event 812
+    t=2.5s                        before the first event at that simulated time or later
+    node /ekf, entity /scan       before an event of a node, of an entity (by name or #number)
+    topic /odom                   before who receives a message, after who sends one
+    /odom: pose.pose.position.x > 3    the same, of messages of which that is true
+    output 3f2a                   after an event with an output of such a hash
+    exception [TYPE]              after an event that raised
+    log [LEVEL] [/TEXT/]          after a log record of that level or worse
+    finding [KIND]                after an event in which the guard found something
+    watch ekf.P[0][0]             after an event that changes a value
+    when node("ekf").P[0][0] > 1  after the event that makes it true
+    Behind all but the last two, 'if EXPRESSION' has to be true as well.
+    """
+    if not rest:
+        shell.show(show.breakpoint_lines(shell.session.breakpoints))
+        return
+    made = shell.session.break_at(rest)
+    shell.show([f"breakpoint {made.number}: {made.text}"])
+
+
+@_add("watch", usage="EXPRESSION", topic="breakpoints")
+def _watch(shell: Prompt, rest: str) -> None:
+    """Stop after events that change a value: ekf.P[0][0], node("ekf").P."""
+    _break(shell, f"watch {rest}")
+
+
+@_add("delete", "d", usage="[NUMBER]...", topic="breakpoints")
+def _delete(shell: Prompt, rest: str) -> None:
+    """Remove breakpoints, or all."""
+    numbers = [_count(word) for word in rest.split()]
+    for number in numbers or [one.number for one in shell.session.breakpoints]:
+        shell.session.clear(number)
+
+
+# -- looking ---------------------------------------------------------------------------------------
+
+INFO = {
+    "breakpoints": "what stops the run",
+    "nodes": "the nodes and their classes",
+    "node": "[NODE]: the attributes and parameters of a node",
+    "queues": "messages and requests that wait",
+    "timers": "timers, and when they are due",
+    "stacks": "who waits for what, inside of a callback",
+    "graph": "topics, services and actions with their ends",
+    "message": "what the callback gets",
+    "checkpoints": "where copies of the run sleep, to go back to",
+}
+
+
+@_add("info", "i", usage="[WHAT]", topic="looking")
+def _info(shell: Prompt, rest: str) -> None:
+    """Show breakpoints, nodes, queues, timers, stacks, graph, …; alone, what there is."""
+    word, _, more = rest.partition(" ")
+    if not word:
+        shell.show(f"info {name:<12} {text}" for name, text in INFO.items())
+        return
+    found = [word] if word in INFO else [name for name in INFO if name.startswith(word)]
+    if not found:
+        hint = did_you_mean(word, INFO, f"there are {', '.join(INFO)}")
+        raise DebugError(f"no info {word!r}; {hint}")
+    what, session = found[0], shell.session
+    if what == "breakpoints":
+        shell.show(show.breakpoint_lines(session.breakpoints))
+    elif what == "node":
+        shell.show(show.value_lines(session.node(more.strip() or _node(shell))))
+    elif what == "checkpoints":
+        shell.show(show.checkpoint_lines(session.checkpoints()))
+    elif what == "queues":
+        shell.show(show.queue_lines(session.inspect(what)))
+    elif what == "graph":
+        shell.show(show.graph_lines(session.inspect(what)))
+    else:
+        value = session.inspect(what)
+        nothing = ["what runs here has received no message"]
+        shell.show(nothing if value is None else show.value_lines(value))
+
+
+def _node(shell: Prompt) -> str:
+    name = shell.node_here()
+    if name is None:
+        raise DebugError("the event here is no node's: say which node")
+    return name
+
+
+@_add("print", "p", usage="EXPRESSION", topic="looking")
+def _print(shell: Prompt, rest: str) -> None:
+    """Evaluate: attributes of this node, node("ekf"), fields of its message, msg, now, event.
+
+    It is evaluated in a copy of the run: whatever it does changes nothing here.
+    """
+    if not rest:
+        raise DebugError('print what? P[0][0] of this node, node("ekf").P, msg, now, event')
+    here = shell.node_here()
+    there = [one["name"] for one in shell.session.inspect("nodes")]
+    value = shell.session.evaluated(rest, here if here in there else None)
+    shell.show(value.splitlines() or [""])
+
+
+@_add("list", "l", topic="looking")
+def _list(shell: Prompt, rest: str) -> None:
+    """Show the source lines of the callback."""
+    shell.show(show.source_lines(shell.session.inspect("source")))
+
+
+@_add("where", "w", "bt", topic="looking")
+def _where(shell: Prompt, rest: str) -> None:
+    """Show the event here, its cause and its hashes."""
+    shell.show(show.where_lines(shell.session.position))
+
+
+@_add("pdb", topic="looking")
+def _pdb(shell: Prompt, rest: str) -> None:
+    """Call the next callback under pdb, from its first line on.
+
+    It is called in a copy of the run: what it does, or you do there, changes nothing here. "c" or
+    "q" of pdb comes back to this prompt, before the callback; "step" runs it.
+    """
+    raised = talk(shell.session.pdb, shell.read)
+    if raised:
+        shell.show([f"the callback raised {raised}"])
+    shell.show([show.position_line(shell.session.position)])
+
+
+# -- searching -------------------------------------------------------------------------------------
+
+
+@_add("who-changed", "wc", usage="NODE ATTRIBUTE", topic="searching")
+def _who_changed(shell: Prompt, rest: str) -> None:
+    """Find the last event up to here that changed an attribute: who-changed ekf P[0][0]."""
+    found = _CHANGED.fullmatch(rest)
+    if found is None:
+        raise DebugError("who changed what? Say a node and an attribute: who-changed ekf P[0][0]")
+    shell.show(show.found_lines(shell.session.last_changed(found["node"], found["attribute"])))
+
+
+@_add("who-sent", "ws", usage="[EVENT]", topic="searching")
+def _who_sent(shell: Prompt, rest: str) -> None:
+    """Find the event that sent what this one (or EVENT) has received."""
+    position = shell.session.position
+    index = _count(rest, position.index if position.is_next else position.index - 1)
+    if index < 0:
+        raise DebugError("nothing has run yet")
+    shell.show(show.found_lines(shell.session.sent_by(index)))
+
+
+@_add("when", usage="CONDITION", topic="searching")
+def _when(shell: Prompt, rest: str) -> None:
+    """Find the first event up to here at which a condition (see break) is true.
+
+    An expression alone is one, too: when ekf.P[0][0] > 1.
+    """
+    if not rest:
+        raise ConditionError("when what? A condition, as of a breakpoint", "when ", 5)
+    shell.show(show.found_lines(shell.session.first_true(_as_condition(rest, shell))))
+
+
+def _as_condition(text: str, shell: Prompt) -> str:
+    """Return the condition that a text means: an expression is ``when …``."""
+    from rsltrace.debug.conditions.expressions import parse_expression
+    from rsltrace.debug.conditions.text import parse_condition
+
+    try:
+        parse_condition(text, shell.names())
+    except ConditionError:
+        try:
+            parse_expression(text, shell.names())
+        except ConditionError:
+            return text
+        return f"when {text}"
+    return text
+
+
+# -- the rest --------------------------------------------------------------------------------------
+
+
+@_add("help", "h", "?", usage="[COMMAND]", topic="the rest")
+def _help(shell: Prompt, rest: str) -> None:
+    """Show this, or more of a command."""
+    shell.show(COMMANDS.help(rest))
+
+
+@_add("quit", "q", "exit", topic="the rest")
+def _quit(shell: Prompt, rest: str) -> None:
+    """End the session."""
+    shell.is_over = True

@@ -1,0 +1,121 @@
+"""What can be said at the prompt: names, abbreviations, help."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from inspect import cleandoc
+from typing import TYPE_CHECKING, Any, Protocol
+
+from rsltrace.errors import DebugError, nearest
+
+if TYPE_CHECKING:
+    from rsltrace.debug.client import DebugSession
+    from rsltrace.debug.conditions.names import Names
+    from rsltrace.debug.positions import Stopped
+
+
+class Prompt(Protocol):
+    """What commands need of the prompt. A command that ends the session sets ``is_over``."""
+
+    session: DebugSession
+    is_over: bool
+
+    def show(self, lines: Iterable[str]) -> None:
+        """Print lines."""
+
+    def stopped(self, stopped: Stopped) -> None:
+        """Print where and why the run has stopped."""
+
+    def read(self, prompt: str) -> str | None:
+        """Return the next line, for somebody else; None if there are no more."""
+
+    def node_here(self) -> str | None:
+        """Return the node whose event is about to run, or has just ended."""
+
+    def names(self) -> Names:
+        """Return the names there are, as far as they are known."""
+
+
+Run = Callable[[Any, str], object]
+"""What a command does, given the prompt and what follows its name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """A command: its names (the first is its own), what follows them, and what it does.
+
+    An empty line ``repeats`` it. ``topic`` is the group that help lists it in.
+    """
+
+    names: tuple[str, ...]
+    usage: str
+    help: str
+    run: Run
+    topic: str
+    repeats: bool = False
+
+    @property
+    def name(self) -> str:
+        """Its own name."""
+        return self.names[0]
+
+
+class Commands:
+    """The commands there are."""
+
+    def __init__(self) -> None:
+        self.all: list[Command] = []
+        self._by_name: dict[str, Command] = {}
+
+    def add(
+        self, *names: str, topic: str, usage: str = "", repeats: bool = False
+    ) -> Callable[[Run], Run]:
+        """Make a function a command, whose help is the function's docstring."""
+
+        def added(run: Run) -> Run:
+            command = Command(names, usage, cleandoc(run.__doc__ or ""), run, topic, repeats)
+            assert not self._by_name.keys() & names, "one name, one command"
+            self.all.append(command)
+            self._by_name.update(dict.fromkeys(names, command))
+            return run
+
+        return added
+
+    def find(self, word: str) -> Command:
+        """Return the command that is meant: by a name, or by the beginning of one.
+
+        :raises DebugError: it could be several, or none.
+        """
+        found = self._by_name.get(word)
+        if found is not None:
+            return found
+        begins = {c.name: c for name, c in self._by_name.items() if name.startswith(word)}
+        if len(begins) == 1:
+            return next(iter(begins.values()))
+        if begins:
+            raise DebugError(f"{word!r} could be {', '.join(sorted(begins))}")
+        near = nearest(word, self._by_name)
+        hint = f"did you mean {near!r}?" if near else "'help' lists what there is"
+        raise DebugError(f"there is no command {word!r}; {hint}")
+
+    def help(self, word: str = "") -> Iterator[str]:
+        """Yield the help of one command, or the list of all.
+
+        :raises DebugError: there is no such command.
+        """
+        if word:
+            command = self.find(word)
+            yield f"{' | '.join(command.names)} {command.usage}".rstrip()
+            yield from (f"  {line}".rstrip() for line in command.help.splitlines())
+            return
+        width = max(len(f"{c.name} {c.usage}") for c in self.all)
+        for topic in dict.fromkeys(command.topic for command in self.all):
+            yield f"{topic}:"
+            for command in self.all:
+                if command.topic == topic:
+                    said = f"{command.name} {command.usage}".rstrip()
+                    short = next((n for n in command.names[1:] if len(n) < 4), "")
+                    first = command.help.splitlines()[0]
+                    yield f"  {short:<4} {said:<{width}}  {first}"
+        yield "The beginning of a name will do; 'help COMMAND' says more. An empty line steps on."
