@@ -88,11 +88,11 @@ class Playback:
 
     def _by_header_stamp(self) -> Iterator[Message]:
         for stamp_ns, topic, data in self.bag.messages():
-            header_ns = _header_stamp_ns(data) if topic in self.headers else 0
+            header_ns = header_stamp_ns(data) if topic in self.headers else 0
             yield header_ns or stamp_ns, topic, data
 
 
-def _header_stamp_ns(data: bytes) -> int:
+def header_stamp_ns(data: bytes) -> int:
     """Return the stamp of the header a CDR message begins with; 0 if it is not set."""
     order = "little" if data[1:2] == b"\x01" else "big"
     sec = int.from_bytes(data[4:8], order, signed=True)  # type: ignore[arg-type]

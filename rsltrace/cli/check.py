@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
-from rsltrace.cli.output.text import table
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import EXIT_USAGE, NodeError, RunError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.terminal import say, tell
+from rsltrace.words.table import table
 
 if TYPE_CHECKING:
     from rsltrace.job import Job

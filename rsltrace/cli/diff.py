@@ -35,7 +35,7 @@ else:
     _Type = click.ParamType  # older versions of click know no types here
 
 
-class _Tolerance(_Type):
+class Tolerance(_Type):
     """``FIELD=TOL``: a glob of fields and a number."""
 
     name = "tolerance"
@@ -89,7 +89,7 @@ class _Tolerance(_Type):
     "--abs",
     "absolute",
     multiple=True,
-    type=_Tolerance(),
+    type=Tolerance(),
     metavar="FIELD=TOL",
     help="Tolerate |a-b| <= TOL in such fields (times: in seconds).",
 )
@@ -97,7 +97,7 @@ class _Tolerance(_Type):
     "--rel",
     "relative",
     multiple=True,
-    type=_Tolerance(),
+    type=Tolerance(),
     metavar="FIELD=TOL",
     help="Tolerate |a-b| <= TOL * max(|a|, |b|) in such fields.",
 )

@@ -9,7 +9,6 @@ from typing import Any, TypeAlias
 
 import click
 
-from rsltrace.cli.output.text import table
 from rsltrace.model.built_in import is_built_in
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
@@ -21,6 +20,7 @@ from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
 from rsltrace.words.kinds import kind_label
+from rsltrace.words.table import table
 
 _Kinds: TypeAlias = type[EventKind] | type[OutputKind]
 _VALUE_MAX = 100

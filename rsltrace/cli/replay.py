@@ -11,10 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.diff import print_diffs
+from rsltrace.cli.diff import Tolerance, print_diffs
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.cli.record import interruptible, progress
-from rsltrace.cli.replay_node import check_options, replay_one, tell_of_run
+from rsltrace.cli.replay_node import (
+    NodeWays,
+    replay_from_job,
+    replay_one,
+    tell_of_run,
+)
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.guard.pin import unpin
@@ -63,6 +68,13 @@ _SHOWN_MAX = 12
 @click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
 @click.option("--node", metavar="NAME", help="Run this node alone, fed with what it got.")
 @click.option(
+    "--bag",
+    "bags",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="With --node: feed it from this rosbag2 recording; TRACE may be a job, then.",
+)
+@click.option(
     "--until-diverged", is_flag=True, help="With --node: end at the first output that differs."
 )
 @click.option("--all", "everything", is_flag=True, help="With --node: show all that differs.")
@@ -71,6 +83,14 @@ _SHOWN_MAX = 12
     multiple=True,
     metavar="FIELD",
     help="With --node: do not compare such fields (header.stamp, /odom:twist).",
+)
+@click.option(
+    "--abs",
+    "absolute",
+    multiple=True,
+    type=Tolerance(),
+    metavar="FIELD=TOL",
+    help="With --node: tolerate |a-b| <= TOL in such fields (times: in seconds).",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print the result as one JSON object.")
 @click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
@@ -85,9 +105,11 @@ def replay(
     job_folder: Path | None,
     trust: bool,
     node: str | None,
+    bags: tuple[Path, ...],
     until_diverged: bool,
     everything: bool,
     ignore: tuple[str, ...],
+    absolute: tuple[tuple[str, float], ...],
     as_json: bool,
     no_pin: bool,
     quiet: bool,
@@ -104,7 +126,8 @@ def replay(
 
     With --node, only that node runs. It gets the messages, requests and responses of the recording
     at their recorded times and in their recorded order, and its outputs are compared: all of them
-    are the same as long as its code is, and after a change of its code one sees what changes.
+    are the same as long as its code is, and after a change of its code one sees what changes. With
+    --bag it gets what a recording of the robot has on the topics that it subscribes to.
 
     With --edit, what comes before the first edit is verified; the run then goes on as a branch of
     its own (-o), whose trace holds the edits, and is compared with TRACE.
@@ -114,11 +137,25 @@ def replay(
     interrupted.
     """
     from rsltrace.replay.edits import check_edits, parse_edit
+    from rsltrace.replay.one_node.ways import is_job
     from rsltrace.replay.preparation import count_to, prepared
 
-    check_options(node, until, first, edits, (until_diverged, everything, bool(ignore)))
+    ways = NodeWays(
+        node=node or "",
+        bags=bags,
+        until_diverged=until_diverged,
+        everything=everything,
+        options=DiffOptions(ignore=ignore, absolute=absolute) if ignore or absolute else None,
+        output=output,
+        force=force,
+        quiet=quiet,
+        as_json=as_json,
+    )
+    ways.check(until, first, edits)
     changes = [parse_edit(text) for text in edits]
-    with prepared(trace, job_folder) as plan:
+    if bags and is_job(trace):
+        return replay_from_job(trace, ways, no_pin=no_pin)
+    with prepared(trace, job_folder, bags=node is None) as plan:
         if no_pin or not plan.job.guard.pins:
             unpin()
         count = None if until is None else count_to(plan.trace, until)
@@ -129,17 +166,7 @@ def replay(
                 tell(line)
         agree(plan, trust=trust)
         if node is not None:
-            return replay_one(
-                plan,
-                node,
-                until_diverged=until_diverged,
-                options=DiffOptions(ignore=ignore) if ignore else None,
-                output=output,
-                force=force,
-                quiet=quiet,
-                as_json=as_json,
-                everything=everything,
-            )
+            return replay_one(plan, ways)
         result = _replayed(
             plan, count, max(begin, 0), changes, output, force=force, quiet=quiet or as_json
         )
@@ -236,7 +263,7 @@ def code_lines(plan: Preparation, doing: str, node: str | None = None) -> Iterat
         yield printable(f"  and {len(code) - _SHOWN_MAX} more{more}")
     if plan.edits:
         yield printable(f"with the edits {'; '.join(edit.text for edit in plan.edits)}")
-    if plan.job.bags and node is None:
+    if plan.job.bags:
         yield printable(f"and the bags {', '.join(bag.path for bag in plan.job.bags)}")
     if plan.changes:
         changes = (f"{c.name} {c.recorded or '-'} -> {c.present or '-'}" for c in plan.changes)

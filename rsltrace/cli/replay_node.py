@@ -1,7 +1,9 @@
-"""``rsltrace replay --node``: one node of a trace alone."""
+"""``rsltrace replay --node``: one node alone, fed from a trace or from a bag."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,68 +13,119 @@ from rsltrace.cli.output.exit_status import reopen_standard_streams, status_with
 from rsltrace.cli.record import interruptible, progress
 from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import NodeError
+from rsltrace.guard.pin import unpin
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.errors import RunError
+    from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.preparation import Preparation
-
-
-def check_options(
-    node: str | None,
-    until: str | None,
-    first: str | None,
-    edits: tuple[str, ...],
-    of_node: tuple[bool, ...],
-) -> None:
-    """Refuse options that have nothing to do.
-
-    :raises click.UsageError: naming them.
-    """
-    if node is None and any(of_node):
-        raise click.UsageError("--until-diverged, --all and --ignore go with --node")
-    if node is not None and (until is not None or first is not None):
-        raise click.UsageError("--from and --until go without --node; it has --until-diverged")
-    if node is not None and edits:
-        raise click.UsageError("--edit goes without --node: the other nodes are to see the change")
-
-
-def replay_one(
-    plan: Preparation,
-    node: str,
-    *,
-    until_diverged: bool,
-    options: DiffOptions | None,
-    output: Path | None,
-    force: bool,
-    quiet: bool,
-    as_json: bool,
-    everything: bool,
-) -> int:
-    """Replay one node, and print what it did."""
-    from rsltrace.cli.output import node_replay
-    from rsltrace.replay.one_node.replaying import replay_node
     from rsltrace.run import Observer
 
-    silent = quiet or as_json
-    with interruptible() as on_interrupt, progress(quiet=silent, what="replaying") as show:
-        result = replay_node(
+
+@dataclass(frozen=True, slots=True)
+class NodeWays:
+    """What the command line says of replaying a node; ``node`` is empty for the whole job."""
+
+    node: str
+    bags: tuple[Path, ...]
+    until_diverged: bool
+    everything: bool
+    options: DiffOptions | None
+    output: Path | None
+    force: bool
+    quiet: bool
+    as_json: bool
+
+    def check(self, until: str | None, first: str | None, edits: tuple[str, ...]) -> None:
+        """Refuse options that have nothing to do.
+
+        :raises click.UsageError: naming them.
+        """
+        of_node = (self.bags, self.until_diverged, self.everything, self.options)
+        if not self.node and any(of_node):
+            raise click.UsageError(
+                "--bag, --until-diverged, --all, --ignore and --abs go with --node"
+            )
+        if self.node and (until is not None or first is not None):
+            raise click.UsageError("--from and --until go without --node; it has --until-diverged")
+        if self.node and edits:
+            raise click.UsageError(
+                "--edit goes without --node: the other nodes are to see the change"
+            )
+        if self.bags and self.until_diverged:
+            raise click.UsageError("--until-diverged goes without --bag")
+
+
+def replay_one(plan: Preparation, ways: NodeWays) -> int:
+    """Replay one node of a trace, and print what it did."""
+    from rsltrace.replay.one_node.from_bag import replay_from_bag
+    from rsltrace.replay.one_node.replaying import replay_node
+
+    def go(echo: bool, observer: Observer) -> NodeReplayResult:
+        if ways.bags:
+            return replay_from_bag(
+                plan.job,
+                ways.node,
+                ways.bags,
+                options=ways.options,
+                output=ways.output,
+                force=ways.force,
+                echo=echo,
+                observer=observer,
+            )
+        return replay_node(
             plan,
-            node,
-            until_diverged=until_diverged,
-            options=options,
-            output=output,
-            force=force,
-            echo=not silent,
-            observer=Observer(progress=show, interrupt=on_interrupt),
+            ways.node,
+            until_diverged=ways.until_diverged,
+            options=ways.options,
+            output=ways.output,
+            force=ways.force,
+            echo=echo,
+            observer=observer,
         )
+
+    return _shown(go, ways)
+
+
+def replay_from_job(path: Path, ways: NodeWays, *, no_pin: bool) -> int:
+    """Run one node of a job file with what bags have for it, and print what it did."""
+    from rsltrace.replay.one_node.from_bag import replay_from_bag
+    from rsltrace.replay.one_node.ways import load_without_bags
+
+    job = load_without_bags(path)
+    if no_pin or not job.guard.pins:
+        unpin()
+
+    def go(echo: bool, observer: Observer) -> NodeReplayResult:
+        return replay_from_bag(
+            job,
+            ways.node,
+            ways.bags,
+            options=ways.options,
+            output=ways.output,
+            force=ways.force,
+            echo=echo,
+            observer=observer,
+        )
+
+    return _shown(go, ways)
+
+
+def _shown(go: Callable[[bool, Observer], NodeReplayResult], ways: NodeWays) -> int:
+    from rsltrace.replay.one_node import report
+    from rsltrace.run import Observer
+
+    silent = ways.quiet or ways.as_json
+    with interruptible() as on_interrupt, progress(quiet=silent, what="replaying") as show:
+        result = go(not silent, Observer(progress=show, interrupt=on_interrupt))
     reopen_standard_streams()
     try:
-        if as_json:
-            say(node_replay.as_json(result))
+        if ways.as_json:
+            say(report.as_json(result))
             return result.exit_code
         tell_of_run(result.error, result.diverged, result.notes, result.path)
-        for line in node_replay.as_text(result, everything=everything):
+        for line in report.as_text(result, everything=ways.everything):
             say(line)
     except OSError as error:
         return status_without_output(error, result.exit_code)

@@ -42,6 +42,7 @@ def replay_trace(
     trace: str | Path,
     *,
     node: str,
+    bag: str | Path | Sequence[str | Path] | None = None,
     until_diverged: bool = False,
     options: DiffOptions | None = None,
     output: str | Path | None = None,
@@ -57,6 +58,7 @@ def replay_trace(
     trace: str | Path,
     *,
     node: str | None = None,
+    bag: str | Path | Sequence[str | Path] | None = None,
     until: int | str | None = None,
     until_diverged: bool = False,
     options: DiffOptions | None = None,
@@ -78,7 +80,10 @@ def replay_trace(
 
     With ``node``, that node runs alone, fed with what the recording says it got, and its outputs
     are compared, within what ``options`` leave out or tolerate; ``until_diverged`` ends the run at
-    the first that differs. Then ``until`` has no meaning, and the result is another one.
+    the first that differs. Then ``until`` has no meaning, and the result is another one. With
+    ``bag`` (one rosbag2 recording or several), the node gets what is in there on the topics that it
+    subscribes to; ``trace`` may be a job file, then, and what the recording has on topics that the
+    node publishes is compared.
 
     This runs the code that the trace names. Unless the job file in the present folder (or in
     ``job_folder``) says the same, that takes ``trust=True``.
@@ -101,25 +106,32 @@ def replay_trace(
     from rsltrace.replay.preparation import count_to, prepared
     from rsltrace.replay.replaying import replay_prepared
 
+    place = None if output is None else Path(output)
+    if node is not None:
+        if edits:
+            raise ReplayError("edits are for all nodes of a trace: give edits or a node")
+        from rsltrace.replay.one_node.ways import replay_one
+
+        bags = [bag] if isinstance(bag, (str, Path)) else bag or ()
+        return replay_one(
+            Path(trace),
+            node,
+            bags=[Path(one) for one in bags],
+            until_diverged=until_diverged,
+            options=options,
+            output=place,
+            force=force,
+            job=job,
+            job_folder=None if job_folder is None else Path(job_folder),
+            trust=trust,
+            echo=echo,
+        )
+    if bag is not None:
+        raise ReplayError("a bag is for one node: say which (node=…)")
     folder = None if job_folder is None else Path(job_folder)
     with prepared(trace, folder, job) as plan:
         if plan.distrust and not trust:
             raise ReplayError(f"{trace} would run code, and {plan.distrust}: give trust=True")
-        place = None if output is None else Path(output)
-        if node is not None:
-            if edits:
-                raise ReplayError("edits are for all nodes of a trace: give edits or a node")
-            from rsltrace.replay.one_node.replaying import replay_node
-
-            return replay_node(
-                plan,
-                node,
-                until_diverged=until_diverged,
-                options=options,
-                output=place,
-                force=force,
-                echo=echo,
-            )
         return replay_prepared(
             plan,
             until=None if until is None else count_to(plan.trace, until),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,32 @@ _NAME_MAX = 255
 """Bytes that the name of a file can have."""
 
 
-def job_in_trace(trace: Trace, folder: Path) -> Job:
+def without_bags(load: Callable[[tuple[str, ...]], Job]) -> Job:
+    """Return a job without its bags, which need not be there. ``load`` gets overrides.
+
+    :raises JobError: if it cannot be used otherwise.
+    """
+    try:
+        return load(("bags=[]",))
+    except JobError as error:
+        try:
+            return load(("bags=[]", "progress=null"))  # who has no bags has no progress
+        except JobError:
+            raise error from None
+
+
+def job_in_trace(trace: Trace, folder: Path, *, bags: bool = True) -> Job:
     """Return the job that a trace holds, as if its file were in ``folder``. Nothing is run.
+
+    Without ``bags`` it is that job without them, and they need not be there.
 
     :raises ReplayError: if the trace holds none, or one of another version.
     """
     try:
         resolved = _resolved(trace)
         _let_follow(trace, resolved, folder)
+        if not bags:
+            resolved.update(bags=[], progress=None)
         return job_from_resolved(
             resolved, name=job_name(trace), text=trace.job_text, folder=folder.absolute()
         )

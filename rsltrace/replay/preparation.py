@@ -51,9 +51,15 @@ class Preparation:
 
 @contextmanager
 def prepared(
-    path: str | Path, job_folder: Path | None = None, job: Job | None = None
+    path: str | Path,
+    job_folder: Path | None = None,
+    job: Job | None = None,
+    *,
+    bags: bool = True,
 ) -> Iterator[Preparation]:
     """Open a trace and see what replaying it takes. Runs nothing, imports nothing.
+
+    Without ``bags``, those of the job need not be there: they are not going to play.
 
     ``job`` stands in for the trace's own, which then has to be trusted by whoever gives it.
 
@@ -66,8 +72,9 @@ def prepared(
             raise ReplayError(f"{path} has no events to replay")
         if job is None:
             folder = folder_of(trace, job_folder)
-            job = job_in_trace(trace, folder)
-            distrust = why_not_trusted(trace, job, folder, named=job_folder is not None)
+            job = job_in_trace(trace, folder, bags=bags)
+            named = job_folder is not None
+            distrust = why_not_trusted(trace, job, folder, named=named, bags=bags)
         else:
             folder, distrust = job.base_dir, ""
         yield Preparation(

@@ -2,9 +2,9 @@
 
 ``record`` runs what a job file says that somebody chose to run. A replay runs what a *trace* says,
 and a trace looks like data. So it runs without being asked only where it does no more than
-``record`` of the job file in the present folder would do: the same nodes with the same parameters,
-arguments, launch files, hooks and bags. What only says when, in which order and for how long they
-run may differ.
+``record`` of the job file in the present folder would do: the same nodes (or some of them) with the
+same parameters, arguments, launch files, hooks and bags. What only says when, in which order and
+for how long they run may differ.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rsltrace.job import Job, job_from_text, load_job
 from rsltrace.launch import expand, ros_launch
 from rsltrace.model.finding import Mode
 from rsltrace.replay.edits import edits_of
-from rsltrace.replay.job_folder import job_name
+from rsltrace.replay.job_folder import job_name, without_bags
 from rsltrace.run.plans.executables import why_not
 from rsltrace.trace.reader import Trace
 
@@ -41,10 +41,11 @@ _MAY_DIFFER = frozenset(
 """Keys of a job that say when, in which order and for how long its nodes run, and what is kept."""
 
 
-def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str:
+def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool, bags: bool = True) -> str:
     """Return why a trace runs only if somebody says so, empty if it may.
 
     ``named``: the job's folder has been named by whoever runs it. Nothing is run to find out.
+    ``bags``: those of the job will play.
     """
     name = job_name(trace)
     if not named and folder.resolve() != Path.cwd():
@@ -52,7 +53,7 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str
     if not name:
         return "its job was made in Python, so there is no job file here that says the same"
     try:
-        own = _own_job(folder / name)
+        own = _own_job(folder / name, bags=bags)
     except (JobError, OSError, RecursionError):
         own = None
     if own is None:
@@ -67,13 +68,13 @@ def why_not_trusted(trace: Trace, job: Job, folder: Path, *, named: bool) -> str
     return ""
 
 
-def _own_job(file: Path) -> Job | None:
+def _own_job(file: Path, *, bags: bool) -> Job | None:
     """Return the job of a job file or launch file, None if that takes running a program."""
     if file.name.endswith(_LAUNCH):
         spec = json.dumps({"file": file.name, "arguments": {}})
         job = job_from_text("{}", str(file), file.parent, overrides=[f"launch.+={spec}"])
     elif file.suffix in (".yaml", ".yml", ".json"):
-        job = load_job(file)
+        job = load_job(file) if bags else without_bags(lambda to: load_job(file, overrides=to))
     else:
         return None
     for launch in job.launch:
@@ -85,7 +86,8 @@ def _own_job(file: Path) -> Job | None:
 
 def _differing(own: Job, job: Job) -> list[str]:
     a, b = _values(own), _values(job)
-    return [key for key in a if a[key] != b[key]]
+    fewer = all(node in a["nodes"] for node in b["nodes"])  # of the nodes that are named here
+    return [key for key in a if a[key] != b[key] and not (key == "nodes" and fewer)]
 
 
 def _values(job: Job) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import edits_of
 
 if TYPE_CHECKING:
-    from rsltrace.run.session import Session
+    from rsltrace.run.session import RunResult, Session
     from rsltrace.trace.reader import Trace
 
 DIVERGED = Stop("the replay stopped at the first event that differs", 1)
@@ -124,6 +124,11 @@ class Verification:
     def _hashes(self) -> Iterator[int]:
         for rows in self._trace.events():
             yield from rows["chain_hash"].tolist()
+
+
+def interruption(run: RunResult) -> int:
+    """Return the exit status of a run that somebody has interrupted, else 0."""
+    return run.exit_code if _INTERRUPTIONS.get(run.exit_code) == run.stop_reason else 0
 
 
 def limit_of(trace: Trace, until: int | None) -> tuple[int, Stop | None]:

@@ -5,10 +5,20 @@
 ...     result = run_job("robot/job.yaml", tmp_path)
 ...     assert_matches_golden(result, "tests/golden/robot.mcap")
 
+``assert_node_unchanged("drive.mcap", "/ekf")`` runs one node alone, fed from a recording.
+
 With pytest, the fixture ``rsltrace_golden`` does both, and ``pytest --rsltrace-update`` rewrites
-golden traces after an intended change. Importing this package loads neither rclpy nor numpy.
+golden traces after an intended change; ``rsltrace_node`` is the fixture for one node. Importing
+this package loads neither rclpy nor numpy.
 """
 
 from rsltrace.testing.golden import GoldenMismatch, assert_matches_golden, run_job
+from rsltrace.testing.nodes import NodeChanged, assert_node_unchanged
 
-__all__ = ["GoldenMismatch", "assert_matches_golden", "run_job"]
+__all__ = [
+    "GoldenMismatch",
+    "NodeChanged",
+    "assert_matches_golden",
+    "assert_node_unchanged",
+    "run_job",
+]

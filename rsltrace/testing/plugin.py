@@ -1,4 +1,4 @@
-"""The pytest plugin: the fixture ``rsltrace_golden`` and the option ``--rsltrace-update``.
+"""The pytest plugin: fixtures ``rsltrace_golden`` and ``rsltrace_node``, ``--rsltrace-update``.
 
 Loaded in every pytest run of every environment with rsltrace in it, so it imports nothing heavy.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from rsltrace.testing.golden import Session
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
     from rsltrace.job import Job
+    from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.run import RunResult
 
 _PROPERTY = "rsltrace_golden_written"
@@ -119,6 +120,33 @@ class Golden:
 def rsltrace_golden(request: pytest.FixtureRequest, tmp_path: Path) -> Golden:
     """Compare runs with golden traces: ``rsltrace_golden("job.yaml")``; see ``Golden``."""
     return Golden(request, tmp_path)
+
+
+@pytest.fixture
+def rsltrace_node(request: pytest.FixtureRequest) -> Callable[..., NodeReplayResult]:
+    """Run one node alone, fed from a recording: ``rsltrace_node("drive.mcap", "/ekf")``.
+
+    Paths are relative to the test's file; the rest is as for ``assert_node_unchanged``.
+    """
+    folder = Path(request.path).parent
+
+    def check(trace: str | Path, node: str, **options: Any) -> NodeReplayResult:
+        __tracebackhide__ = True
+        from rsltrace.errors import RsltraceError, RunError
+        from rsltrace.testing.nodes import NodeChanged, assert_node_unchanged
+
+        for name in ("job_folder", "bag"):
+            if isinstance(options.get(name), (str, Path)):
+                options[name] = folder / options[name]
+        try:
+            return assert_node_unchanged(folder / trace, node, **options)
+        except RunError:
+            raise  # the traceback is that of the node
+        except (RsltraceError, NodeChanged) as error:
+            message = str(error)
+        pytest.fail(message, pytrace=False)
+
+    return check
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

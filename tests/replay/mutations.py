@@ -26,8 +26,9 @@ _COMPARISONS: dict[type[ast.cmpop], str] = {
 
 @dataclass(frozen=True)
 class Mutation:
-    """A source with one expression exchanged; ``what`` says which, for a test's message."""
+    """A source with one expression exchanged in ``line``; ``what`` says it for a message."""
 
+    line: int
     what: str
     source: str
 
@@ -71,4 +72,4 @@ def _mutation(lines: list[str], node: ast.AST, new: str) -> Mutation:
     tail = lines[last].encode()[node.end_col_offset :].decode()
     old = ast.unparse(node)
     changed = [*lines[:first], f"{head}{new}{tail}", *lines[last + 1 :]]
-    return Mutation(f"line {node.lineno}: {old} -> {new}", "".join(changed))
+    return Mutation(node.lineno, f"line {node.lineno}: {old} -> {new}", "".join(changed))

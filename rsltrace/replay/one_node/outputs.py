@@ -14,7 +14,7 @@ from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import WHOLE, diff_messages, preview
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import Output, OutputKind
+from rsltrace.model.event import NO_EVENT, Output, OutputKind
 from rsltrace.replay.one_node.result import Change, OutputChange
 from rsltrace.trace.format import TOPIC_ROSOUT
 from rsltrace.trace.reader import Trace
@@ -33,12 +33,36 @@ Key = tuple[OutputKind, str]
 
 @dataclass(frozen=True, slots=True)
 class Put:
-    """An output of a node: when, where to, its place among all outputs of the node."""
+    """An output of a node: when, where to, its place among all outputs of the node.
+
+    Outputs of two sides that are ``at`` the same stand for each other, those of one side in order.
+    """
 
     stamp_ns: int
     key: Key
     place: int
     output: Output
+    at: int
+
+
+class Side:
+    """The outputs of a node in a trace."""
+
+    def __init__(self, trace: Trace, puts: Sequence[Put]) -> None:
+        self.trace, self.puts = trace, puts
+
+    def decoded(self, put: Put) -> object | None:
+        """Return what was put out, None if it was not kept or cannot be decoded."""
+        trace, output = self.trace, put.output
+        if output.kind is OutputKind.EXCEPTION:
+            return trace.detail(output)
+        channel, payload = trace.channel_of(output), trace.payload(output)
+        if channel is None or payload is None:
+            return None
+        try:
+            return trace.decode(channel, payload[2])
+        except TraceError:
+            return None
 
 
 def outputs_of_node(trace: Trace, node: str) -> list[Put]:
@@ -63,31 +87,28 @@ def outputs_of_node(trace: Trace, node: str) -> list[Put]:
                 kind = OutputKind(kind)
                 name = TOPIC_ROSOUT if kind is OutputKind.LOG else own[entity]
                 output = Output(event, entity, kind, digest, sequence)
-                found.append(Put(int(stamps[event - first]), (kind, name), len(found), output))
+                stamp_ns = int(stamps[event - first])
+                found.append(Put(stamp_ns, (kind, name), len(found), output, stamp_ns))
     return found
 
 
-def changes(
-    recorded: tuple[Trace, Sequence[Put]],
-    present: tuple[Trace, Sequence[Put]],
-    options: DiffOptions,
-) -> Iterator[OutputChange]:
+def changes(recorded: Side, present: Side, options: DiffOptions) -> Iterator[OutputChange]:
     """Yield what has changed, in the order of its time."""
-    for before, after in _pairs(recorded[1], present[1]):
+    for before, after in _pairs(recorded.puts, present.puts):
         if before is not None and after is not None:
             if before.output.hash == after.output.hash:
                 continue
-            fields = _fields(recorded[0], before, present[0], after, options)
+            fields = _fields(recorded, before, present, after, options)
             if not fields:
                 continue  # what differs is ignored, or tolerated
             yield _change(Change.CHANGED, before, before, after, fields)
         elif before is not None:
-            text = _preview(recorded[0], before)
-            yield _change(Change.MISSING, before, before, None, (FieldDifference(WHOLE, text, ""),))
+            whole = FieldDifference(WHOLE, _preview(recorded, before), "")
+            yield _change(Change.MISSING, before, before, None, (whole,))
         else:
             assert after is not None
-            text = _preview(present[0], after)
-            yield _change(Change.NEW, after, None, after, (FieldDifference(WHOLE, "", text),))
+            whole = FieldDifference(WHOLE, "", _preview(present, after))
+            yield _change(Change.NEW, after, None, after, (whole,))
 
 
 def _change(
@@ -102,22 +123,26 @@ def _change(
         time_ns=at.stamp_ns,
         kind=at.key[0].label,
         name=at.key[1],
-        recorded_event=None if before is None else before.output.event,
-        event=None if after is None else after.output.event,
+        recorded_event=_event(before),
+        event=_event(after),
         fields=fields,
     )
+
+
+def _event(put: Put | None) -> int | None:
+    return None if put is None or put.output.event == NO_EVENT else put.output.event
 
 
 def _pairs(recorded: Sequence[Put], present: Sequence[Put]) -> list[tuple[Put | None, Put | None]]:
     """Return outputs that stand for each other, in order."""
     waiting: dict[tuple[Key, int], list[Put]] = {}
     for put in present:
-        waiting.setdefault((put.key, put.stamp_ns), []).append(put)
+        waiting.setdefault((put.key, put.at), []).append(put)
     for same in waiting.values():
         same.reverse()
     found: list[tuple[Put | None, Put | None]] = []
     for put in recorded:
-        others = waiting.get((put.key, put.stamp_ns))
+        others = waiting.get((put.key, put.at))
         found.append((put, others.pop() if others else None))
     found += [(None, put) for others in waiting.values() for put in others]
     return sorted(found, key=_place)
@@ -130,28 +155,15 @@ def _place(pair: tuple[Put | None, Put | None]) -> tuple[int, int]:
 
 
 def _fields(
-    trace: Trace, before: Put, other: Trace, after: Put, options: DiffOptions
+    recorded: Side, before: Put, present: Side, after: Put, options: DiffOptions
 ) -> tuple[FieldDifference, ...]:
-    a, b = _decoded(trace, before), _decoded(other, after)
+    a, b = recorded.decoded(before), present.decoded(after)
     if a is None or b is None:
-        return (FieldDifference(WHOLE, _preview(trace, before), _preview(other, after)),)
+        return (FieldDifference(WHOLE, _preview(recorded, before), _preview(present, after)),)
     found, _ = diff_messages(a, b, options.for_topic(before.key[1]), limit=_FIELDS_MAX)
     return tuple(one for one in found if not one.within_tolerance)
 
 
-def _decoded(trace: Trace, put: Put) -> object | None:
-    if put.key[0] is OutputKind.EXCEPTION:
-        return trace.detail(put.output)
-    channel = trace.channel_of(put.output)
-    payload = trace.payload(put.output)
-    if channel is None or payload is None:
-        return None
-    try:
-        return trace.decode(channel, payload[2])
-    except TraceError:
-        return None
-
-
-def _preview(trace: Trace, put: Put) -> str:
-    message = _decoded(trace, put)
+def _preview(side: Side, put: Put) -> str:
+    message = side.decoded(put)
     return _NOT_KEPT if message is None else preview(message, 60)

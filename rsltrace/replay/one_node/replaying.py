@@ -9,7 +9,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.loop.stop import Stop
 from rsltrace.replay.one_node.columns import Columns
-from rsltrace.replay.one_node.outputs import changes, outputs_of_node
+from rsltrace.replay.one_node.outputs import Side, changes, outputs_of_node
 from rsltrace.replay.one_node.result import NodeReplayResult
 from rsltrace.replay.one_node.script import check_payloads
 from rsltrace.replay.one_node.session import FedSession, run_fed
@@ -17,6 +17,7 @@ from rsltrace.replay.one_node.unit import Unit
 from rsltrace.replay.one_node.watch import Watch
 from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
+from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
 from rsltrace.run.process import kept_process
 from rsltrace.trace.format import METADATA_FED
@@ -59,7 +60,12 @@ def replay_node(
             compared = recorded
             if run.stop_reason == CHANGED.reason:
                 compared = [put for put in recorded if put.stamp_ns <= run.end_ns]
-            found = tuple(changes((trace, compared), (present, puts), options or DiffOptions()))
+            elif interruption(run):
+                compared = [put for put in recorded if put.stamp_ns < run.end_ns]
+                puts = [put for put in puts if put.stamp_ns < run.end_ns]
+            found = tuple(
+                changes(Side(trace, compared), Side(present, puts), options or DiffOptions())
+            )
     return NodeReplayResult(
         trace=trace.name,
         node=unit.node.name,
@@ -70,6 +76,7 @@ def replay_node(
         ended=run.stop_reason,
         path=None if output is None else place,
         error=run.error,
+        interrupted=interruption(run),
         notes=tuple(dict.fromkeys([*plan.notes, *_notes(unit, columns, run, bool(found))])),
     )
 

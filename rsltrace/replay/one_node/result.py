@@ -92,6 +92,8 @@ class NodeReplayResult:
         inputs = "1 input" if self.inputs == 1 else f"{self.inputs} inputs"
         fed = f"fed with {inputs} to {format_seconds(self.end_ns)} s"
         first = self.first
+        if first is None and not self.compared:
+            return f"{self.node} ran, and there is nothing to compare it with ({fed})"
         if first is None:
             return f"{self.node} does the same: {self.compared} outputs ({fed})"
         when = format_seconds(first.time_ns)

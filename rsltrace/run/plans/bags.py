@@ -112,7 +112,7 @@ def _with_headers(spec: BagSpec, bag: Bag) -> frozenset[int]:
     return frozenset(
         index
         for index, topic in enumerate(bag.topics)
-        if _begins_with_header(check_type(spec.path, topic))
+        if begins_with_header(check_type(spec.path, topic))
     )
 
 
@@ -203,7 +203,7 @@ def check_type(bag: str, topic: BagTopic) -> type:
         ) from error
 
 
-def _begins_with_header(message_class: Any) -> bool:
+def begins_with_header(message_class: Any) -> bool:
     """Return whether the first field of a message is a ``std_msgs/Header``."""
     fields = message_class.get_fields_and_field_types()
     return next(iter(fields.values()), "") == "std_msgs/Header"

@@ -1,0 +1,201 @@
+"""One node fed from a recording of the real robot: the topics that it subscribes to play to it.
+
+The run is one of a job with one entry and the bag, so its trace is an ordinary one. What the node
+puts out is compared with what the robot recorded on the same topics. A robot takes time for what
+takes none here, so messages are matched by the stamp in their header; those without one by their
+order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from rsltrace.bag import open_bag
+from rsltrace.bag.playback import header_stamp_ns
+from rsltrace.diff.options import DiffOptions
+from rsltrace.errors import ReplayError
+from rsltrace.job import BagSpec, Job, StopSpec
+from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.replay.one_node.outputs import Key, Put, Side, changes, outputs_of_node
+from rsltrace.replay.one_node.probe import Ends, ends_of
+from rsltrace.replay.one_node.result import NodeReplayResult
+from rsltrace.replay.replaying import place_for
+from rsltrace.replay.verification import interruption
+from rsltrace.run import Observer
+from rsltrace.run.plans.bags import begins_with_header, check_type, never_plays
+from rsltrace.run.recording import run
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.reader import Trace
+
+_OF_ALL_NODES = ("/rosout", "/parameter_events")
+_NOT_OF_ROBOTS: dict[str, object] = {
+    **dict.fromkeys(("delay", "policy", "executors", "execution")),
+    **dict.fromkeys(("start_ns", "construct_time_ns", "progress")),
+    "bags": (),
+    "stop": StopSpec(),
+}
+"""What a job says of a simulated robot; a recording of a real one has the effects of all that."""
+
+
+class BagSide(Side):
+    """What a bag has on the topics of a node, decoded by what a trace says of their types."""
+
+    def __init__(self, trace: Trace) -> None:
+        super().__init__(trace, [])
+        self.puts: list[Put] = []
+        self.data: list[bytes] = []
+
+    def decoded(self, put: Put) -> object | None:
+        channel = put.key[1]
+        if not any(one.topic == channel for one in self.trace.channels.values()):
+            return None
+        return self.trace.decode(channel, self.data[put.place])
+
+
+def replay_from_bag(
+    job: Job,
+    node: str,
+    bags: Sequence[Path],
+    *,
+    options: DiffOptions | None = None,
+    output: Path | None = None,
+    force: bool = False,
+    echo: bool = False,
+    observer: Observer | None = None,
+) -> NodeReplayResult:
+    """Run one node of a job with what bags have of its topics; compare what it puts out.
+
+    :raises ReplayError: the job makes no such node, or the bags have nothing for it.
+    :raises JobError, SetupError, BagError, OutputError: the run cannot start or be written.
+    :raises RunError: what went wrong in the node.
+    """
+    alone = job.model_copy(update=_NOT_OF_ROBOTS)
+    ends = ends_of(alone, node)
+    specs = tuple(_specs(bags, ends))
+    nodes = (job.nodes[ends.entry],)
+    with place_for(output) as path:
+        done = run(
+            alone.model_copy(update={"nodes": nodes, "bags": specs}),
+            path,
+            force=force,
+            echo=echo,
+            observer=observer,
+        )
+        if done.error is not None:
+            raise done.error
+        place = done.path or path
+        with Trace.open(place) as trace:
+            here, there = _sides(trace, ends, bags)
+            if interruption(done):
+                there.puts = [put for put in there.puts if put.stamp_ns < done.end_ns]
+            found = tuple(changes(there, here, options or DiffOptions()))
+            inputs = sum(int((r["kind"] == EventKind.BAG).sum()) for r in trace.events())
+    return NodeReplayResult(
+        trace=", ".join(map(str, bags)),
+        node=ends.node,
+        inputs=inputs,
+        compared=len(there.puts),
+        changes=found,
+        end_ns=done.end_ns,
+        ended=done.stop_reason,
+        path=None if output is None else place,
+        interrupted=interruption(done),
+        notes=tuple(dict.fromkeys([*done.notes, *_notes(ends, there)])),
+    )
+
+
+def _specs(bags: Sequence[Path], ends: Ends) -> Iterator[BagSpec]:
+    """Yield the bags with the topics of which the node hears.
+
+    :raises ReplayError: there are none, or of another type.
+    """
+    names: list[str] = []
+    met = False
+    for path in bags:
+        with open_bag(path, recover=True, skip=never_plays) as bag:
+            topics = {topic.name: topic.type_name for topic in bag.topics}
+        names += topics
+        wanted = [name for name in topics if name in ends.subscribed]
+        for name in wanted:
+            if topics[name] != ends.subscribed[name]:
+                raise ReplayError(
+                    f"{path}: {name} is {topics[name]}, and {ends.node} wants it as "
+                    f"{ends.subscribed[name]}"
+                )
+        if wanted:
+            met = True
+            yield BagSpec(path=str(path.absolute()), topics=wanted)
+    if not met:
+        raise ReplayError(
+            f"{', '.join(map(str, bags))}: nothing of what {ends.node} subscribes to "
+            f"({', '.join(ends.subscribed) or 'nothing'}) is in there, only "
+            f"{', '.join(dict.fromkeys(names))}; remappings in the job give topics other names"
+        )
+
+
+def _compared(ends: Ends) -> list[str]:
+    """Return the topics that only the node itself can have filled, as far as one can tell."""
+    return [t for t in ends.published if t not in (*_OF_ALL_NODES, *ends.subscribed)]
+
+
+def _sides(trace: Trace, ends: Ends, bags: Sequence[Path]) -> tuple[Side, BagSide]:
+    """Return what the node has put out, and what was recorded on these topics."""
+    recorded = BagSide(trace)
+    headers: dict[str, bool] = {}
+    for path in bags:
+        with open_bag(path, recover=True, skip=never_plays) as bag:
+            found = {topic.name for topic in bag.topics}
+        wanted = [topic for topic in _compared(ends) if topic in found]
+        if wanted:
+            _read(path, wanted, recorded, headers)
+    counts: dict[Key, int] = {}
+    puts = []
+    for put in outputs_of_node(trace, ends.node):
+        if put.key[0] is OutputKind.MESSAGE and put.key[1] in headers:
+            payload = trace.payload(put.output)
+            data = b"" if payload is None else payload[2]
+            at = _at(put.key, data, headers, counts)
+            puts.append(Put(put.stamp_ns, put.key, put.place, put.output, at))
+    return Side(trace, puts), recorded
+
+
+def _read(path: Path, topics: list[str], side: BagSide, headers: dict[str, bool]) -> None:
+    from rsltrace.doors.rclpy.wire.codec import codec_for
+
+    counts: dict[Key, int] = {}
+    with open_bag(path, topics=topics, recover=True, skip=never_plays) as bag:
+        classes = [check_type(str(path), topic) for topic in bag.topics]
+        for topic, cls in zip(bag.topics, classes, strict=True):
+            headers[topic.name] = begins_with_header(cls)
+        canonical = [codec_for(cls).canonical for cls in classes]
+        for stamp_ns, index, raw in bag.messages():
+            data = canonical[index](raw)
+            key: Key = (OutputKind.MESSAGE, bag.topics[index].name)
+            output = Output(NO_EVENT, 0, OutputKind.MESSAGE, hash64(data), NO_SEQUENCE)
+            at = _at(key, data, headers, counts)
+            side.puts.append(Put(stamp_ns, key, len(side.data), output, at))
+            side.data.append(data)
+
+
+def _at(key: Key, data: bytes, headers: dict[str, bool], counts: dict[Key, int]) -> int:
+    """Return the stamp of a message's header, or its number where it has none."""
+    if headers[key[1]]:
+        return header_stamp_ns(data)
+    counts[key] = counts.get(key, -1) + 1
+    return counts[key]
+
+
+def _notes(ends: Ends, there: Side) -> Iterator[str]:
+    both = [t for t in ends.published if t in ends.subscribed and t not in _OF_ALL_NODES]
+    if both:
+        yield (
+            f"{ends.node} publishes and hears {', '.join(both)}: what was recorded there plays, "
+            "its own messages among it, and nothing there is compared"
+        )
+    if not there.puts:
+        topics = ", ".join(_compared(ends)) or "nothing"
+        yield (
+            f"the recording has nothing on what {ends.node} publishes ({topics}), so nothing was "
+            "compared; -o keeps this run, and --node compares with it from then on"
+        )

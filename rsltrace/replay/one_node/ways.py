@@ -1,0 +1,74 @@
+"""The ways to replay one node: from a trace, from a trace with a bag, from a job with a bag."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rsltrace.diff.options import DiffOptions
+from rsltrace.errors import ReplayError
+from rsltrace.job import Job, load_job
+from rsltrace.replay.job_folder import without_bags
+from rsltrace.replay.one_node.from_bag import replay_from_bag
+from rsltrace.replay.one_node.replaying import replay_node
+from rsltrace.replay.one_node.result import NodeReplayResult
+from rsltrace.replay.preparation import prepared
+
+
+def is_job(path: Path) -> bool:
+    """Whether a file is a job rather than a trace, by its name."""
+    return path.suffix in (".yaml", ".yml", ".json")
+
+
+def load_without_bags(path: Path) -> Job:
+    """Return the job of a file, for other bags than its own.
+
+    :raises JobError: if it cannot be used.
+    """
+    return without_bags(lambda to: load_job(path, overrides=to))
+
+
+def replay_one(
+    source: Path,
+    node: str,
+    *,
+    bags: Sequence[Path],
+    until_diverged: bool,
+    options: DiffOptions | None,
+    output: Path | None,
+    force: bool,
+    job: Job | None,
+    job_folder: Path | None,
+    trust: bool,
+    echo: bool,
+) -> NodeReplayResult:
+    """Do what ``rsltrace.replay`` does with a node.
+
+    :raises RsltraceError: as there.
+    """
+    if bags and is_job(source):
+        return replay_from_bag(
+            job or load_without_bags(source),
+            node,
+            bags,
+            options=options,
+            output=output,
+            force=force,
+            echo=echo,
+        )
+    with prepared(source, job_folder, job, bags=False) as plan:
+        if plan.distrust and not trust:
+            raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
+        if bags:
+            return replay_from_bag(
+                plan.job, node, bags, options=options, output=output, force=force, echo=echo
+            )
+        return replay_node(
+            plan,
+            node,
+            until_diverged=until_diverged,
+            options=options,
+            output=output,
+            force=force,
+            echo=echo,
+        )
