@@ -5,11 +5,32 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
+import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+
+# Ends with the process that started it, and does not load what lies in the present folder.
+_PROGRAM = """
+import ctypes, os, sys
+ctypes.CDLL(None).prctl(1, 9)
+if os.getppid() != int(sys.argv.pop(1)):
+    sys.exit(137)
+del sys.path[0]
+sys.path.append(sys.argv.pop(1))
+import runpy
+sys.argv[0] = 'rsltrace'
+runpy.run_module('rsltrace', run_name='__main__')
+"""
+OWN_FOLDER = Path(__file__).resolve().parents[2]
+"""The folder that this package is in."""
+
+
+def rsltrace_command(words: Sequence[str]) -> list[str]:
+    """Return a command line of this very rsltrace; its process ends with the present one."""
+    return [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(OWN_FOLDER), *words]
 
 
 @dataclass(frozen=True, slots=True)

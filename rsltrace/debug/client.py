@@ -22,6 +22,7 @@ from types import TracebackType
 from typing import Any
 
 from rsltrace import errors
+from rsltrace.debug.branches import Branches
 from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.positions import Breakpoint, Position, Stopped, position_of, stopped_of
 from rsltrace.errors import DebugError, RsltraceError
@@ -64,7 +65,7 @@ class DebugSession:
         :raises DebugError: the processes of the session cannot be made.
         """
         self.on_notice = on_notice or (lambda notice: None)
-        spec = {
+        spec: dict[str, Any] = {
             "source": os.fspath(source),
             "job_folder": None if job_folder is None else os.fspath(job_folder),
             "trust": trust,
@@ -73,9 +74,15 @@ class DebugSession:
             "echo": echo,
             "overrides": list(overrides),
         }
+        self._spec = spec
+        self._branches: Branches | None = None
         self._last_id = 0
         self._lock = threading.Lock()
         self._sending = threading.Lock()
+        self._open(spec)
+
+    def _open(self, spec: dict[str, Any]) -> None:
+        """Start the processes of the session."""
         ours, theirs = socket.socketpair()
         command = [sys.executable, "-m", "rsltrace.debug.supervisor", str(theirs.fileno())]
         try:
@@ -94,7 +101,7 @@ class DebugSession:
         try:
             ready = self._until(lambda message: message.get("notice") == "ready")
         except BaseException:
-            self.close()
+            self._end()
             raise
         self.events: int | None = ready["events"]
         self.notes: tuple[str, ...] = tuple(ready["notes"])
@@ -113,6 +120,11 @@ class DebugSession:
 
     def close(self) -> None:
         """End the session with all its processes. A second call does nothing."""
+        self._end()
+        if self._branches is not None:
+            self._branches.close()
+
+    def _end(self) -> None:
         self._lines.close()
         try:
             self._process.wait(_END_S)
@@ -244,6 +256,41 @@ class DebugSession:
         """Return ``indices`` of the checkpoints, the ``bytes`` of memory that they take (PSS), and
         ``why_not``: why there are none, if that is so."""
         return dict(self._ask("checkpoints"))
+
+    # -- what if -----------------------------------------------------------------------------------
+
+    def edit(self, text: str) -> Position:
+        """Change something (docs/what-if.md), and go on in the branch that comes of it.
+
+        A text without a place, as ``message.data = 3.0``, is about the event that follows. The run
+        is made again with the edit, from its beginning to its end; the session then stands where it
+        did, in the branch: going back and ahead, breakpoints and questions are those of any run. A
+        second edit branches off the branch.
+
+        :raises EditError: the edit cannot be understood, or not be made. Nothing has changed then.
+        """
+        position = self.position
+        if self._branches is None:
+            spec = self._spec
+            self._branches = Branches(spec["source"], spec["job_folder"], spec["overrides"])
+        path = self._branches.make(text, position.index)
+        breakpoints = self.breakpoints
+        self._end()
+        folder = self._branches.job_folder
+        self._open({**self._spec, "source": str(path), "job_folder": folder, "trust": True})
+        for one in breakpoints:
+            self.break_at(one.text)
+        return self.go_to(min(position.index, self.events or 0)).position
+
+    def branch(self, output: str | Path, *, force: bool = False) -> Path:
+        """Keep the trace of the branch in which the session is: it holds the edits, and replays.
+
+        :raises DebugError: nothing has been edited.
+        :raises OutputError: ``output`` exists (``force`` replaces it), or cannot be written.
+        """
+        if self._branches is None:
+            raise DebugError("nothing has been edited in this session: there is no branch to keep")
+        return self._branches.keep(output, force=force)
 
     # -- talking -----------------------------------------------------------------------------------
 

@@ -23,6 +23,7 @@ from rsltrace.guard.pin import pin, unpin
 if TYPE_CHECKING:
     from rsltrace.debug.history import History
     from rsltrace.job import Job
+    from rsltrace.replay.edits import Edit
 
 
 def main() -> None:
@@ -32,11 +33,11 @@ def main() -> None:
     die_with_parent(spec["supervisor"])
     with ExitStack() as stack:
         try:
-            job, history, notes = _opened(spec, stack)
+            job, history, edits, notes = _opened(spec, stack)
             if not job.guard.pins:
                 unpin()
             lines = Lines(moved_high(socket.socket(fileno=number)))
-            _serve(job, history, notes, spec, lines, stack)
+            _serve(job, history, edits, notes, spec, lines, stack)
         except (RsltraceError, OSError) as error:
             from rsltrace.debug.engine import said
 
@@ -44,8 +45,10 @@ def main() -> None:
             end_process(2)
 
 
-def _opened(spec: dict[str, Any], stack: ExitStack) -> tuple[Job, History, list[str]]:
-    """Return the job to run, and what is known of its run.
+def _opened(
+    spec: dict[str, Any], stack: ExitStack
+) -> tuple[Job, History, tuple[Edit, ...], list[str]]:
+    """Return the job to run, what is known of its run, the edits in it, and notes.
 
     :raises RsltraceError: it cannot be run here.
     """
@@ -56,7 +59,7 @@ def _opened(spec: dict[str, Any], stack: ExitStack) -> tuple[Job, History, list[
     if not is_trace(source):
         from rsltrace.job import load_job
 
-        return load_job(Path(source), overrides=spec["overrides"]), RunHistory(), []
+        return load_job(Path(source), overrides=spec["overrides"]), RunHistory(), (), []
     from rsltrace.replay.preparation import prepared
 
     folder = spec["job_folder"]
@@ -64,12 +67,13 @@ def _opened(spec: dict[str, Any], stack: ExitStack) -> tuple[Job, History, list[
     if plan.distrust and not spec["trust"]:
         raise ReplayError(f"{source} would run code, and {plan.distrust}: give trust=True")
     changed = [f"{one.name} {one.change}" for one in plan.code if one.change]
-    return plan.job, TraceHistory(plan.trace), [*plan.notes, *changed]
+    return plan.job, TraceHistory(plan.trace), plan.edits, [*plan.notes, *changed]
 
 
 def _serve(
     job: Job,
     history: History,
+    edits: tuple[Edit, ...],
     notes: list[str],
     spec: dict[str, Any],
     lines: Lines,
@@ -77,6 +81,7 @@ def _serve(
 ) -> None:
     from rsltrace.debug.engine import Engine
     from rsltrace.debug.ledger import Ledger
+    from rsltrace.replay.editing import Editing
     from rsltrace.run.process import Observer
     from rsltrace.run.session import Session
 
@@ -96,6 +101,7 @@ def _serve(
             observer=Observer(note=notes.append),
         )
     )
+    Editing(edits, known=len(edits)).attach(session)  # those that a branch was made with
     engine = Engine(
         session,
         ledger,

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import rsltrace
 from rsltrace import DebugSession
-from rsltrace.errors import ConditionError, DebugError, ReplayError
+from rsltrace.errors import ConditionError, DebugError, EditError, OutputError, ReplayError
 from rsltrace.trace.reader import Trace
 
 
@@ -197,3 +198,47 @@ def test_a_job_that_was_never_recorded(folder: Path) -> None:
 def test_a_trace_that_nobody_trusts_is_not_run(folder: Path) -> None:
     with pytest.raises(ReplayError, match="would run code"):
         DebugSession(folder / "run.mcap")
+
+
+def test_what_if(folder: Path, tmp_path: Path, trace: Trace) -> None:
+    """A session goes on in the branch that an edit makes, back and ahead, and keeps it."""
+    with DebugSession(folder / "run.mcap", trust=True) as session:
+        with pytest.raises(DebugError, match="nothing has been edited"):
+            session.branch(tmp_path / "branch.mcap")
+        stop = session.break_at("/smooth: data > 500")
+        session.go_to(300)
+        count, state = session.evaluate("source.count"), session.evaluate("filter.state")
+        with pytest.raises(EditError, match="did you mean 'state'"):
+            session.edit('node("/filter").stat = 0.0')
+        assert session.evaluate("filter.state") == state
+        assert session.edit('node("/filter").state = 1000.0').index == 300
+        assert session.evaluate("filter.state") == 1000.0
+        assert session.evaluate("source.count") == count
+        assert session.reverse_step().position.index == 299
+        assert session.evaluate("filter.state") == state
+        assert [one.text for one in session.breakpoints] == [stop.text]
+        hit = session.go_on()
+        assert hit.reason == "breakpoint"
+        assert hit.position.index in range(300, 306)
+        session.go_to(330)
+        session.edit('parameters("/source")["use_sim_time"] = True')
+        path = session.branch(tmp_path / "branch.mcap")
+        with pytest.raises(OutputError, match="exists"):
+            session.branch(path)
+    result = rsltrace.replay(path, trust=True, job_folder=folder)
+    assert result.is_whole
+    with Trace.open(path) as branch:
+        assert branch.event_count == trace.event_count + 1
+        assert branch.event(299).chain_hash == trace.event(299).chain_hash
+        assert branch.digest != trace.digest
+
+
+def test_what_if_of_a_job(folder: Path, tmp_path: Path) -> None:
+    with DebugSession(folder / "job.yaml", overrides=["stop.duration=0.2s"]) as session:
+        session.run_to("0.1s")
+        index = session.position.index
+        assert session.edit("drop()").index == index
+        assert session.go_on().reason == "end"
+        session.branch(tmp_path / "branch.mcap")
+    with Trace.open(tmp_path / "branch.mcap") as branch:
+        assert branch.end_ns == 200_000_000

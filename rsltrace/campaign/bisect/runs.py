@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import rsltrace
 from rsltrace.campaign.bisect.repository import Repository
 from rsltrace.campaign.bisect.worktree import Worktree
 from rsltrace.campaign.perturb import (
@@ -18,23 +17,7 @@ from rsltrace.campaign.perturb import (
     record_words,
     recorded,
 )
-from rsltrace.campaign.processes import Processes
-
-# Ends with the process that started it, and does not load what lies in the present folder.
-_PROGRAM = """
-import ctypes, os, sys
-ctypes.CDLL(None).prctl(1, 9)
-if os.getppid() != int(sys.argv.pop(1)):
-    sys.exit(137)
-del sys.path[0]
-sys.path.append(sys.argv.pop(1))
-import runpy
-sys.argv[0] = 'rsltrace'
-runpy.run_module('rsltrace', run_name='__main__')
-"""
-
-
-_OWN = Path(rsltrace.__file__).resolve().parent.parent
+from rsltrace.campaign.processes import OWN_FOLDER, Processes, rsltrace_command
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +38,7 @@ class Runner:
         cwd = self.folder
         cwd.mkdir(parents=True, exist_ok=True)
         path = self.worktree.folder / f"{name}.mcap"
-        command = [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(_OWN)]
-        command += record_words(self.arguments, path)
+        command = rsltrace_command(record_words(self.arguments, path))
         if can_fix_addresses():
             command = ["setarch", "-R", *command]
         done = self.processes.run(
@@ -78,7 +60,7 @@ class Runner:
         found = []
         for entry in dict.fromkeys(sys.path):
             path = Path(entry or ".").resolve()
-            if path == _OWN or not path.is_relative_to(self.repository.top):
+            if path == OWN_FOLDER or not path.is_relative_to(self.repository.top):
                 continue  # this program itself is the same at every revision
             if path.is_relative_to(Path(sys.prefix).resolve()) or not path.is_dir():
                 continue
