@@ -251,7 +251,7 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
 
     def handle(number: int, frame: object) -> None:
         if not ends:
-            raise KeyboardInterrupt
+            raise KeyboardInterrupt(128 + number)
         end, name = ends.pop(), _ENDS[signal.Signals(number)]
         # Not through sys.stderr: the signal may have come in the middle of a write to it.
         with suppress(OSError):

@@ -168,6 +168,16 @@ def test_an_interrupted_run_closes_its_file_and_says_so(
         assert trace.digest in stdout
 
 
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_run_that_is_ended_before_it_begins_has_the_status_of_its_signal(
+    rsltrace: Any, job_file: Any, tmp_path: Path, name: str, code: int
+) -> None:
+    job_file(ENDLESS, f"import os, signal\nos.kill(os.getpid(), signal.{name})\n")
+    done = rsltrace("record", "job.yaml", "-o", "out.mcap")
+    assert done.returncode == code, done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) -> None:
     job_file(ENDLESS)
     process = _start(tmp_path)

@@ -103,8 +103,8 @@ def status_of(command: Callable[[], object]) -> int:
         error.show(shown)
         tell(shown.getvalue(), end="")
         status = error.exit_code
-    except (KeyboardInterrupt, click.Abort):
-        status = EXIT_INTERRUPTED
+    except (KeyboardInterrupt, click.Abort) as end:
+        status = _interrupted(end)
     except OSError as error:
         status = status_without_output(error)
     except Exception:
@@ -131,6 +131,13 @@ def status_without_output(error: OSError, status: int = 0) -> int:
         return status or EXIT_BROKEN_PIPE
     of = f": {error.filename}" if error.filename else ""
     return _failed(f"{error.strerror or error}{of}", status or EXIT_USAGE)
+
+
+def _interrupted(end: BaseException) -> int:
+    """Return 128 + the signal, if whoever raised the interrupt has said which it was."""
+    cause = end.__cause__ if isinstance(end, click.Abort) else end
+    told = cause.args[0] if cause is not None and cause.args else EXIT_INTERRUPTED
+    return told if isinstance(told, int) else EXIT_INTERRUPTED
 
 
 def _failed(message: str, status: int) -> int:
