@@ -181,13 +181,13 @@ class Session:
         with self._guarded.engaged():
             self._import_what_is_named()
         check_bag_types(self.job, self._bags)
+        self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
+        if self._observer.interrupt is not None:  # from here on there is a file to be closed
+            self._observer.interrupt(self._interrupt)
         if self._output is not None:
             self._open_trace(stack, self._output)
         elif self._recorded_by is not None:
             self._record_to(self._recorded_by)
-        self._watchdog = Watchdog(self.world.domain, self.world.stacks.runners.thread)
-        if self._observer.interrupt is not None:
-            self._observer.interrupt(self._interrupt)
         stack.enter_context(quiet_gc())
         keep_heap()
         if self._recorded_by is None:

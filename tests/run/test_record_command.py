@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import array
 import fcntl
+import importlib
 import json
 import os
 import re
@@ -18,6 +19,9 @@ from typing import Any
 import pytest
 
 from rsltrace import Trace
+from rsltrace.job import load_job
+from rsltrace.loop.stop import Stop
+from rsltrace.run import Observer, run
 
 pytestmark = pytest.mark.ros
 
@@ -176,6 +180,28 @@ def test_a_run_that_is_ended_before_it_begins_has_the_status_of_its_signal(
     done = rsltrace("record", "job.yaml", "-o", "out.mcap")
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_a_trace_is_closed_that_was_interrupted_while_it_was_opened(
+    job_file: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    job_file(ENDLESS)
+    monkeypatch.chdir(tmp_path)
+    ends: list[Any] = []
+
+    def write_job(*given: Any) -> None:
+        write(*given)
+        ends[0](Stop("interrupted", 130))
+
+    module = importlib.import_module("rsltrace.run.session")
+    write = module.write_job
+    monkeypatch.setattr(module, "write_job", write_job)
+    observer = Observer(interrupt=ends.append)
+    result = run(load_job("job.yaml"), "out.mcap", observer=observer)
+    assert result.exit_code == 130
+    with Trace.open("out.mcap") as trace:
+        assert trace.complete
+        assert trace.result["exit_code"] == "130"
 
 
 def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) -> None:

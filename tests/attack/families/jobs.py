@@ -38,7 +38,7 @@ def _ask(rng: Random, case: Case, text: str | bytes, name: str = "job.yaml") -> 
     place = case.folder / name
     place.write_bytes(text.encode("utf-8", "surrogatepass") if isinstance(text, str) else text)
     hostile.canary_module(case.folder / "elsewhere", case.canary)
-    case.names = (name, name.encode("unicode_escape").decode())
+    case.names = (name, name.encode("unicode_escape").decode(), "--until")
     _commands(rng, case, name)
 
 
