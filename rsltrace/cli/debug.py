@@ -89,12 +89,13 @@ def debug(
     if (job_folder is not None or trust) and not is_trace(source):
         raise click.UsageError("--job-folder and --trust are for a TRACE")
     with ExitStack() as stack:
-        names = None
+        names, told = None, set()
         if is_trace(source):
             plan = stack.enter_context(prepared(source, job_folder))
             for line in code_lines(plan, "debugging"):
                 tell(line)
             agree(plan, trust=trust)
+            told = {f"{one.name} {one.change}" for one in plan.code}
             names = names_of(plan.trace.entities.values())
         session = stack.enter_context(
             DebugSession(
@@ -108,7 +109,7 @@ def debug(
                 on_notice=_on_notice,
             )
         )
-        for note in session.notes:
+        for note in (note for note in session.notes if note not in told):
             tell(f"note: {note}")
         return Shell(session, commands, names).run()
 
