@@ -162,7 +162,10 @@ class DebugSession:
         return stopped_of(self._ask("go_on"))
 
     def pause(self) -> None:
-        """Stop a run that another thread waits for, after its present event."""
+        """Stop a run that another thread waits for, after its present event. A callback that does
+        not come back in five seconds is ended with its process; the session is then back where the
+        run began. A Ctrl-C does the same.
+        """
         self._send({"id": 0, "do": "pause"})
 
     # -- back --------------------------------------------------------------------------------------
@@ -299,7 +302,11 @@ class DebugSession:
             self._last_id += 1
             number = self._last_id
             self._send({"id": number, "do": do, **values})
-            answer = self._until(lambda message: message.get("id") == number)
+            try:
+                answer = self._until(lambda message: message.get("id") == number)
+            except KeyboardInterrupt:
+                self.pause()
+                answer = self._until(lambda message: message.get("id") == number)
         if "error" in answer:
             raise _error(answer["error"])
         return answer["ok"]

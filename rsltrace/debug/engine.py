@@ -21,7 +21,7 @@ from rsltrace.debug.conditions.text import parse_condition
 from rsltrace.debug.forking import end_process, fork_beside, why_not
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described
-from rsltrace.debug.lines import Lines, Message, moved_high
+from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.view import View
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.guard.guard import engage
@@ -258,7 +258,9 @@ class Engine:
                         return
                 else:
                     self._do(request)
-            except (Exception, RecursionError) as error:
+            except KeyError as error:
+                self._answer(error=said(DebugError(f"not a request of this protocol: no {error}")))
+            except Exception as error:
                 self._answer(error=said(error))
 
     def _begin(self, request: Message) -> bool:
@@ -347,12 +349,13 @@ class Engine:
         """
         if not self._forks:
             raise DebugError("checkpoints are off")
-        reason = why_not([self.lines.fileno(), *self.ledger.history.descriptors], self._idle)
+        pairs = self.session.inner_pairs()
+        reason = why_not(self._own_descriptors(), self._idle, pairs)
         if reason:
             raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
         try:
-            is_copy = fork_beside(self._supervisor)
+            is_copy = fork_beside(self._supervisor, pairs)
         except BaseException:
             ours.close()
             theirs.close()
@@ -362,11 +365,15 @@ class Engine:
             return ours
         ours.close()
         self.lines.close()
-        self.lines = Lines(moved_high(theirs))
+        self.lines = Lines(theirs)
+        self.lines.move_high()
         pid = _getpid()
-        self.session.changes_process(pid)
+        self.session.changes_process(pid, pairs)
         self.lines.send({"notice": "copy", "pid": pid})
         return None
+
+    def _own_descriptors(self) -> list[int]:
+        return [self.lines.fileno(), *self.ledger.history.descriptors]
 
     def _apart(self, work: Callable[[], Any]) -> None:
         """Do what runs a user's code in a copy, so that it changes nothing here."""

@@ -11,8 +11,9 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import os
+import socket
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 
 from rsltrace.errors import DebugError
@@ -21,6 +22,7 @@ _PR_SET_PDEATHSIG = 1
 _SIGKILL = 9
 _LOOK_US = 200
 _c = ctypes.PyDLL(None, use_errno=True)  # keeps Python's lock, which nobody else would release
+_SHARED = ("/dev/ptmx", "anon_inode:[eventfd]", "anon_inode:[timerfd]", "anon_inode:inotify")
 _KEPT_FLAGS = os.O_APPEND | os.O_NONBLOCK
 
 
@@ -39,7 +41,11 @@ def die_with_parent(parent: int, between: int = 0) -> None:
         end_process(0)
 
 
-def why_not(kept: Iterable[int], idle: frozenset[int]) -> str:
+Pairs = Sequence[tuple[int, int]]
+"""Descriptors of the two ends of pipes and of pairs of sockets, both in this process."""
+
+
+def why_not(kept: Iterable[int], idle: frozenset[int], pairs: Pairs) -> str:
     """Return why this process cannot be copied, "" if it can. ``kept`` are descriptors of ours,
     ``idle`` the threads that do nothing in a simulation."""
     names = [name for thread, name in _threads() if thread not in idle]
@@ -48,16 +54,20 @@ def why_not(kept: Iterable[int], idle: frozenset[int]) -> str:
             f"{len(names)} real thread{'s' * (len(names) > 1)} of a library run in it "
             f"({', '.join(sorted(set(names))[:4])}), which no copy would have"
         )
-    ours = set(kept)
+    ours, inner = set(kept), {number for pair in pairs for number in pair}
     for number, target, mode in _open_descriptors():
         if number in ours or number < 3:
             continue
+        if number in inner and not _waiting_bytes(number):
+            continue
         if target.startswith("/dev/nvidia"):
             return "it uses a GPU, which cannot be copied"
+        if target.startswith(_SHARED):
+            return f"a node has {target} open (descriptor {number}), which both copies would share"
         if stat.S_ISSOCK(mode):
             return f"a node has a socket open (descriptor {number}), which both copies would share"
-        if stat.S_ISFIFO(mode) and _waiting_bytes(number):
-            return f"a node has a pipe open with bytes in it (descriptor {number})"
+        if stat.S_ISFIFO(mode):
+            return f"a node has a pipe open (descriptor {number}), which both copies would share"
         if stat.S_ISREG(mode) and _is_read_and_written(number):
             return (
                 f"a node has {target} open for reading and writing: what it writes there would not "
@@ -66,13 +76,15 @@ def why_not(kept: Iterable[int], idle: frozenset[int]) -> str:
     children = _children()
     if children:
         return f"a node has started a process ({', '.join(map(str, children[:4]))})"
-    return ""
+    shared = _shared_memory()
+    return f"a node shares memory with other processes ({shared})" if shared else ""
 
 
-def fork_beside(parent: int) -> bool:
+def fork_beside(parent: int, pairs: Pairs) -> bool:
     """Fork a process that is a child of ``parent`` (a subreaper); True in the new one.
 
-    Both go on from here with files of their own: what one reads moves no position of the other's.
+    Both go on from here with files of their own (what one reads moves no position of the other's)
+    and with ``pairs`` of their own, which are empty.
 
     :raises DebugError: if no process can be made.
     """
@@ -82,6 +94,7 @@ def fork_beside(parent: int) -> bool:
         second, between = -1, os.getpid()
         with suppress(BaseException):
             _reopen_files()
+            _renew(pairs)
             second = int(_c.fork())
         if second:
             end_process(int(second < 0))
@@ -125,6 +138,15 @@ def _children() -> list[int]:
     return []
 
 
+def _shared_memory() -> str:
+    """Return what of this process's memory would not be copied, "" if all of it would."""
+    with suppress(OSError), open("/proc/self/maps", "rb") as file:
+        for line in file:
+            if b" rw-s " in line or b" rwxs " in line:
+                return line.split(maxsplit=5)[-1].decode(errors="replace").strip()
+    return ""
+
+
 def _open_descriptors() -> Iterator[tuple[int, str, int]]:
     """Yield number, target and mode of what is open."""
     for name in os.listdir("/proc/self/fd"):
@@ -157,3 +179,20 @@ def _reopen_files() -> None:
                 os.lseek(own, os.lseek(number, 0, os.SEEK_CUR), os.SEEK_SET)
             os.dup2(own, number, inheritable=os.get_inheritable(number))
             os.close(own)
+
+
+def _renew(pairs: Pairs) -> None:
+    """Give this process pipes and pairs of sockets of its own."""
+    for one, other in pairs:
+        if stat.S_ISFIFO(os.fstat(one).st_mode):
+            ends = os.pipe()
+            if fcntl.fcntl(one, fcntl.F_GETFL) & os.O_ACCMODE != os.O_RDONLY:
+                ends = ends[1], ends[0]
+        else:
+            with socket.socket(fileno=os.dup(one)) as like:
+                first, second = socket.socketpair(like.family, like.type)
+            ends = first.detach(), second.detach()
+        for number, end in zip((one, other), ends, strict=True):
+            os.set_blocking(end, os.get_blocking(number))
+            os.dup2(end, number, inheritable=os.get_inheritable(number))
+            os.close(end)

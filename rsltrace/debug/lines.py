@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import resource
 import select
 import socket
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 from rsltrace.errors import DebugError
@@ -29,8 +29,7 @@ class Lines:
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
-        self._poll = select.poll()  # ``select`` knows small descriptors only
-        self._poll.register(end, select.POLLIN)
+        self._poll = _poll_of(end)
         self._data = bytearray()
         self._searched = 0
         self._descriptors: deque[int] = deque()
@@ -106,19 +105,23 @@ class Lines:
             message["with"] = [self._descriptors.popleft() for _ in range(count)]
         return message
 
+    def move_high(self) -> None:
+        """Give this end a high descriptor: nodes close and use up the low ones."""
+        limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
+        lowest = max((limit if 0 < limit < _HIGHEST else _HIGHEST) - _ROOM, 3)
+        with suppress(OSError):
+            number = fcntl.fcntl(self._end.fileno(), fcntl.F_DUPFD_CLOEXEC, lowest)
+            self._end.close()
+            self._end = socket.socket(fileno=number)
+            self._poll = _poll_of(self._end)
+
     def close(self) -> None:
         """Close this end."""
         self.ended = True
         self._end.close()
 
 
-def moved_high(end: socket.socket) -> socket.socket:
-    """Return the socket with a high number: nodes close and use up the low ones."""
-    limit = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    lowest = max((limit if 0 < limit < _HIGHEST else _HIGHEST) - _ROOM, 3)
-    try:
-        number = fcntl.fcntl(end.fileno(), fcntl.F_DUPFD_CLOEXEC, lowest)
-    except OSError:
-        return end
-    os.close(end.detach())
-    return socket.socket(fileno=number)
+def _poll_of(end: socket.socket) -> select.poll:
+    poll = select.poll()  # ``select`` knows small descriptors only
+    poll.register(end, select.POLLIN)
+    return poll

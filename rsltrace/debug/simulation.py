@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.debug.forking import die_with_parent, end_process
-from rsltrace.debug.lines import Lines, moved_high
+from rsltrace.debug.lines import Lines
 from rsltrace.errors import ReplayError, RsltraceError
 from rsltrace.guard.pin import pin, unpin
 
@@ -31,17 +31,18 @@ def main() -> None:
     pin()
     number, spec = int(sys.argv[1]), json.loads(sys.argv[2])
     die_with_parent(spec["supervisor"])
+    lines = Lines(socket.socket(fileno=number))
     with ExitStack() as stack:
         try:
             job, history, edits, notes = _opened(spec, stack)
             if not job.guard.pins:
                 unpin()
-            lines = Lines(moved_high(socket.socket(fileno=number)))
+            lines.move_high()
             _serve(job, history, edits, notes, spec, lines, stack)
         except (RsltraceError, OSError) as error:
             from rsltrace.debug.engine import said
 
-            Lines(socket.socket(fileno=number)).send({"notice": "failed", "error": said(error)})
+            lines.send({"notice": "failed", "error": said(error)})
             end_process(2)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import time
 from collections import deque
 from typing import Any
 
@@ -14,6 +15,7 @@ from rsltrace.errors import DebugError
 
 _INTERVAL_S = 0.05
 _APART_LIMIT_S = 20.0
+_PAUSE_LIMIT_S = 5.0
 _WEIGHED_EVERY = 8
 _PIECE_BYTES = 1 << 16
 
@@ -44,6 +46,8 @@ class Tree:
         self._since_weighed = 0
         self._cursor: SimProcess
         self._is_quiet = False
+        self._paused_s: float | None = None
+        """When the client asked to stop what runs, in seconds of real time."""
         self._why_no_checkpoints = ""
         self._output, self._output_end = os.pipe()
         os.set_blocking(self._output, False)
@@ -317,6 +321,8 @@ class Tree:
         self._is_quiet = True
         try:
             answer: Message = self._ask(process, request)
+            if answer["reason"] == "paused":
+                raise DebugError("interrupted: the session stays where it was")
             return answer
         finally:
             self._pass_output_on()
@@ -340,6 +346,7 @@ class Tree:
                 process.lines.send({"id": 0, **request})
             except OSError:
                 raise Lost(self.family.how_ended(process)) from None
+        self._paused_s = None
         while True:
             message = self._message_of(process, limit_s)
             if "error" in message:
@@ -383,9 +390,12 @@ class Tree:
             ends.append(process.lines)
         if not self._client.ended:
             ends.append(self._client)
+        if self._paused_s is not None and process is not None:
+            limit_s = max(self._paused_s + _PAUSE_LIMIT_S - time.monotonic(), 0.0)
         ready = select.select(ends, [], [], limit_s)[0]
         if not ready:
-            raise Lost(f"it has not come back for {limit_s:g} s, and was ended")
+            self._paused_s = None
+            raise Lost("its callback did not come back, and was ended")
         if self._output in ready:
             self._pass_output_on()
         if self._client in ready:
@@ -399,7 +409,9 @@ class Tree:
         while (request := self._client.next()) is not None:
             if process is not None and request.get("do") == "pause":
                 process.lines.send({"id": 0, "do": "pause"})
-            self._waiting.append(request)
+                self._paused_s = time.monotonic()
+            else:
+                self._waiting.append(request)
         if self._client.ended and process is not None:
             raise ClientGone("the client is gone")
 

@@ -84,6 +84,15 @@ class DescriptorTable:
         far = self.far_end(fd)
         return far is None or self._far_ends.get(far, (None, 0))[0] != _identity(far)
 
+    def inner_pairs(self) -> list[tuple[int, int]]:
+        """Return the pipes and pairs of sockets that the run has both ends of, each once."""
+        pairs = ((fd, self.far_end(fd)) for fd in list(self._far_ends) if not self.leads_out(fd))
+        return [
+            (fd, far)
+            for fd, far in pairs
+            if far is not None and fd < far and not stat.S_ISCHR(_fstat(fd).st_mode)
+        ]
+
     def is_outside(self, fd: object) -> bool:
         """Return whether a descriptor leads to somebody who is not part of the run."""
         if self.find(fd) is not None:

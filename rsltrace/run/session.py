@@ -144,10 +144,20 @@ class Session:
         """Whether the nodes are constructed, and time stands at the start or beyond."""
         return self._has_begun
 
-    def changes_process(self, pid: int) -> None:
-        """Take note that the run goes on in a copy of its process."""
+    def inner_pairs(self) -> list[tuple[int, int]]:
+        """Return the pipes and pairs of sockets that nodes have made, and keep both ends of."""
+        guard = self._guarded.guard
+        return [] if guard is None else guard.descriptors.inner_pairs()
+
+    def changes_process(self, pid: int, pairs: Sequence[tuple[int, int]]) -> None:
+        """Take note that the run goes on in a copy of its process, which has these ``pairs`` of
+        descriptors anew."""
         self.world.stacks.runners.process = pid
-        self._guarded.changes_process(pid)
+        guard = self._guarded.guard
+        if guard is not None:
+            guard.process = pid
+            for one, other in pairs:
+                guard.descriptors.join(one, other)
 
     def __enter__(self) -> Session:
         """Open everything. Whatever can be known to be wrong is found before a file is made.

@@ -193,6 +193,7 @@ def test_a_job_that_was_never_recorded(folder: Path) -> None:
         assert session.go_on().reason == "end"
         assert session.position.index == trace.event_count
         assert session.go_to(10).position.index == 10
+        assert session.checkpoints()["why_not"] == ""
 
 
 def test_a_trace_that_nobody_trusts_is_not_run(folder: Path) -> None:

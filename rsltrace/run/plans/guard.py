@@ -121,11 +121,6 @@ class RunGuard:
         if summary:
             writer.add_metadata(METADATA_GUARD, summary)
 
-    def changes_process(self, pid: int) -> None:
-        """Take note that the run goes on in a copy of its process."""
-        if self.guard is not None:
-            self.guard.process = pid
-
     def engaged(self) -> AbstractContextManager[None]:
         """Put the guard in charge of what this thread does now."""
         return nullcontext() if self.guard is None else engage(self.guard)

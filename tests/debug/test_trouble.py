@@ -1,0 +1,360 @@
+"""What goes wrong in a session is said, the session goes on where it can, nothing stays behind."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace import DebugSession
+from rsltrace.errors import DebugError, RsltraceError
+
+pytestmark = pytest.mark.ros
+
+CODE = """
+import ctypes, os, socket, subprocess, sys, threading, time
+from pathlib import Path
+from rclpy.node import Node
+
+class Ticks(Node):
+    def __init__(self):
+        super().__init__('ticks')
+        self.n = 0
+        self.kept = None
+        self.create_timer(0.01, self.tick)
+
+    def tick(self):
+        self.n += 1
+        if self.n == 50:
+            self.at_50()
+        if self.n == 100:
+            self.at_100()
+
+    def at_50(self):
+        pass
+
+    def at_100(self):
+        pass
+
+"""
+JOB = "nodes: [{{node: 'ticks:{name}'}}]\nstop: {{duration: {duration}}}\n"
+MARK = "RSLTRACE_TEST_MARK"
+
+
+def marked() -> list[int]:
+    """Return the processes below this one that a session has started."""
+    mark = f"{MARK}={os.environ[MARK]}".encode()
+    found = []
+    for name in os.listdir("/proc"):
+        if name.isdigit() and int(name) != os.getpid():
+            try:
+                if mark in Path(f"/proc/{name}/environ").read_bytes().split(b"\0"):
+                    found.append(int(name))
+            except OSError:
+                pass
+    return found
+
+
+def gone(pids: list[int]) -> bool:
+    """Say whether processes are gone within a minute."""
+    return eventually(lambda: not any(map(is_running, pids)))
+
+
+def eventually(is_so: Callable[[], bool]) -> bool:
+    """Say whether something comes true within a minute."""
+    for _ in range(600):
+        if is_so():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def is_running(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.fixture(autouse=True)
+def nothing_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
+    monkeypatch.setenv(MARK, str(tmp_path))
+    yield
+    assert gone(marked()), marked()
+
+
+@pytest.fixture
+def job(tmp_path: Path) -> Callable[..., Path]:
+    """Write a job with a node whose 50th and 100th ticks do what is given."""
+
+    def write(at_50: str, at_100: str = "pass", duration: str = "2s") -> Path:
+        code = f"class N(Ticks):\n    def at_50(self):\n        {at_50}\n"
+        code += f"    def at_100(self):\n        {at_100}\n"
+        (tmp_path / "ticks.py").write_text(CODE + code)
+        path = tmp_path / "job.yaml"
+        path.write_text(JOB.format(name="N", duration=duration))
+        return path
+
+    return write
+
+
+def children_of(session: DebugSession) -> list[int]:
+    pid = session._process.pid
+    return [int(word) for word in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def mostly_long(value: str, *usual: str) -> Any:
+    """Return a parameter, for the long tests unless it is a usual one."""
+    return value if value in usual else pytest.param(value, marks=pytest.mark.long)
+
+
+THREAD = "ctypes.CDLL(None).pthread_create(ctypes.byref(ctypes.c_ulong()), None, PAUSE, None)"
+NOT_COPIED = {
+    "real thread": (THREAD.replace("PAUSE", "ctypes.CDLL(None).pause"), None),
+    "socket": (
+        "self.kept = socket.socket(); self.kept.bind(('127.0.0.1', 0))",
+        "self.kept.close()",
+    ),
+    "for reading and writing": (
+        "self.kept = open(Path(__file__).with_name('x'), 'w+')",
+        "self.kept.close()",
+    ),
+    "started a process": (
+        "self.kept = subprocess.Popen(['sleep', '60'])",
+        "(self.kept.kill(), self.kept.wait())",
+    ),
+    "shares memory": (
+        "import mmap; self.kept = mmap.mmap(-1, 4096)",
+        "self.kept.close()",
+    ),
+}
+
+
+@pytest.mark.parametrize("why", [mostly_long(why, "real thread") for why in NOT_COPIED])
+def test_what_cannot_be_copied_is_refused_and_one_goes_back_without(
+    why: str, job: Callable[..., Path]
+) -> None:
+    at_50, at_100 = NOT_COPIED[why]
+    notices: list[dict[str, Any]] = []
+    with DebugSession(job(at_50, at_100 or "pass"), on_notice=notices.append) as session:
+        session.run_to(40)
+        session.run_to(80)
+        assert session.evaluate("ticks.n") == 79
+        stopped = session.reverse_step(5)  # from a checkpoint before the trouble
+        assert (stopped.position.index, session.evaluate("ticks.n")) == (75, 74)
+        refused = [one["text"] for one in notices if one["notice"] == "no checkpoints"]
+        assert refused
+        assert why in refused[0]
+        session.run_to(150)
+        if at_100 is not None:
+            assert session.reverse_step().position.index == 149
+            assert session.checkpoints()["indices"][-1] > 102
+
+
+def test_without_checkpoints_going_back_is_running_again(folder: Path) -> None:
+    notices: list[dict[str, Any]] = []
+    trace = folder / "run.mcap"
+    with DebugSession(trace, trust=True, checkpoints=0, on_notice=notices.append) as session:
+        session.run_to(100)
+        state = session.evaluate("filter.state")
+        session.run_to(300)
+        assert session.go_to(100).position.index == 100
+        assert session.evaluate("filter.state") == state
+        assert any(one["notice"] == "again" for one in notices)
+        number = session.break_at("when filter.state > 1").number
+        assert 0 < session.reverse_go_on().position.index < 100
+        session.clear(number)
+        assert eventually(lambda: len(list(filter(is_running, children_of(session)))) == 1)
+
+
+def test_killed_children_are_noticed_and_made_again(folder: Path) -> None:
+    with DebugSession(folder / "run.mcap", trust=True) as session:
+        session.run_to(500)
+        session.run_to(600)
+        state = session.evaluate("filter.state")
+        for pid in children_of(session):
+            os.kill(pid, signal.SIGKILL)
+        with pytest.raises(DebugError, match=r"ended by SIGKILL; the session is back at 600"):
+            session.step()
+        assert session.position.index == 600
+        assert session.evaluate("filter.state") == state
+        assert session.reverse_step().position.index == 599
+        assert session.go_on().reason == "end"
+
+
+CRASHES = {
+    "SIGSEGV": "ctypes.string_at(0)",
+    "exit status 7": "ctypes.CDLL(None)._exit(7)",
+    "SIGABRT": "ctypes.CDLL(None).abort()",
+}
+
+
+@pytest.mark.parametrize("how", [mostly_long(how, "SIGSEGV") for how in CRASHES])
+def test_a_node_that_ends_the_interpreter(how: str, job: Callable[..., Path]) -> None:
+    with DebugSession(job(CRASHES[how])) as session:
+        session.run_to(20)
+        with pytest.raises(DebugError, match=rf"{how}; the session is back at 20"):
+            session.go_on()
+        assert session.run_to(50).position.index == 50
+        with pytest.raises(DebugError, match=how):
+            session.step(5)
+        assert session.reverse_step().position.index == 49
+        with pytest.raises(DebugError, match=how):
+            session.evaluate("ticks.at_50()")
+        assert session.position.index == 49
+
+
+def test_a_callback_that_does_not_come_back(job: Callable[..., Path]) -> None:
+    with DebugSession(job("while True: pass")) as session:
+        session.run_to(20)
+        timer = threading.Timer(1.0, session.pause)
+        timer.start()
+        with pytest.raises(DebugError, match=r"did not come back.* back at 20"):
+            session.go_on()
+        timer.join()
+        assert session.step().position.index == 21
+
+
+def test_a_run_is_paused_and_goes_on(job: Callable[..., Path]) -> None:
+    with DebugSession(job("pass", duration="3600s")) as session:
+        timer = threading.Timer(1.0, session.pause)
+        timer.start()
+        stopped = session.go_on()
+        timer.join()
+        assert stopped.reason == "paused"
+        index = stopped.position.index
+        assert session.step().position.index == index + 1
+        assert session.reverse_step(2).position.index == index - 1
+
+
+LIMIT = """
+import resource
+def limit():
+    '''No more processes, for this one and what it forks. For root, that takes not being root.'''
+    resource.setrlimit(resource.RLIMIT_NPROC, (1, 1))
+    if os.getuid() == 0:
+        libc = ctypes.CDLL(None, use_errno=True)
+        head, caps = (ctypes.c_uint32 * 2)(0x20080522, 0), (ctypes.c_uint32 * 6)()
+        assert libc.capget(head, caps) == 0
+        caps[0] &= ~(1 << 21 | 1 << 24)  # CAP_SYS_ADMIN, CAP_SYS_RESOURCE
+        assert libc.setresuid(65534, 0, 0) == 0
+        assert libc.capset(head, caps) == 0
+"""
+
+
+def test_a_fork_that_fails(job: Callable[..., Path], tmp_path: Path) -> None:
+    path = job("limit()")
+    with (tmp_path / "ticks.py").open("a") as file:
+        file.write(LIMIT)
+    notices: list[dict[str, Any]] = []
+    with DebugSession(path, on_notice=notices.append) as session:
+        session.run_to(40)
+        session.run_to(80)
+        refused = [one["text"] for one in notices if one["notice"] == "no checkpoints"]
+        assert "no process can be made for a checkpoint" in refused[0]
+        assert session.evaluate("ticks.n") == 79  # in place, for want of a copy
+        assert session.reverse_step().position.index == 79
+        assert session.evaluate("ticks.n") == 78
+
+
+def test_a_trace_whose_job_does_not_load_any_more(tmp_path: Path, folder: Path) -> None:
+    for name in ("job.yaml", "run.mcap", "nodes_of_debug.py"):
+        shutil.copy(folder / name, tmp_path)
+    (tmp_path / "nodes_of_debug.py").write_text("from rclpy.node import Nod\n")
+    with pytest.raises(RsltraceError, match="Nod"):
+        DebugSession(tmp_path / "run.mcap", trust=True)
+    (tmp_path / "nodes_of_debug.py").unlink()
+    with pytest.raises(RsltraceError, match="nodes_of_debug"):
+        DebugSession(tmp_path / "run.mcap", trust=True)
+    (tmp_path / "job.yaml").unlink()
+    with pytest.raises(RsltraceError, match="looked for"):
+        DebugSession(tmp_path / "run.mcap", trust=True)
+    with pytest.raises(RsltraceError, match="nothing"):
+        DebugSession(tmp_path / "nothing.mcap")
+
+
+def test_a_run_that_is_not_what_the_trace_says_stops_there(tmp_path: Path, folder: Path) -> None:
+    for name in ("job.yaml", "run.mcap", "nodes_of_debug.py"):
+        shutil.copy(folder / name, tmp_path)
+    code = (tmp_path / "nodes_of_debug.py").read_text()
+    changed = code.replace("1.5 * self.count", "(1.5 if self.count < 50 else 2.0) * self.count")
+    (tmp_path / "nodes_of_debug.py").write_text(changed)
+    with DebugSession(tmp_path / "run.mcap", trust=True) as session:
+        assert any("nodes_of_debug has changed" in note for note in session.notes)
+        stopped = session.go_on()
+        assert stopped.reason == "diverged"
+        assert session.evaluate("source.count") == 50
+        assert session.step().reason == "diverged"
+        index = stopped.position.index
+        assert session.reverse_step().position.index == index - 1
+        assert session.evaluate("source.count") == 49
+        assert session.step().reason == "diverged"
+
+
+def test_a_client_that_disconnects_in_the_middle(job: Callable[..., Path]) -> None:
+    session = DebugSession(job("pass", duration="3600s"))
+    failed = []
+
+    def run() -> None:
+        try:
+            session.go_on()
+        except (DebugError, OSError, ValueError) as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    time.sleep(1)
+    pids = marked()
+    assert len(pids) > 2, pids
+    session._lines._end.shutdown(socket.SHUT_RDWR)
+    thread.join()
+    assert failed
+    assert gone(pids)
+    session.close()
+
+
+def test_a_client_that_is_killed(job: Callable[..., Path]) -> None:
+    path = job("subprocess.Popen(['sleep', '600'], start_new_session=True)", duration="3600s")
+    script = f"import rsltrace\nrsltrace.DebugSession({str(path)!r}).go_on()\n"
+    client = subprocess.Popen([sys.executable, "-c", script])
+    for _ in range(600):
+        pids = marked()
+        if len(pids) > 4 and any(_command(pid) == "sleep" for pid in pids):
+            break
+        time.sleep(0.1)
+    else:
+        pytest.fail("the session has not begun")
+    client.kill()
+    client.wait()
+    assert gone(pids)
+
+
+def _command(pid: int) -> str:
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        return ""
+
+
+def test_requests_that_are_none_are_answered(folder: Path) -> None:
+    with DebugSession(folder / "run.mcap", trust=True) as session:
+        for request in ({}, {"do": "fly"}, {"do": "step", "count": "x"}, {"do": "event"}):
+            with pytest.raises(DebugError, match=r"no request|not a request"):
+                session._ask(**{"do": "", **request})  # type: ignore[arg-type]
+        with pytest.raises(DebugError, match="no breakpoint 7"):
+            session.clear(7)
+        with pytest.raises(DebugError, match="no step"):
+            session.step(0)
+        with pytest.raises(DebugError, match="no event 100000"):
+            session.event(100_000)
+        assert session.step().position.index == 1
