@@ -43,7 +43,7 @@ class View:
         for handle in self._domain.graph.nodes:
             node = getattr(handle, "wrapper", None)
             if node is not None:
-                found[handle.fully_qualified_name] = node
+                found[handle.key] = node
         return found
 
     @property

@@ -285,8 +285,8 @@ class Network:
         end = self._ends.get(endpoint.entity_id)
         if end is None:
             node = endpoint.node.fully_qualified_name
-            key = (kind, name, node)
-            ordinal = self._counts.get(key, 0)
-            self._counts[key] = ordinal + 1
-            end = self._ends[endpoint.entity_id] = (node, ordinal)
+            key = (kind, name, endpoint.node.key)
+            count = self._counts.get(key, 0)
+            self._counts[key] = count + 1
+            end = self._ends[endpoint.entity_id] = (node, endpoint.node.ordinal(count))
         return end

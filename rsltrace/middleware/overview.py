@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
@@ -75,8 +76,18 @@ def overview(graph: Graph, waiting: Iterable[str], *, everything: bool = False) 
         nodes,
         tuple(links),
         waiting=tuple(waiting),
-        problems=tuple(problem for link in links for problem in _problems(link)),
+        problems=(*_namesakes(nodes), *(one for link in links for one in _problems(link))),
     )
+
+
+def _namesakes(nodes: Iterable[NodeView]) -> Iterator[str]:
+    """Yield the names that several nodes have: a mistake, most often."""
+    for name, count in Counter(node.name for node in nodes).items():
+        if count > 1:
+            yield (
+                f"{count} nodes are named {name}: their parameters, services and logs go by that "
+                "name; unless that is meant, give each a name of its own (name: or namespace:)"
+            )
 
 
 def _node(node: Participant) -> NodeView:

@@ -23,14 +23,19 @@ class ActionEnd(Protocol):
         """The name of the action's type."""
 
 
+_THINGS_PER_NODE = 1 << 20
+
+
 class Participant(DomainEntity):
     """Somebody in the domain, with a name; in the trace, a node.
 
     ``door`` speaks for it. ``process`` is where it lives, if that may end before the run does.
+    ``number`` tells those of one name apart, in the order of creation.
     """
 
     kind = EntityKind.NODE
     process: object = None
+    number = 1
 
     def __init__(self, dispatcher: Dispatcher, name: str, namespace: str, door: Door) -> None:
         super().__init__(dispatcher, None)
@@ -42,6 +47,16 @@ class Participant(DomainEntity):
         self.state: State | None = None
         self.actions: list[ActionEnd] = []
         self.timers: list[Timer] = []
+
+    @property
+    def key(self) -> str:
+        """The full name, with the number of a second one of that name: ``/n #2``."""
+        name = self.fully_qualified_name
+        return name if self.number == 1 else f"{name} #{self.number}"
+
+    def ordinal(self, count: int) -> int:
+        """Return a number for one of its things that no other node of its name gives."""
+        return count + (self.number - 1) * _THINGS_PER_NODE
 
     def timer_periods(self) -> Iterable[tuple[str, int]]:
         """Yield (callback, period in ns) of its timers."""

@@ -15,6 +15,7 @@ from rsltrace.loop.policy import Candidate, Policy
 from rsltrace.middleware.entity import Runnable
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.events.event import OutsideEvent, Owner
+from rsltrace.middleware.participant import Participant
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import EventKind
 
@@ -155,8 +156,10 @@ class Scheduling:
         if node is not None:
             owner = node.fully_qualified_name
             kind, name = handle.execution_name()
-            key = (owner, kind, name)
-            ordinal = self._counts[key] = self._counts.get(key, -1) + 1
+            assert isinstance(node, Participant), "nobody else's callbacks take time"
+            key = (node.key, kind, name)
+            self._counts[key] = self._counts.get(key, -1) + 1
+            ordinal = node.ordinal(self._counts[key])
             for rule in self._plan.execution:
                 if fnmatchcase(owner, rule.node) and (
                     rule.entity is None or fnmatchcase(name, rule.entity)

@@ -164,7 +164,7 @@ class Simulation:
 
         :raises RunError: if there is none of that name, or more than one.
         """
-        names = {node.get_fully_qualified_name(): node for node in self.nodes}
+        names = {node.handle.key: node for node in self.nodes}
         found = [n for n in names if n == name or (name[:1] != "/" and n.endswith(f"/{name}"))]
         if len(found) == 1:
             return names[found[0]]

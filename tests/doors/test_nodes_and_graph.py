@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import random
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rclpy
 from rcl_interfaces.msg import Log, ParameterEvent, SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
@@ -16,7 +18,7 @@ from std_msgs.msg import String, UInt64
 from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
-from rsltrace.errors import JobError, NodeError, RunError
+from rsltrace.errors import JobError, NodeError
 
 pytestmark = pytest.mark.ros
 
@@ -95,12 +97,73 @@ def test_a_broken_parameter_file_is_named(simulate: Any, tmp_path: Path) -> None
         simulate(NodeSpec(node=Parametrized, parameter_files=["broken.yaml"]), duration=1)
 
 
-def test_two_nodes_of_one_name_are_refused(simulate: Any) -> None:
-    def twice() -> list[Node]:
-        return [Node("same"), Node("same")]
+class Same(Node):
+    def __init__(self, number: int) -> None:
+        super().__init__("same")
+        self.number = number
+        self.heard: list[int] = []
+        self.publisher = self.create_publisher(UInt64, "numbers", 10)
+        self.create_subscription(UInt64, "numbers", lambda m: self.heard.append(m.data), 10)
+        self.create_timer(1.0, self.tick)
 
-    with pytest.raises(RunError, match="already a node named /same"):
-        simulate(twice, duration=1)
+    def tick(self) -> None:
+        self.publisher.publish(UInt64(data=self.number))
+        self.get_logger().info(f"{self.number} draws {random.random()}")
+
+
+def test_two_nodes_of_one_name_are_kept_apart(simulate: Any, capfd: Any) -> None:
+    made: list[Any] = []
+
+    def same(number: int) -> Any:
+        def make() -> Node:
+            made.append(Same(number))
+            return made[-1]
+
+        return make
+
+    def others(first: Any) -> None:
+        made.clear()
+        delay = {"default": {"uniform": {"min": 0, "max": "1ms"}}}
+        recorded = simulate(same(1), same(2), duration=1.5, job={"delay": delay, "seed": 3})
+        assert [sorted(node.heard) for node in made] == [[1, 2], [1, 2]]
+        assert recorded.result.notes == ("several nodes are named /same",)
+        with recorded.trace() as trace:
+            nodes = [e for e in trace.entities.values() if e.kind.label == "node"]
+        calls = {(met.node, met.count) for met in recorded.result.guarded}
+        assert [node.name for node in nodes] == ["/same", "/same"]
+        assert {("/same", 1), ("/same #2", 1)} <= calls
+        first.append((recorded.result.digest, recorded.logs()))
+
+    runs: list[Any] = []
+    others(runs)
+    others(runs)
+    assert runs[0] == runs[1]
+    one, two = runs[0][1]
+    assert one.split()[0] == "1"
+    assert two.split()[0] == "2"
+    assert one.split()[2] != two.split()[2]  # each draws from a stream of its own
+
+
+def test_nodes_of_one_name_in_one_process_share_the_publisher_of_logs(
+    simulate: Any, capfd: Any
+) -> None:
+    """As rcl does, which warns of it."""
+
+    def program() -> None:
+        rclpy.init()
+        first, second = Node("same"), Node("same")
+        first.get_logger().info("first")
+        second.get_logger().info("second")
+        second.destroy_node()
+        first.get_logger().info("nobody publishes this")
+
+    def other() -> None:
+        rclpy.init()
+        node = Node("same")  # in a process of its own
+        node.get_logger().info("other")
+
+    recorded = simulate(NodeSpec(main=program), NodeSpec(main=other))
+    assert recorded.logs() == ["first", "second", "other"]
 
 
 def test_parameter_services_events_and_callbacks(simulate: Any) -> None:

@@ -128,10 +128,22 @@ def test_a_field_that_no_exit_status_can_come_from(
     assert f"job.yaml:2:43: stop.topic.exit_code: {message}" in str(result.error)
 
 
+ONCE = """
+class Once(Node):
+    made = 0
+
+    def __init__(self):
+        if Once.made:
+            raise ValueError("there is one of it")
+        Once.made += 1
+        super().__init__("once")
+"""
+
+
 def test_which_of_several_alike_could_not_be_made(record_job: Callable[..., Any]) -> None:
-    yaml = "nodes:\n  - node: nodes_under_test:Talker\n  - node: nodes_under_test:Talker\n"
-    error = record_job(yaml, NODES, output=None).error
-    first, *_, last = str(error).splitlines()
-    assert first.startswith("there is already a node named /talker")
+    yaml = "nodes:\n  - node: nodes_under_test:Once\n  - node: nodes_under_test:Once\n"
+    error = record_job(yaml, NODES + ONCE, output=None).error
+    _, *_, last = str(error).splitlines()
+    assert "there is one of it" in str(error)
     assert last.startswith("  the job names it at ")
     assert last.endswith("job.yaml:3:5")

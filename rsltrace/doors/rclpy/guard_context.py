@@ -29,7 +29,7 @@ class GuardContext:
         """Return the node whose code runs, or the entry whose constructor has made none yet."""
         stacks = self._stacks
         if stacks.event.node is not None:
-            return str(stacks.event.node.fully_qualified_name)
+            return str(stacks.event.node.key)
         entry = entry_of(stacks.event)
         return entry.key if entry is not None else ""
 

@@ -31,5 +31,5 @@ def parameters_of(graph: Graph) -> dict[str, Parameters]:
             continue
         declared = tuple(node._parameters)
         unused = tuple(name for name in node._parameter_overrides if name not in node._parameters)
-        found[handle.fully_qualified_name] = Parameters(handle.entry_key, declared, unused)
+        found[handle.key] = Parameters(handle.entry_key, declared, unused)
     return found

@@ -22,6 +22,14 @@ from rsltrace.trace.format import TOPIC_ROSOUT
 _SEVERITY = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 _TEN_SECONDS_NS = 10 * NS_PER_S
 
+_SHARED = (
+    "Publisher already registered for node name: '{0}'. If this is due to multiple nodes with the "
+    "same name then all logs for the logger named '{0}' will go out over the existing publisher. "
+    "As soon as any node with that name is destructed it will unregister the publisher, preventing "
+    "any further logs for that name from being published on the rosout topic."
+)
+"""What rcl says."""
+
 QOS_ROSOUT = Qos(
     history=History.KEEP_LAST,
     depth=1000,
@@ -48,7 +56,7 @@ class Logs:
         self._domain = domain
         self._base_dir = base_dir
         self.echo = echo
-        self._nodes: dict[str, NodeHandle] = {}
+        self._nodes: dict[str, list[NodeHandle]] = {}
         self._files: dict[str, str] = {}
 
     @cached_property
@@ -59,22 +67,37 @@ class Logs:
         return Log()
 
     def attach(self, node: NodeHandle, qos: Any = None) -> None:
-        """Give a node its /rosout publisher, with the usual QoS profile unless it says another."""
+        """Give a node its /rosout publisher, with the usual QoS profile unless it says another.
+
+        As in rcl, nodes of one name in one process share that of the first.
+        """
         from rcl_interfaces.msg import Log
 
+        name = node.logger_name()
+        same = self._nodes.setdefault(name, [])
+        if any(one.process is node.process and one.context.ok() for one in same):
+            if self.echo:
+                self._print(
+                    30, self._domain.loop.now_ns, "rcl.logging_rosout", _SHARED.format(name)
+                )
+            return
         node.rosout = RosoutHandle(node, Log, TOPIC_ROSOUT, QOS_ROSOUT if qos is None else qos)
-        self._nodes[node.logger_name()] = node
+        same.append(node)
 
     def detach(self, node: NodeHandle) -> None:
-        """Forget a node."""
-        self._nodes.pop(node.logger_name(), None)
+        """Forget a node, and the publisher that it shares with others of its name."""
+        same = self._nodes.get(node.logger_name(), [])
+        for one in [one for one in same if one.process is node.process]:
+            same.remove(one)
+            if one is not node and one.context.ok() and one.rosout is not None:
+                one.rosout.destroy()
 
     def add_sublogger(self, name: str, child: str) -> bool:
         """Let a child logger publish through its node; False if the node has no /rosout."""
-        node = self._nodes.get(name)
-        if node is not None:
-            self._nodes[f"{name}.{child}"] = node
-        return node is not None
+        nodes = self._nodes.get(name)
+        if nodes:
+            self._nodes[f"{name}.{child}"] = nodes
+        return bool(nodes)
 
     def log(
         self, severity: int, name: str, message: Any, function: str, file: str, line: int
@@ -90,7 +113,10 @@ class Logs:
         severity = int(severity)
         if self.echo:
             self._print(severity, now_ns, name, message)
-        node = self._nodes.get(name) or self._domain.event.node
+        nodes, node = self._nodes.get(name), self._domain.event.node
+        if nodes:
+            process = getattr(node, "process", None)
+            node = next((one for one in nodes if one.process is process), nodes[0])
         rosout = getattr(node, "rosout", None)
         if rosout is None or rosout.destroyed:
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from itertools import count
 from typing import Any, Protocol
 
 from rsltrace.doors.rclpy.arguments import (
@@ -16,7 +17,6 @@ from rsltrace.doors.rclpy.handles.node_state import NodeStates
 from rsltrace.doors.rclpy.stacks.construction import policy_of
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
-from rsltrace.errors import NodeError
 from rsltrace.middleware.entity import DomainEntity, callback_name
 from rsltrace.middleware.events.census import Asker
 from rsltrace.middleware.graph import Graph, action_names_and_types, names_and_types
@@ -86,9 +86,8 @@ class NodeHandle(Destroyable, Participant):
         self._logs = logs
         name, namespace = self._renamed(node_name, namespace)
         domain = stacks.domain
-        if _is_taken(stacks, full_name(namespace, name)):
-            raise _duplicate(full_name(namespace, name), domain.loop.now_ns)
         Participant.__init__(self, domain.dispatcher, name, namespace, domain.dispatcher.door)
+        self._number_among_others()
         self.policy = policy_of(stacks.event)
         self.state = states.add(self)
         self.mailbox: Mailbox | None = None
@@ -104,6 +103,17 @@ class NodeHandle(Destroyable, Participant):
         said = [each.rosout() for each in [*self._outer, self.arguments]]
         if enable_rosout and next((s for s in reversed(said) if s is not None), True):
             logs.attach(self, rosout_qos)
+
+    def _number_among_others(self) -> None:
+        """Tell the node apart from others of its name. ROS allows that; it is seldom meant."""
+        others = _at_work(self.stacks, self.fully_qualified_name)
+        if others:
+            taken = {other.number for other in others}
+            self.number = next(number for number in count(1) if number not in taken)
+            note = f"several nodes are named {self.fully_qualified_name}"
+            notes = self.stacks.domain.outcome.notes
+            if note not in notes:
+                notes.append(note)
 
     def _set_log_levels(self) -> None:
         """Do what ``--log-level`` asks for, for the loggers it names and for this node's."""
@@ -256,25 +266,14 @@ def class_name(cls: type) -> str:
     return f"{cls.__module__}:{cls.__qualname__}"
 
 
-def _is_taken(stacks: Stacks, name: str) -> bool:
-    """Return whether a node of that name is at work.
+def _at_work(stacks: Stacks, name: str) -> list[Participant]:
+    """Return the nodes of a name that are at work.
 
     In a program's hands a node may be left behind: its context is shut down, or nobody spins it.
     """
-    for node in stacks.domain.graph.nodes_named(name):
-        if not isinstance(node, NodeHandle):
-            return True
-        if node.context.ok() and (node.wrapper is not None or stacks.programs.is_hosted):
-            return True
-    return False
-
-
-def _duplicate(name: str, now_ns: int) -> NodeError:
-    return NodeError(
-        f"there is already a node named {name}; give one of them another name or namespace "
-        "(name: or namespace: in the job)",
-        node=name,
-        entity=name,
-        stamp_ns=now_ns,
-        traceback_text="",
-    )
+    return [
+        node
+        for node in stacks.domain.graph.nodes_named(name)
+        if not isinstance(node, NodeHandle)
+        or (node.context.ok() and (node.wrapper is not None or stacks.programs.is_hosted))
+    ]

@@ -106,7 +106,7 @@ class NodeStates:
         if not wanted:
             return None
         state = NodeState(handle.dispatcher, handle, keeps=wanted == "record")
-        self.by_node[handle.fully_qualified_name] = state
+        self.by_node[handle.key] = state
         return state
 
 
