@@ -288,6 +288,6 @@ def run_shell(
         env={"PATH": os.environ.get("PATH", ""), **environment},
         capture_output=True,
         stdin=subprocess.DEVNULL,
-        timeout=60,
+        timeout=600,
         check=False,
     )

@@ -41,7 +41,7 @@ class Limits:
     cpu_s: float = 10.0
     rss_mib: int = 700
     address_mib: int = 6144
-    wall_s: float = 150.0
+    wall_s: float = 600.0
     file_bytes: int | None = None
 
 

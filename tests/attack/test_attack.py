@@ -175,7 +175,7 @@ _SABOTAGE: dict[Wrong, str] = {
     Wrong.SECRET: "print('password-of-mine')",
     Wrong.LEFT: "import os, time\nif os.fork() == 0: time.sleep(600)",
 }
-_TIGHT = Limits(cpu_s=2, rss_mib=200, wall_s=100)
+_TIGHT = Limits(cpu_s=2, rss_mib=200)
 
 
 def _case(folder: Path) -> Case:

@@ -15,13 +15,13 @@ pytestmark = pytest.mark.ros
 MODULE = """
 def square(x): return x * x
 def answer(asked, answers):
-    for _ in range(3): answers.put(asked.get(timeout=30) * 2)
+    for _ in range(3): answers.put(asked.get(timeout=300) * 2)
 def queues():
     asked, answers = multiprocessing.Queue(), multiprocessing.Queue()
     process = multiprocessing.Process(target=answer, args=(asked, answers))
     process.start()
     for number in range(3): asked.put(number)
-    found = [answers.get(timeout=30) for _ in range(3)]
+    found = [answers.get(timeout=300) for _ in range(3)]
     process.join()
     return found, process.exitcode
 def pool():

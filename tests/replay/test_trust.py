@@ -181,7 +181,7 @@ def test_on_a_terminal_one_is_asked(
         )
         os.close(theirs)
         os.write(ours, f"{answer}\n".encode())
-        out, _ = process.communicate(timeout=60)
+        out, _ = process.communicate(timeout=600)
         os.close(ours)
         assert process.returncode == status
         assert bool(out) == (status == 0)

@@ -30,7 +30,7 @@ def test_robot(name, rsltrace_golden):
     rsltrace_golden("run.mcap", "golden/" + name)
 """
 _OURS = re.compile(r"(?:^|[\s/])rsltrace/[\w/]+\.py:\d+")
-_LIMITS = Limits(cpu_s=30, rss_mib=600, wall_s=150)
+_LIMITS = Limits(cpu_s=30, rss_mib=600)
 
 Make = Callable[[Random, Corpus, Path, bytes], bool]
 """Puts a golden trace at a place, for a run of these bytes; returns whether it may pass."""

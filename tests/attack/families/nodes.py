@@ -20,7 +20,7 @@ nodes:
 stop: {duration: 500ms}
 record: {segment_events: 16}
 """
-_LIMITS = Limits(cpu_s=12, rss_mib=900, wall_s=90)
+_LIMITS = Limits(cpu_s=12, rss_mib=900)
 
 _GROUPS: dict[str, str] = {
     "descriptors": "close_descriptors close_and_take dup2_over_all no_descriptors",

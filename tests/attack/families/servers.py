@@ -22,7 +22,7 @@ from tests.attack.corpus import Corpus
 from tests.attack.families.common import Attack, Family
 from tests.attack.model import Case, Complaint, Limits, Ran, Wrong
 
-_LIMITS = Limits(cpu_s=15, rss_mib=500, wall_s=240)
+_LIMITS = Limits(cpu_s=15, rss_mib=500)
 _SECRETS = ("hunter2-password", "signature-0123456789", "token-abcdef")
 _BLOCK = 1 << 16
 
