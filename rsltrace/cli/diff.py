@@ -26,7 +26,7 @@ _WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 140
 _HEIGHT_MIN = 21
 _PROMPTS = 3
 """Lines a terminal shows beside the report: the command, perhaps on two lines, and the prompt."""
-_ASCII = {ord("└"): "`-", ord("…"): "..."}
+_ASCII = {ord("└"): "`-", ord("…"): "...", ord("→"): "->"}
 
 
 if TYPE_CHECKING:

@@ -11,15 +11,11 @@ from rsltrace.middleware.entity import DomainEntity, callback_name
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.operation import TIMER_CANCEL, TIMER_PERIOD, TIMER_RESET
 from rsltrace.trace.chain import hash64
 
 TIMER = int(EventKind.TIMER)
 _pack_deadline = struct.Struct("<Q").pack
-
-# Operations of TIMER outputs; part of the trace format.
-OP_CANCEL = 1
-OP_RESET = 2
-OP_PERIOD = 3
 
 
 class Timer(DomainEntity):
@@ -71,20 +67,20 @@ class Timer(DomainEntity):
         """Stop; ``reset`` starts again."""
         self.state.canceled = True
         self.dispatcher.loop.timers.remove(self.state)
-        self._note(OP_CANCEL, 0)
+        self._note(TIMER_CANCEL, 0)
 
     def reset(self) -> None:
         """Start a new period now."""
         self.state.reset(self.dispatcher.loop.now_ns)
         if self.active:
             self.dispatcher.loop.timers.add(self.state)
-        self._note(OP_RESET, self.state.deadline_ns)
+        self._note(TIMER_RESET, self.state.deadline_ns)
 
     def set_period(self, period_ns: int) -> None:
         """Set the period; the present deadline stays."""
         if period_ns != self.state.period_ns:
             self.state.period_ns = period_ns
-            self._note(OP_PERIOD, period_ns)
+            self._note(TIMER_PERIOD, period_ns)
 
     def _note(self, operation: int, value: int) -> None:
         if self.active:

@@ -6,6 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-from rsltrace.errors import BagError, RunError
+from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
 from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
@@ -23,6 +24,7 @@ from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.events.census import Census
 from rsltrace.model.finding import GuardCount
+from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.inputs import check_output
 from rsltrace.run.plans.bags import (
@@ -59,6 +61,10 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.entry import Entry
     from rsltrace.doors.rclpy.world import World
     from rsltrace.middleware.events.recorded_run import RecordedRun
+
+_FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
+_WAITS_MAX = 2000
+"""Characters of who waits for what in a deadlock that a trace keeps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,6 +416,7 @@ class Session:
                     "stop_reason": stop.reason,
                     "exit_code": str(exit_code),
                     "ended_after": str(outcome.ended_after),
+                    **_waits(error),
                 },
                 replace=self._has_begun or exit_code == 0,
             )
@@ -428,3 +435,11 @@ class Session:
             notes=(*self._notes, *outcome.notes, *unused),
             guarded=self._guarded.counts,
         )
+
+
+def _waits(error: RunError | None) -> dict[str, str]:
+    """Return what a trace keeps of a deadlock: nothing else in it tells who waits for what."""
+    if not isinstance(error, DeadlockError):
+        return {}
+    text = _FOLDER.sub("", str(error))  # a trace has no path of the machine it was made on
+    return {"error": shortened(text, _WAITS_MAX)}

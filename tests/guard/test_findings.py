@@ -151,7 +151,7 @@ def test_info_cat_and_diff_tell(
     report = command("diff", "a.mcap", "b.mcap")
     assert "verdict: same-input-different-output" in report
     assert "! environment: os.environ['SHIFT']  not set  |  '9'" in report
-    assert "gave different answers" in report
+    assert "gave not set in a" in " ".join(report.split())
     as_json = json.loads(command("diff", "a.mcap", "b.mcap", "--format", "json"))
     assert as_json["divergences"][0]["calls"][0] == {
         "source": "environment",
@@ -179,7 +179,10 @@ def test_a_diff_remembers_what_the_node_read_before(
     assert [(c.call, c.event_a, c.a, c.b) for c in found.calls] == [
         ("os.environ['SHIFT']", 0, "not set", "'9'")
     ]
-    assert f"os.environ['SHIFT'] at {INIT} gave different answers" in (found.root_sentence)
+    assert (
+        f"os.environ['SHIFT'] at {INIT.split()[0]} gave not set in a, '9' in b"
+        in found.root_sentence
+    )
 
 
 @pytest.mark.parametrize(

@@ -45,7 +45,8 @@ def complaints(a: Path, b: Path, truth: Truth) -> list[Complaint]:
     wrong += _words(found, truth)
     if truth.values:
         wrong += _values(found, of_a, of_b, truth.values)
-    wrong += _reaches(found.divergences[0], of_a, of_b)
+    if truth.independent == 1:
+        wrong += _reaches(found.divergences[0], of_a, of_b)
     wrong += _symmetric(found, mirrored)
     return wrong
 
@@ -157,7 +158,7 @@ def _symmetric(found: Diff, mirrored: Diff) -> list[Complaint]:
         one, other = found.divergences[0], mirrored.divergences[0]
         pairs["cause"] = (_bag_of_words(one.root_sentence), _bag_of_words(other.root_sentence))
         pairs["root"] = (_mirror(one.root.value), other.root.value)
-        pairs["reaches"] = (one.reaches, other.reaches)
+        pairs["reaches"] = (_reached(one), _reached(other))
         pairs["messages"] = (
             sorted((m.topic, m.position < 0) for m in one.messages),
             sorted((m.topic, m.position < 0) for m in other.messages),
@@ -176,10 +177,15 @@ def _symmetric(found: Diff, mirrored: Diff) -> list[Complaint]:
     return wrong
 
 
+def _reached(found: Divergence) -> list[tuple[str, int, int]]:
+    return [(reach.topic, reach.after_ns, abs(reach.moved_ns)) for reach in found.reaches]
+
+
 def _mirror(word: str) -> str:
     return _MIRRORED.get(word, word)
 
 
 def _bag_of_words(text: str) -> Counter[str]:
-    words = (_SAME_WORDS.get(word, word) for word in re.findall(r"[\w./:'-]+", text.lower()))
+    found = (word.strip(".:") for word in re.findall(r"[\w./:'-]+", text.lower()))
+    words = (_SAME_WORDS.get(word, word) for word in found)
     return Counter(word for word in words if word)

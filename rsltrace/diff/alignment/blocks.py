@@ -304,7 +304,8 @@ def mark_inverted(items: list[EventPair]) -> None:
 
 
 def _mark_beyond(block: AlignedBlock) -> None:
-    """Mark what one run did after the other had ended. Shutting nodes down is not doing."""
+    """Mark what one run did after the other had ended. Shutting nodes down is not doing, and a
+    run that goes on to a later time without an event has not ended."""
     for rows, other, end, of_b in (
         (block.rows_a, block.rows_b, block.end_b, False),
         (block.rows_b, block.rows_a, block.end_a, True),
@@ -314,7 +315,9 @@ def _mark_beyond(block: AlignedBlock) -> None:
         for item in reversed(block.items):
             theirs, mine = (item.a, item.b) if of_b else (item.b, item.a)
             if theirs >= 0:
-                if other.kind[theirs - other.first] != SHUTDOWN:
+                over = other.run.trace.ended_after
+                unwinding = over is not None and theirs >= over
+                if other.kind[theirs - other.first] != SHUTDOWN and not unwinding:
                     break
             elif rows.kind[mine - rows.first] != SHUTDOWN:
-                item.beyond = True
+                item.beyond = rows.stamp[mine - rows.first] >= other.run.trace.end_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from difflib import SequenceMatcher
 
@@ -18,19 +19,24 @@ def matched_outputs(
     Outputs are matched by what sent them, in order. One that is there in both but at another place
     has moved.
     """
-    if [x[:3] for x in a] == [y[:3] for y in b]:
+    contents_a, contents_b = [x[:3] for x in a], [y[:3] for y in b]
+    if contents_a == contents_b:
+        return
+    if Counter(contents_a) == Counter(contents_b):
+        for position, content in enumerate(contents_a):
+            if content != contents_b[position]:
+                yield position, a[position], b[contents_b.index(content)], True
         return
     pairs = list(_paired(a, b))
-    missing = {y[:3]: y for _, x, y in pairs if x is None and y is not None}
-    moved: set[tuple[int, int, int]] = set()
+    alone_a = {x[:3] for _, x, y in pairs if x is not None and y is None}
+    alone_b = {y[:3]: y for _, x, y in pairs if y is not None and x is None}
     for position, x, y in pairs:
         if x is not None and y is not None:
             if x[:3] != y[:3]:
                 yield position, x, y, False
-        elif x is not None and x[:3] in missing:
-            moved.add(x[:3])
-            yield position, x, missing[x[:3]], True
-        elif y is None or y[:3] not in moved:
+        elif x is not None and x[:3] in alone_b:
+            yield position, x, alone_b[x[:3]], True
+        elif y is None or y[:3] not in alone_a:
             yield position, x, y, False
 
 

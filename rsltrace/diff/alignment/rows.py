@@ -12,6 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
+from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.trace.reader import Trace
@@ -19,8 +20,11 @@ from rsltrace.trace.reader import Trace
 CONSTRUCT = int(EventKind.CONSTRUCT)
 BAG = int(EventKind.BAG)
 TIMER = int(EventKind.TIMER)
+SUBSCRIPTION = int(EventKind.SUBSCRIPTION)
 SHUTDOWN = int(EventKind.SHUTDOWN)
 _ENTITY = int(OutputKind.ENTITY)
+_DRAW = int(OutputKind.DRAW)
+_ZERO_DELAY = encode_draw(Draw.DELAY, 0)
 
 OutputRow = tuple[int, int, int, int]
 """(kind, number of the entity, content hash, payload sequence) of an output. The content hash of a
@@ -34,6 +38,8 @@ class Run:
     trace: Trace
     matching: EntityMatching
     of_b: bool
+    without_zero_delays: bool = False
+    """Whether a delay of 0 ns counts as no delay: the jobs differ in their delays."""
 
 
 @dataclass
@@ -127,9 +133,11 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
             rows.number[place] = rows.owner[place] = _constructed(rows, place)
         elif kind == BAG:
             rows.owner[place] = rows.number[place]
-    if not run.matching.same_ids:
+    if not run.matching.same_ids or run.without_zero_delays:
         rows.content = [
-            hash(tuple(output[:3] for output in rows.outputs(first + place))) if count else 0
+            hash(tuple(o[:3] for o in rows.outputs(first + place) if counts(run, o)))
+            if count
+            else 0
             for place, count in enumerate(rows.output_counts)
         ]
     return rows
@@ -147,6 +155,11 @@ def _constructed(rows: Rows, place: int) -> int:
         if kind == _ENTITY and keys[number].kind == EntityKind.NODE.label:
             return number
     return 0
+
+
+def counts(run: Run, output: OutputRow) -> bool:
+    """Whether an output is compared."""
+    return not (run.without_zero_delays and output[0] == _DRAW and output[2] == _ZERO_DELAY)
 
 
 def outputs_of(run: Run, index: int) -> list[OutputRow]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from itertools import zip_longest
 
 from rsltrace.diff.alignment.rows import Run
@@ -11,6 +12,8 @@ from rsltrace.model.finding import Finding
 
 CALLS_MAX = 20
 EARLIER_MAX = 3
+_FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
+"""The folder of an absolute path between quotes."""
 
 
 def call_differences(
@@ -45,19 +48,20 @@ def _before(run: Run, view: EventView | None, node: str) -> list[Finding]:
 
 
 def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
-    """Pair the n-th findings of each call at each place."""
+    """Pair the n-th findings of each call at each place; a file may lie in another folder."""
     places: dict[tuple[str, str], tuple[list[Finding], list[Finding]]] = {}
     for side, findings in enumerate((a, b)):
         for finding in findings:
-            places.setdefault((finding.call, finding.stack), ([], []))[side].append(finding)
+            place = (_FOLDER.sub(r"\1", finding.call), finding.stack)
+            places.setdefault(place, ([], []))[side].append(finding)
     calls = []
-    for (call, stack), (of_a, of_b) in places.items():
+    for (_, stack), (of_a, of_b) in places.items():
         for x, y in zip_longest(of_a, of_b):
             one = x or y
             calls.append(
                 CallDifference(
                     source=one.source.value,
-                    call=call,
+                    call=one.call,
                     where=stack.partition("\n")[0],
                     event_a=None if x is None else x.event,
                     event_b=None if y is None else y.event,

@@ -8,17 +8,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from rsltrace.diff.causes.event_views import CLOCK_OF, phrase, raised
+from rsltrace.diff.causes.event_views import CLOCK_OF, drawn_for, node_of, phrase, raised
+from rsltrace.diff.causes.lost_messages import GONE
+from rsltrace.diff.causes.output_notes import durations
 from rsltrace.diff.causes.propagation import NODE
-from rsltrace.diff.result.divergence import MessageDifference
+from rsltrace.diff.causes.relevance import Place, Relevance
+from rsltrace.diff.causes.wording import (
+    because_of,
+    field_text,
+    listed,
+    state_text,
+    what_differs,
+)
+from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
-from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 from rsltrace.words.phrases import at_time
 
-_NAMED_MAX = 3
+_NO_DRAW = "none"
+_QOS_EVENT = "new qos event "
+_OF_BAGS = ("bags", "start", "construct_time", "min_time_step")
+"""Keys of a job that decide when a bag's message is played."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +54,16 @@ class Case:
     why: str | None
     messages: Sequence[MessageDifference]
     settings: Sequence[Setting]
+    relevance: Relevance
+    state: Sequence[StateDifference] = ()
+    lost: str = ""
+    """What became of a message that only one run received, where that is known."""
+
+    periods: tuple[int, int] | None = None
+    """Of a timer, its period in both runs (ns), if they differ."""
+
+    swapped_with_ns: int | None = None
+    """When the bag of b plays what the bag of a plays here, and the other way round."""
 
     @property
     def one(self) -> EventView:
@@ -48,6 +71,22 @@ class Case:
         view = self.a or self.b
         assert view is not None
         return view
+
+    def because(self, *, inside: bool = False, drawn: bool = False) -> str:
+        """Say which settings differ that can be the cause, "" if there are none."""
+        views = (self.a, self.b, self.other_a, self.other_b, self.cause_a, self.cause_b)
+        nodes = {node_of(view) for view in views if view is not None}
+        if any(m.topic.startswith(_QOS_EVENT) for m in self.messages):
+            nodes = set()  # whose QoS has changed is not known
+        nodes |= {m.topic.rpartition(" of ")[2] for m in self.messages if _is_draw(m)}
+        constructing = self.one.kind is EventKind.CONSTRUCT or any(
+            m.kind is OutputKind.ENTITY or m.topic == "/parameter_events" for m in self.messages
+        )
+        settings = self.settings
+        if self.one.kind is EventKind.BAG and not drawn:
+            settings = [s for s in settings if s.key.partition(".")[0] in _OF_BAGS]
+        place = Place(frozenset(nodes - {""}), constructing, inside, drawn)
+        return because_of(self.relevance.of(settings, place))
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,13 +146,15 @@ def judge(case: Case) -> Judgement:
 
 def _construction(case: Case) -> Judgement:
     a, b, one = case.a, case.b, case.one
-    verdict, root = Verdict.GRAPH, Root.JOB if case.settings else Root.CALLBACK
-    because = _because_of_settings(case.settings)
+    because = case.because()
+    verdict, root = Verdict.GRAPH, Root.JOB if because else Root.CALLBACK
     if a is None or b is None:
         has, has_not = ("a", "b") if b is None else ("b", "a")
         name = one.entity.name or "a part of the run"
         sentence = f"the graphs differ: {name} is constructed in {has} and not in {has_not}"
         root = Root.JOB
+    elif a.entity != b.entity:
+        sentence = f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
     elif case.inverted:
         sentence = "the nodes are constructed in another order"
     else:
@@ -121,15 +162,17 @@ def _construction(case: Case) -> Judgement:
         if changed:
             where = {"only a": "only in a", "only b": "only in b"}
             things = [f"{m.topic} {where.get(m.presence, 'differs')}" for m in changed]
-            sentence = f"the graphs differ: {phrase(one)} made other entities ({_listed(things)})"
-        elif case.settings:
+            sentence = f"the graphs differ: {phrase(one)} made other entities ({listed(things)})"
+            if any(m.topic.startswith(_QOS_EVENT) for m in changed):
+                sentence += ", since QoS differs"
+        elif because:
             verdict = Verdict.ENVIRONMENT
-            sentence = f"{phrase(one)} did something else{_what_differs(case)}"
+            sentence = f"{phrase(one)} did something else{what_differs(case.messages)}"
         else:
             verdict, root = Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK
             sentence = (
-                f"{phrase(one)} did something else{_what_differs(case)}, in the same job and "
-                "environment"
+                f"{phrase(one)} did something else{what_differs(case.messages)}, in the same job "
+                "and environment"
             )
     why = because or (
         "job and environment are the same as far as the traces tell: the constructor itself is "
@@ -154,7 +197,7 @@ def _schedule(case: Case) -> Judgement:
         "both were ready at the same simulated time; whatever decides between them (order of "
         "creation, of subscription, of delivery) is not the same in the two runs"
     )
-    if because := _because_of_settings(case.settings):
+    if because := case.because():
         root_sentence = f"both were ready at the same simulated time, and {because}"
     return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, root_sentence, first, second)
 
@@ -165,7 +208,9 @@ def _one_sided(case: Case) -> Judgement:
     has, has_not = ("a", "b") if a else ("b", "a")
     instead = case.other_b if a else case.other_a
     sentence = f"{phrase(one)} {at_time(one.stamp_ns)} happened only in {has}"
-    if instead is not None:
+    if case.lost:
+        sentence += f": {case.lost}"
+    elif instead is not None:
         sentence += f"; {has_not} went on with {phrase(instead)} {at_time(instead.stamp_ns)}"
     cause = case.cause_a if a else case.cause_b
     if case.why is not None:
@@ -173,15 +218,20 @@ def _one_sided(case: Case) -> Judgement:
     elif cause is not None:
         root_sentence = (
             f"what it should have received was sent in both runs (event {cause.index}, "
-            f"{phrase(cause)}), but arrived only in {has}"
+            f"{phrase(cause)}), but {case.lost or f'arrived only in {has}'}"
         )
+        because = case.because()
+        if because:
+            root_sentence += f"; {because}"
+        elif case.lost.startswith(GONE):
+            root_sentence += f"; {one.entity.node} is not deterministic"
     elif one.kind is EventKind.BAG:
         root_sentence = f"only the bag of {has} has this message"
     elif one.kind is EventKind.OUTSIDE:
         root_sentence = f"whoever drove the simulation did this only in {has}"
     else:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
-        if because := _because_of_settings(case.settings):
+        if because := case.because():
             root_sentence = f"nothing before it differs, but {because}"
     return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
 
@@ -195,11 +245,18 @@ def _exception(case: Case, a: EventView, b: EventView) -> Judgement:
         "from the same input"
     )
     return Judgement(
-        Verdict.EXCEPTION, Root.EXCEPTION, sentence, _hidden(case, "what decides over it"), a, b
+        Verdict.EXCEPTION,
+        Root.EXCEPTION,
+        sentence,
+        _hidden(case, f"{phrase(a)} itself", inside=True),
+        a,
+        b,
     )
 
 
 def _timing(case: Case, a: EventView, b: EventView) -> Judgement:
+    if a.kind is EventKind.BAG:
+        return _bag_timing(case, a, b)
     delta_ns = b.stamp_ns - a.stamp_ns
     if delta_ns:
         late = "later" if delta_ns > 0 else "earlier"
@@ -207,6 +264,8 @@ def _timing(case: Case, a: EventView, b: EventView) -> Judgement:
             f"{phrase(a)} ran {at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b, "
             f"{format_duration(abs(delta_ns))} {late}"
         )
+        if case.periods is not None:
+            sentence += f": timer period {durations(*case.periods)}"
     else:
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} was due at another time in a than in b"
     return Judgement(
@@ -214,11 +273,31 @@ def _timing(case: Case, a: EventView, b: EventView) -> Judgement:
     )
 
 
+def _bag_timing(case: Case, a: EventView, b: EventView) -> Judgement:
+    """A bag decides on the time of its messages, and nothing else does."""
+    times = f"{at_time(a.stamp_ns)} in a and {at_time(b.stamp_ns)} in b"
+    if case.swapped_with_ns is not None:
+        early, late = sorted((a.stamp_ns, b.stamp_ns))
+        sentence = (
+            f"the bag's messages on {a.entity.name} {at_time(early)} and {at_time(late)} are "
+            "swapped"
+        )
+        why = "the bags that were played have these two messages in another order"
+    else:
+        late_ns = b.stamp_ns - a.stamp_ns
+        late_text = "later" if late_ns > 0 else "earlier"
+        sentence = f"{phrase(a)} was played {times}, {format_duration(abs(late_ns))} {late_text}"
+        why = case.because() or "the bags that were played have this message at another time"
+    return Judgement(Verdict.TIMING, Root.EXTERNAL_INPUT, sentence, why, a, b)
+
+
 def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
     inputs = [m.topic for m in case.messages if m.position < 0 and m.topic]
     what = f"another {inputs[0]}" if inputs else "another input"
     if a.kind is EventKind.BAG:
-        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one"
+        values = next((field_text(m.fields, m.more_fields) for m in case.messages), "")
+        told = f" ({values})" if values else ""
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one{told}"
         root, why = Root.EXTERNAL_INPUT, "the bags that were played differ in this message"
     elif a.kind is EventKind.OUTSIDE:
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one"
@@ -253,35 +332,50 @@ def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDiffere
     was_a, was_b = (first.fields[0].a, first.fields[0].b) if first.fields else ("?", "?")
     is_clock = first.topic.startswith(CLOCK_OF)
     same = "read a clock" if is_clock else "did the same in both runs"
-    sentence = (
-        f"{phrase(a)} {at_time(a.stamp_ns)} {same}, but chance decided otherwise: "
-        f"{first.topic}: {was_a} in a, {was_b} in b"
-    )
+    because = case.because(drawn=True)
+    what = f"{first.topic}: {_drawn(was_a, was_b)} in a, {_drawn(was_b, was_a)} in b"
+    if first.topic == drawn_for(a.entity) and not is_clock:
+        what = f"{was_a} in a and {was_b} in b".replace("takes", "took")
+    if _NO_DRAW in (was_a, was_b) and not is_clock and not because:
+        has, has_not = ("b", "a") if was_a == _NO_DRAW else ("a", "b")
+        what = f"what it sent goes to {first.topic} only in {has}"
+        because = (
+            f"in {has_not} nothing is under way to {first.topic}: it is gone, or not connected"
+        )
+    chance = "" if because and "seed" not in because else "chance decided otherwise: "
+    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} {same}, but {chance}{what}"
     if len(draws) > 1:
         sentence += f" (and {len(draws) - 1} more)"
-    why = _because_of_settings(case.settings) or (
+    why = because or (
         "job and seed are the same as far as the traces tell, so the stream of this link had been "
         "drawn from a different number of times before"
     )
     return Judgement(Verdict.DRAW, Root.DRAW, sentence, why, a, b)
 
 
+def _drawn(text: str, other: str) -> str:
+    return f"no {other.partition(' ')[0]}" if text == _NO_DRAW else text
+
+
 def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
     if a.kind is EventKind.OUTSIDE:
-        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is something else{_what_differs(case)}"
+        sentence = (
+            f"{phrase(a)} {at_time(a.stamp_ns)} is something else{what_differs(case.messages)}"
+        )
         root = Root.EXTERNAL_INPUT
         return Judgement(Verdict.DIFFERENT_INPUT, root, sentence, _DRIVEN_DIFFERENTLY, a, b)
     same = "the same input" if a.input_hash else "no input"
     sentence = f"{phrase(a)} {at_time(a.stamp_ns)} got {same} in both runs"
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
         sentence += " and sent the same, but left its node in another state"
+        sentence += state_text(case.state)
     else:
-        sentence += f" and did something else{_what_differs(case)}"
+        sentence += f" and did something else{what_differs(case.messages)}"
     return Judgement(
         Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
         Root.CALLBACK,
         sentence,
-        _hidden(case, "the callback itself"),
+        _hidden(case, "the callback itself", inside=not _suspended(a, b)),
         a,
         b,
     )
@@ -290,35 +384,29 @@ def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
 # -- words ---------------------------------------------------------------------------------------
 
 
-def _hidden(case: Case, what: str) -> str:
+def _hidden(case: Case, what: str, *, inside: bool = False) -> str:
     """Say what a root means: nothing that the trace shows differs before it."""
     if case.why == NODE:
         return ""
+    if because := case.because(inside=inside):
+        return f"nothing before it differs, but {because}"
     text = f"nothing before it differs: {what} is not deterministic"
-    because = _because_of_settings(case.settings)
-    return f"nothing before it differs, but {because}" if because else text
+    if case.one.entity.node and not case.one.state_hash:
+        text += (
+            f", or the state of {case.one.entity.node} differed before (which "
+            "guard: {state: record} in the job tells)"
+        )
+    if case.relevance.guard_is_off:
+        text += "; with guard: false nobody saw what it read from outside"
+    return text
 
 
-def _because_of_settings(settings: Sequence[Setting]) -> str:
-    if not settings:
-        return ""
-    return f"the runs were made differently: {_listed([str(setting) for setting in settings])}"
+def _suspended(a: EventView, b: EventView) -> bool:
+    return EventFlag.SUSPENDED in a.flags | b.flags
 
 
-def _what_differs(case: Case) -> str:
-    where = {"only a": " only in a", "only b": " only in b"}
-    things = [
-        f"{message.topic}{where.get(message.presence, '')}"
-        for message in case.messages
-        if message.position >= 0
-    ]
-    return f" ({_listed(things)})" if things else ""
-
-
-def _listed(things: Sequence[str]) -> str:
-    unique = list(dict.fromkeys(things))
-    more = len(unique) - _NAMED_MAX
-    return ", ".join(unique[:_NAMED_MAX]) + (f" and {more} more" if more > 0 else "")
+def _is_draw(message: MessageDifference) -> bool:
+    return message.kind is OutputKind.DRAW
 
 
 def _event(index: int) -> str:

@@ -138,6 +138,12 @@ def drawn_for(key: EntityKey) -> str:
     return f"{key.kind} {key.name} of {key.node}"
 
 
+def node_of(view: EventView) -> str:
+    """Return the full name of the node an event is of; a constructor's is the one it makes."""
+    is_node = view.entity.kind == EntityKind.NODE.label
+    return view.entity.name if is_node else view.entity.node
+
+
 def phrase(view: EventView) -> str:
     """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
     return event_phrase(view.kind, view.entity)

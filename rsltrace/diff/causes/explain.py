@@ -10,10 +10,13 @@ from rsltrace.diff.alignment.rows import Run, outputs_of
 from rsltrace.diff.causes.call_differences import call_differences
 from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
 from rsltrace.diff.causes.event_views import EventViews
+from rsltrace.diff.causes.lost_messages import lost_message
 from rsltrace.diff.causes.message_differences import message_differences
-from rsltrace.diff.causes.propagation import NODE, FoundDivergence, Origin
+from rsltrace.diff.causes.propagation import BUSY, DRAWN, NODE, STUCK, FoundDivergence, Origin
 from rsltrace.diff.causes.record_command import record_again
+from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
+from rsltrace.diff.causes.swapped import swapped_with
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import (
     CallDifference,
@@ -26,6 +29,7 @@ from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 
 ANCESTORS_MAX = 5
@@ -49,6 +53,7 @@ class Explainer:
     def __post_init__(self) -> None:
         self._viewer_a = EventViews(self.run_a)
         self._viewer_b = EventViews(self.run_b)
+        self._relevance = Relevance(self.run_a, self.run_b)
         self.warnings: dict[str, None] = {}
         """What to know before one runs a ``next_step``."""
 
@@ -86,6 +91,12 @@ class Explainer:
     ) -> tuple[EventView | None, EventView | None, tuple[MessageDifference, ...]]:
         item = found.origin.item
         a, b = self.view(item.a, of_b=False), self.view(item.b, of_b=True)
+        other_a, other_b = (
+            self.view(found.place_a, of_b=False),
+            self.view(found.place_b, of_b=True),
+        )
+        if other_a is not None and other_b is not None and _is_renamed(self, other_a, other_b):
+            return other_a, other_b, ()
         return a, b, message_differences(self.run_a, self.run_b, a, b, self.options)
 
     def _judge(
@@ -108,8 +119,25 @@ class Explainer:
                 why=found.origin.why,
                 messages=messages,
                 settings=self.settings,
+                relevance=self._relevance,
+                state=state_differences(self.run_a, self.run_b, a, b),
+                lost=lost_message(self.run_a, self.run_b, a, b),
+                periods=self._periods(a, b),
+                swapped_with_ns=swapped_with(self.run_a, self.run_b, a, b),
             )
         )
+
+    def _periods(self, a: EventView | None, b: EventView | None) -> tuple[int, int] | None:
+        if a is None or b is None or a.kind is not EventKind.TIMER:
+            return None
+        found = []
+        for run, view in ((self.run_a, a), (self.run_b, b)):
+            entity = run.trace.entities[run.trace.event(view.index).entity]
+            found.append(entity.detail.get("period_ns"))
+        one, other = found
+        if isinstance(one, int) and isinstance(other, int) and one != other:
+            return one, other
+        return None
 
     def _root_judgement(self, number: int) -> Judgement:
         if number not in self._judged:
@@ -145,6 +173,8 @@ class Explainer:
                 item = following.item
                 view = self.view(item.a, of_b=False) or self.view(item.b, of_b=True)
                 relation = f"may have changed the state of {view.entity.node}" if view else ""
+            elif following is not None and following.why in _SHARED:
+                relation = _SHARED[following.why]
             elif following is not None:
                 relation = self._sent(following)
             a = self.view(origin.item.a, of_b=False)
@@ -229,14 +259,14 @@ class Explainer:
 
     def _reaches(self, found: FoundDivergence) -> tuple[Reach, ...]:
         keys = self.run_a.matching.keys
-        topics: dict[str, tuple[int, int]] = {}
-        for number, (first, count) in found.reached.items():
+        topics: dict[str, tuple[int, int, int]] = {}
+        for number, (first, count, moved) in found.reached.items():
             topic = keys[number].name
-            earlier, so_far = topics.get(topic, (first, 0))
-            topics[topic] = (min(first, earlier), so_far + count)
+            earlier, so_far, by = topics.get(topic, (first, 0, moved))
+            topics[topic] = (min(first, earlier), so_far + count, moved if first < earlier else by)
         reaches = [
-            Reach(topic, max(first - found.stamp, 0), count)
-            for topic, (first, count) in topics.items()
+            Reach(topic, max(first - found.stamp, 0), count, moved)
+            for topic, (first, count, moved) in topics.items()
             if self.options.wants_topic(topic)
         ]
         return tuple(sorted(reaches, key=lambda reach: (reach.after_ns, reach.topic)))
@@ -279,14 +309,38 @@ def _told_to_differ(settings: Sequence[Setting]) -> bool:
     return any(not setting.place.startswith("environment:") for setting in settings)
 
 
+def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
+    """Whether two constructors make the same node under different names."""
+    if not a.kind is b.kind is EventKind.CONSTRUCT or a.entity.type != b.entity.type:
+        return False
+    matching = explainer.run_a.matching
+    alone_a = matching.by_key[a.entity] in matching.only_a
+    return bool(a.entity.type) and alone_a and matching.by_key[b.entity] in matching.only_b
+
+
 def _with_call(judgement: Judgement, calls: Sequence[CallDifference]) -> str:
-    """Add to the root the first call that can explain it."""
-    if judgement.root is not Root.CALLBACK or not calls:
+    """Say which call explains a root, if one that gave different answers does."""
+    if judgement.root not in _BY_CALLS or not calls or not judgement.root_sentence:
         return judgement.root_sentence
     call = calls[0]
-    differs = "gave different answers" if call.a != call.b else "was called in it"
-    return f"{judgement.root_sentence}; {call.call} at {call.where} {differs}"
+    place = f"{call.call} at {call.where.partition(' in ')[0]}"
+    if call.a == call.b:
+        return judgement.root_sentence
+    if call.a is None or call.b is None:
+        name = "b" if call.a is None else "a"
+        return f"{judgement.root_sentence}; {place} was called only in {name}"
+    a, b = (shortened(printable(value), _ANSWER_MAX) for value in (call.a, call.b))
+    return f"{place} gave {a} in a, {b} in b"
 
+
+_ANSWER_MAX = 60
+_BY_CALLS = frozenset(
+    (Root.CALLBACK, Root.TIMING, Root.MISSING, Root.EXTRA, Root.EXCEPTION, Root.SCHEDULE)
+)
+"""Roots that what a node read from outside can be behind."""
+
+
+_SHARED = {DRAWN: "is drawn otherwise again in", BUSY: "keeps waiting", STUCK: "ended before"}
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
 """What recording the job once more tells more about: which of the two runs is the usual one."""

@@ -16,6 +16,7 @@ from functools import cached_property
 from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file
+from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.result.traces import Setting
 from rsltrace.model.nesting import nested_too_deep
 from rsltrace.model.stamp import format_duration
@@ -33,7 +34,7 @@ Path = tuple["str | int", ...]
 
 def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
     """Return what differs in the jobs, in the order of the job file; keys without a line last."""
-    resolved_a, resolved_b = _resolved(a), _resolved(b)
+    resolved_a, resolved_b = resolved_job(a), resolved_job(b)
     if not resolved_a or not resolved_b:
         return tuple(_differing_lines(a, b))
     text_a, text_b = _JobText(a), _JobText(b)
@@ -44,8 +45,7 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         places = text_a.place(change.path_a, change.a), text_b.place(change.path_b, change.b)
         depth, line = max(places, key=lambda place: place[0])
         name = f"{_name(a, b)}:{line}" if depth else "job"
-        in_a = change.a is not None
-        key = _key(change.path_a, resolved_a) if in_a else _key(change.path_b, resolved_b)
+        key = _shared_key(change, resolved_a, resolved_b)
         found.append((line or _LINES_MAX, Setting(name, *change.shown(), key)))
     return tuple(setting for _, setting in sorted(found, key=lambda item: item[0]))
 
@@ -148,6 +148,19 @@ def _key(path: Path, value: Any) -> str:
     return ".".join(steps)
 
 
+def _shared_key(change: _Change, job_a: Any, job_b: Any) -> str:
+    """Return the key of a change; of a node that goes by another name in each run, by number."""
+    if change.a is None or change.b is None:
+        key = _key(change.path_b, job_b) if change.a is None else _key(change.path_a, job_a)
+        return _numbered(change.path_a) if change.path_a[-1] == "name" else key
+    keys = _key(change.path_a, job_a), _key(change.path_b, job_b)
+    return keys[0] if keys[0] == keys[1] else _numbered(change.path_a)
+
+
+def _numbered(path: Path) -> str:
+    return ".".join(_written(step) for step in path)
+
+
 def _inner(value: Any, step: str | int) -> Any:
     return value.get(step) if isinstance(value, dict) else value[step]
 
@@ -156,14 +169,6 @@ def _is_named_by_users(path: Path) -> bool:
     """Whether a key of the job is a name that its author chose, not one that rsltrace knows."""
     parents = ("arguments", "parameters", "remappings", "topics", "services")
     return isinstance(path[-1], int) or any(parent in parents for parent in path[:-1])
-
-
-def _resolved(trace: Trace) -> dict[str, Any]:
-    try:
-        value = json.loads(trace.job.get("resolved") or "{}")
-    except ValueError:  # of a later version, or damaged: the job files themselves are compared
-        return {}
-    return value if isinstance(value, dict) else {}
 
 
 def _changes(path_a: Path, path_b: Path, a: Any, b: Any) -> Iterator[_Change]:

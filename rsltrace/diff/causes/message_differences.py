@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from rsltrace.diff.alignment.outputs import matched_outputs
-from rsltrace.diff.alignment.rows import OutputRow, Run, outputs_of
+from rsltrace.diff.alignment.rows import OutputRow, Run, counts, outputs_of
 from rsltrace.diff.causes.event_views import drawn_for
+from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER, OutputNotes, parameters_text
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import MessageDifference
 from rsltrace.diff.result.events import EventView
@@ -26,6 +27,7 @@ MESSAGES_MAX = 50
 """Differing messages of one event that are decoded; one callback can publish thousands."""
 
 _EXCEPTION_MAX = 200
+_PARAMETER_EVENTS = "/parameter_events"
 _INPUT = -1
 _IN_BOTH, _ONLY_A, _ONLY_B = "both", "only a", "only b"
 _WITH_PAYLOAD = frozenset(
@@ -66,12 +68,19 @@ class _Evidence:
             yield self._difference(_INPUT, input_a, input_b, hash_a, hash_b)
         outputs_a = outputs_of(self._run_a, a.index) if a is not None else []
         outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
+        notes = OutputNotes(self._run_a, self._run_b, a, b)
         bag = any(view is not None and _is_published_input(view) for view in (a, b))
         for position, x, y, moved in matched_outputs(outputs_a, outputs_b):
+            if not any(row and counts(self._run_a, row) for row in (x, y)):
+                continue
             if bag and (x or y or (0,))[0] == OutputKind.MESSAGE:
                 continue  # what is published is the input, shown already
-            reason = "sent in another order" if moved else ""
-            yield self._difference(position, x, y, x and x[2], y and y[2], reason)
+            found = self._difference(position, x, y, x and x[2], y and y[2], moved=moved)
+            one = x or y
+            if one is not None and not (x and y):
+                note = notes.note(one, (outputs_a, outputs_b), only_b=x is None)
+                found = replace(found, note=note or found.note)
+            yield found
 
     def _input(self, run: Run, view: EventView | None) -> OutputRow | None:
         """Return the output that was an event's input; for a bag message, its own publication."""
@@ -95,7 +104,8 @@ class _Evidence:
         b: OutputRow | None,
         hash_a: int | None,
         hash_b: int | None,
-        reason: str = "",
+        *,
+        moved: bool = False,
     ) -> MessageDifference:
         one = a or b
         assert one is not None
@@ -112,9 +122,10 @@ class _Evidence:
             presence=presence,
             hash_a=hash_a,
             hash_b=hash_b,
-            reason=reason,
+            reason="sent in another order" if moved else "",
+            note=IN_ANOTHER_ORDER if moved else "",
         )
-        if reason or kind == OutputKind.ENTITY:
+        if moved or kind == OutputKind.ENTITY:
             return base
         if kind == OutputKind.DRAW:
             text_a, text_b = (draw_text(output[2]) if output else "none" for output in (a, b))
@@ -134,8 +145,10 @@ class _Evidence:
             lines = str(values[0]).strip().splitlines() or [""]
             return replace(base, preview=shortened(printable(lines[-1]), _EXCEPTION_MAX))
         if len(values) == 1:
-            return replace(base, preview=preview(values[0]))
+            note = parameters_text(values[0]) if topic == _PARAMETER_EVENTS else ""
+            return replace(base, preview=preview(values[0]), note=note)
         fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
+        reason = ""
         if not fields and self._options.ignore:
             reason = "all fields that differ are ignored"
         elif not fields:

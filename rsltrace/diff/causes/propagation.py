@@ -13,11 +13,23 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
-from rsltrace.diff.alignment.rows import CONSTRUCT, SHUTDOWN, OutputRow, Rows
+from rsltrace.diff.alignment.rows import (
+    BAG,
+    CONSTRUCT,
+    SHUTDOWN,
+    SUBSCRIPTION,
+    OutputRow,
+    Rows,
+    counts,
+)
 from rsltrace.model.event import NO_EVENT, OutputKind
+from rsltrace.trace.reader import Trace
 
 CAUSE = "cause"
 NODE = "node"
+DRAWN = "drawn"
+BUSY = "busy"
+STUCK = "stuck"
 REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
 
 UNDECIDED = -1
@@ -49,7 +61,8 @@ class FoundDivergence:
     """A divergence before it is put in words.
 
     ``place_a`` and ``place_b`` say where it stands in runs that have no such event. ``reached``
-    holds for each publisher, client or service: first stamp, number of messages. ``cause_only`` is
+    holds for each publisher, client or service: first stamp, number of messages, and how much later
+    (in b) the first one was sent, if it only moved (else 0). ``cause_only`` is
     set where nothing but the cause differs. ``swapped`` are the entities that changed places.
     """
 
@@ -57,7 +70,7 @@ class FoundDivergence:
     stamp: int
     place_a: int
     place_b: int
-    reached: dict[int, tuple[int, int]] = field(default_factory=dict)
+    reached: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     cause_only: bool = False
     swapped: frozenset[int] = frozenset()
 
@@ -80,6 +93,8 @@ class Propagation:
         self._moment: list[Origin] = []
         self._moment_stamp = -1
         self._inverted_in: dict[int, int] = {}
+        self._drawn: Origin | None = None
+        self._busy: Origin | None = None
 
     def origin_of(self, item: EventPair) -> Origin | None:
         """Return why an item differs, if it does."""
@@ -99,6 +114,8 @@ class Propagation:
 
     def _seed(self, first: EventPair) -> None:
         found = self._root(first)
+        if first.a < 0 or first.b < 0:  # until here the indexes of both runs are the same
+            found.place_a = found.place_b = max(first.a, first.b)
         found.cause_only = first.plain
         if first.plain:
             return
@@ -138,8 +155,42 @@ class Propagation:
             origin = Origin(item, UNDECIDED, why, previous)
             self._moment.append(origin)
             self._remember(item, origin)
-        elif rows.kind[place] != SHUTDOWN:  # when the run ends is said elsewhere
-            self._spread(item, self._root(item).origin)
+        elif (shared := self._shared_root(item)) is not None:
+            self._consequence(item, *shared)
+        elif rows.kind[place] != SHUTDOWN and not self._is_unwinding(item):
+            self._spread(item, self._root(item).origin)  # when the run ends is said elsewhere
+
+    def _shared_root(self, item: EventPair) -> tuple[str, Origin] | None:
+        """Return what an item follows from that neither its cause nor its node tells: what is drawn
+        differently once is drawn differently again, and who is busy for longer keeps others
+        waiting."""
+        a, b = self._block.rows_a, self._block.rows_b
+        if item.a < 0 or item.b < 0:
+            rows, index = self._rows(item)
+            stuck = (b if item.b < 0 else a).run.trace
+            if _failed(stuck) and not _failed(rows.run.trace) and self.found:
+                return STUCK, self.found[0].origin
+            waits = rows.kind[index - rows.first] == SUBSCRIPTION
+            return (BUSY, self._busy) if self._busy is not None and waits else None
+        i, j = item.a - a.first, item.b - b.first
+        if a.stamp[i] != b.stamp[j]:
+            waits = self._busy is not None and a.kind[i] != BAG
+            return (BUSY, self._busy) if self._busy is not None and waits else None
+        only_drawn = a.input[i] == b.input[j] and a.flags[i] == b.flags[j]
+        if self._drawn is None or not only_drawn or a.state[i] != b.state[j]:
+            return None
+        outputs = self._different_outputs(item)
+        if outputs and all(output[0] == _DRAW for output in outputs):
+            return DRAWN, self._drawn
+        return None
+
+    def _is_unwinding(self, item: EventPair) -> bool:
+        """Whether an item is what a run did when it had ended."""
+        a, b = self._block.rows_a.run.trace, self._block.rows_b.run.trace
+        return any(
+            index >= 0 and trace.ended_after is not None and index >= trace.ended_after
+            for trace, index in ((a, item.a), (b, item.b))
+        )
 
     def _consequence(self, item: EventPair, why: str | None, previous: Origin) -> None:
         depth = previous.depth + 1
@@ -163,7 +214,7 @@ class Propagation:
     def _root(self, item: EventPair) -> FoundDivergence:
         origin = Origin(item, len(self.found), None, None)
         place_a, place_b = self._places(item)
-        found = FoundDivergence(origin, self._block.stamp(item), place_a, place_b)
+        found = FoundDivergence(origin, self._first_stamp(item), place_a, place_b)
         self.found.append(found)
         self._remember(item, origin)
         return found
@@ -264,8 +315,9 @@ class Propagation:
         outputs = rows.outputs(mine)
         if nth >= len(outputs):
             return True
-        receiver = rows.number[at - rows.first]
-        if any(o[:2] == (_DRAW, receiver) for o in self._different_outputs(cause)):
+        # A delay is drawn for the receiver, an execution time for what ran.
+        drawn = (rows.number[at - rows.first], rows.number[mine - rows.first])
+        if any(o[0] == _DRAW and o[1] in drawn for o in self._different_outputs(cause)):
             return True
         # Of equal outputs, the second has a counterpart only if the other run sent two.
         sent = outputs[nth][:3]
@@ -286,18 +338,46 @@ class Propagation:
                 self._taint(owner, origin)
             return
         outputs = self._different_outputs(item)
-        nodes = rows.run.matching.nodes
+        nodes, number = rows.run.matching.nodes, rows.number[place]
         if not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
             # What chance decides on the way leaves the sender as it was; its own clock does not.
             self._taint(owner, origin)
+        if any(o[0] == _DRAW for o in outputs):
+            self._drawn = self._drawn or origin
+        if any(o[:2] == (_DRAW, number) for o in outputs):  # it takes longer, or shorter
+            self._busy = self._busy or origin
         found = self.found[origin.root]
-        stamp = self._block.stamp(item)
         for kind, number, _, _ in outputs:
             if kind == OutputKind.ENTITY:  # the node may be one that only this run has
                 self._taint(rows.run.matching.nodes[number], origin)
             elif kind in REACHING:
-                first, count = found.reached.get(number, (stamp, 0))
-                found.reached[number] = (min(first, stamp), count + 1)
+                self._reach(found, number, self._first_stamp(item), 0)
+        for kind, number, _, _ in self._moved_outputs(item, outputs):
+            if kind in REACHING:
+                self._reach(found, number, self._first_stamp(item), self._moved_by(item))
+
+    def _reach(self, found: FoundDivergence, number: int, stamp: int, moved_ns: int) -> None:
+        first, count, moved = found.reached.get(number, (stamp, 0, moved_ns))
+        if stamp < first:
+            first, moved = stamp, moved_ns
+        found.reached[number] = (first, count + 1, moved)
+
+    def _moved_by(self, item: EventPair) -> int:
+        a, b = self._block.rows_a, self._block.rows_b
+        if item.a < 0 or item.b < 0:
+            return 0
+        return b.stamp[item.b - b.first] - a.stamp[item.a - a.first]
+
+    def _first_stamp(self, item: EventPair) -> int:
+        """Return when an item happened in whichever run had it first."""
+        return self._block.stamp(item) + min(self._moved_by(item), 0)
+
+    def _moved_outputs(self, item: EventPair, differing: list[OutputRow]) -> list[OutputRow]:
+        """Return the outputs that both runs have, at another time."""
+        if not self._moved_by(item):
+            return []
+        a = self._block.rows_a
+        return list(_beyond(a.outputs(item.a), Counter(output[:3] for output in differing)))
 
     def _taint(self, owner: int, origin: Origin) -> None:
         if owner:
@@ -308,7 +388,14 @@ class Propagation:
         a, b = self._block.rows_a, self._block.rows_b
         mine = a.outputs(item.a) if item.a >= 0 else []
         theirs = b.outputs(item.b) if item.b >= 0 else []
+        if a.run.without_zero_delays:
+            mine = [output for output in mine if counts(a.run, output)]
+            theirs = [output for output in theirs if counts(b.run, output)]
         return different_outputs(mine, theirs)
+
+
+def _failed(trace: Trace) -> bool:
+    return trace.complete and trace.result.get("exit_code", "0") != "0"
 
 
 def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:

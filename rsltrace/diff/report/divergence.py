@@ -254,13 +254,19 @@ def _brief(event: EventView | None, width: int) -> str:
     )
 
 
+def moved_text(moved_ns: int) -> str:
+    """Return how much later a message came in b: ``later by 4 ms``."""
+    return f"{'later' if moved_ns > 0 else 'earlier'} by {format_duration(abs(moved_ns))}"
+
+
 def _reaches(found: Divergence, width: int) -> Section:
     if not found.reaches:
         return NOTHING
     parts = []
     for reach in found.reaches:
         when = f"after {format_duration(reach.after_ns)}" if reach.after_ns else "at once"
-        parts.append(f"{printable(reach.topic)} {when}")
+        moved = f" ({moved_text(reach.moved_ns)})" if reach.moved_ns else ""
+        parts.append(f"{printable(reach.topic)} {when}{moved}")
     for shown in range(len(parts), 0, -1):
         more = [f"and {len(parts) - shown} more"] if shown < len(parts) else []
         rows = wrapped(f"reaches {', '.join(parts[:shown] + more)}", width, indent="  ")

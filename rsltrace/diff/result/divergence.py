@@ -16,8 +16,10 @@ class MessageDifference:
 
     ``position`` is the output's place in its event, or -1 for the input. ``presence`` is ``both``,
     ``only a`` or ``only b``. ``fields`` is empty when a payload was not recorded; ``reason`` then
-    says so, and how to record it. ``preview`` is the decoded message as one short line where only
-    one side has it (of an exception: its last line). A new entity has hash 0: it is known by name.
+    says so, and how to record it. ``note`` says in a few words what became of it: ``in another
+    order``, ``twice in b``, ``4 ms later in b``, ``cancelled in a``. ``preview`` is the decoded
+    message as one short line where only one side has it (of an exception: its last line). A new
+    entity has hash 0: it is known by name.
     """
 
     kind: OutputKind | None
@@ -31,6 +33,7 @@ class MessageDifference:
     more_fields: int = 0
     preview: str = ""
     reason: str = ""
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,11 +80,15 @@ class CauseStep:
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """A topic that the divergence reaches, and how long (simulated ns) after it."""
+    """A topic that the divergence reaches, and how long (simulated ns) after it.
+
+    ``moved_ns``: the first message is the same one in b, only so much later (negative: earlier).
+    """
 
     topic: str
     after_ns: int
     events: int
+    moved_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 ULP_TOLD_MAX = 1_000_000
 """Reports tell smaller distances in units in the last place: larger ones are no rounding."""
 
+SAME_ELEMENTS = "the same elements in another order"
+"""In the note of an array, or a list, that was put together in another order."""
+
 
 @dataclass(frozen=True, slots=True)
 class FieldDifference:

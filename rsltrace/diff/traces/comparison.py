@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 from rsltrace.diff.alignment.blocks import (
@@ -25,7 +26,7 @@ from rsltrace.diff.result.divergence import Divergence
 from rsltrace.diff.result.traces import Diff, Setting
 from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.counts import EventCounts
-from rsltrace.diff.traces.ended_runs import failures, judge_end, who_ended
+from rsltrace.diff.traces.ended_runs import failure_text, failures, judge_end, who_ended
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.trace.reader import Trace
@@ -54,9 +55,10 @@ class _Comparison:
         self._start = start
         self._options = options
         self._matching: EntityMatching = match_entities(a, b)
-        self._run_a = Run(a, self._matching, of_b=False)
-        self._run_b = Run(b, self._matching, of_b=True)
         self._job = job_settings(a, b)
+        delays = any(setting.key.partition(".")[0] == "delay" for setting in self._job)
+        self._run_a = Run(a, self._matching, of_b=False, without_zero_delays=delays)
+        self._run_b = Run(b, self._matching, of_b=True, without_zero_delays=delays)
         self._environment = environment_settings(a, b)
         self._notes = list(interruptions(a, b))
         self._counts = EventCounts()
@@ -66,7 +68,7 @@ class _Comparison:
         """Return the answer."""
         over = who_ended(self._a, self._b, self._start)
         divergences = [self._ended(over)] if over is not None else self._aligned()
-        first = divergences[0]
+        divergences[0] = first = self._with_failure(divergences[0])
         if first.verdict not in _TELL_THE_END:
             self._notes += failures(self._a, self._b)
         return Diff(
@@ -84,6 +86,13 @@ class _Comparison:
             notes=tuple(self._notes),
             tolerance=messages_within(self._a, self._b, self._start, self._options),
         )
+
+    def _with_failure(self, first: Divergence) -> Divergence:
+        """Add to the cause how one of the runs failed, where that is not said already."""
+        text = failure_text(self._a, self._b)
+        if not text or first.verdict in _TELL_THE_END or not first.root_sentence:
+            return first
+        return replace(first, root_sentence=f"{first.root_sentence}; {text}")
 
     def _sentence(self, first: Divergence) -> str:
         if not self._matching.different_jobs:
@@ -119,12 +128,19 @@ class _Comparison:
                 self._counts.take_equal(block)
                 continue
             known = len(propagation.found)
-            first = first_item(block, self._start) if not known else None
+            first = self._first(block) if not known else None
             propagation.take(block, first)
             self._counts.take(block)
             new = propagation.found[known:]
             wanted += [f for f in new if watch is None or watch(f.origin.item, block)]
         return self._divergences(propagation, wanted)
+
+    def _first(self, block: AlignedBlock) -> EventPair:
+        """Return the pair at which the runs diverge; a delay of 0 ns alone is no divergence."""
+        first = first_item(block, self._start)
+        if first.plain and self._run_a.without_zero_delays:
+            return next((item for item in block.items if not item.plain), first)
+        return first
 
     def _divergences(
         self, propagation: Propagation, wanted: list[FoundDivergence]
@@ -174,21 +190,21 @@ class _Comparison:
 def first_item(block: AlignedBlock, start: int) -> EventPair:
     """Return the pair at which the runs diverge: of event ``start`` of a, or of b.
 
-    If neither run has the other's event there, it is that of a that is said to be missing; if
-    both only changed places, or only times, the one that moved.
+    What came first in time leads, since the other run's event may be a consequence that only moved.
+    Of two at one time it is what only one run has, then what moved to another time, then what did
+    the same, then the one whose name comes first: the same whichever run is a.
     """
-    of_a = next((item for item in block.items if item.a == start), None)
-    of_b = next((item for item in block.items if item.b == start), None)
-    if of_a is None or of_b is None:
-        only = of_a or of_b
-        assert only is not None, "a block holds the event it starts with"
-        return only
-    if of_a is of_b or of_a.b < 0:
-        return of_a
-    if of_b.a < 0:
-        return of_b
-    moved_a, moved_b = _moved(block, of_a), _moved(block, of_b)
-    return of_b if moved_b and not moved_a else of_a
+    found = {}
+    for rows, of_b in ((block.rows_a, False), (block.rows_b, True)):
+        for item in block.items:
+            if (item.b if of_b else item.a) == start:
+                place = start - rows.first
+                paired = item.a >= 0 and item.b >= 0
+                still = paired and not _moved(block, item)
+                name = str(rows.run.matching.keys[rows.number[place]])
+                found[rows.stamp[place], paired, still, not item.same, name] = item
+    assert found, "a block holds the event it starts with"
+    return found[min(found)]
 
 
 def _moved(block: AlignedBlock, item: EventPair) -> bool:

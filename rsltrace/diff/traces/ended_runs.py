@@ -5,15 +5,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from rsltrace.diff.causes.classify import Judgement
+from rsltrace.diff.causes.wording import because_of
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.traces import Setting
 from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION, Root, Verdict
 from rsltrace.diff.traces.sides import stop_reason
 from rsltrace.model.event import Event, EventFlag, EventKind
+from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.reader import Trace
 from rsltrace.words.phrases import at_time, seconds_text
 
 _LOOKED_AT_MAX = 100
+_ERROR_MAX = 300
+NOTHING_LEFT = "nothing left to do"
 
 
 def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
@@ -26,10 +30,44 @@ def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
     for trace in (a, b):
         if not trace.complete and start >= trace.event_count:
             return trace
-    over_a, over_b = _is_over(a, start), _is_over(b, start)
+    over_a, over_b = _is_over(a, b, start), _is_over(b, a, start)
     if over_a and over_b:
         return None if a.end_ns == b.end_ns else a if a.end_ns < b.end_ns else b
     return a if over_a else b if over_b else None
+
+
+def _stops(a: Trace, b: Trace, over: Trace, job: Sequence[Setting]) -> list[Setting]:
+    """Return the stop conditions that differ, if it was they that ended a run."""
+    if exit_code(over) or stop_reason(a) == stop_reason(b) == NOTHING_LEFT:
+        return []
+    return [setting for setting in job if setting.key.partition(".")[0] == "stop"]
+
+
+def _why_ended(over: Trace, name: str, job: Sequence[Setting]) -> str:
+    how = error_text(over)
+    if how:
+        how = f"{name} failed (exit code {exit_code(over)}): {how}"
+    elif exit_code(over):
+        how = f"{name} ended with exit code {exit_code(over)} ({stop_reason(over)})"
+    elif stop_reason(over) == NOTHING_LEFT:
+        how = f"{name} had nothing left to do"
+    else:
+        how = f"{name} ended because of this: {stop_reason(over)}"
+    others = [s for s in job if s.key.partition(".")[0] not in ("stop", "record", "livelock_limit")]
+    because = because_of(others)
+    return f"both do the same until then; {how}{f'; {because}' if because else ''}"
+
+
+def exit_code(trace: Trace) -> int:
+    """Return how a run ended, 0 if it is not known."""
+    text = trace.result.get("exit_code", "0") if trace.complete else "0"
+    return int(text) if text.isdecimal() else 0
+
+
+def error_text(trace: Trace) -> str:
+    """Return why a run failed, in one line; "" if it did not, or where the trace does not say."""
+    text = trace.result.get("error", "") if trace.complete else ""
+    return shortened(printable(" ".join(text.split())), _ERROR_MAX)
 
 
 def failures(a: Trace, b: Trace) -> list[str]:
@@ -44,6 +82,15 @@ def failures(a: Trace, b: Trace) -> list[str]:
     ]
 
 
+def failure_text(a: Trace, b: Trace) -> str:
+    """Say how the one run failed that did, "" if both did or none."""
+    if bool(exit_code(a)) == bool(exit_code(b)):
+        return ""
+    name, trace = ("a", a) if exit_code(a) else ("b", b)
+    why = error_text(trace) or stop_reason(trace)
+    return f"{name} then failed (exit code {exit_code(trace)}): {why}"
+
+
 def _failed(trace: Trace) -> Event | None:
     """Return the event whose exception ended a run: what follows it are the ends of its nodes."""
     if not trace.complete or trace.result.get("exit_code", "0") == "0":
@@ -56,8 +103,15 @@ def _failed(trace: Trace) -> Event | None:
     return None
 
 
-def _is_over(trace: Trace, start: int) -> bool:
-    """Whether a run had ended before its event ``start``."""
+def _is_over(trace: Trace, other: Trace, start: int) -> bool:
+    """Whether a run had ended before its event ``start``: not if it lasted until after that of the
+    other, without an event."""
+    if (
+        not exit_code(trace)
+        and start < other.event_count
+        and other.event(start).stamp_ns < trace.end_ns
+    ):
+        return False
     if trace.ended_after is not None:
         return start >= trace.ended_after
     # A trace of an earlier version: one of class nodes ends with their destruction.
@@ -83,13 +137,11 @@ def judge_end(
             f"the recording of {name} was cut off: its run was killed, is still going on, or the "
             "file is not whole"
         )
-    elif told := [setting for setting in job if setting.key.partition(".")[0] == "stop"]:
+    elif told := _stops(a, b, over, job):
         root = Root.JOB
         differs = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in told)
         why = f"both do the same as long as they last, and their jobs differ in {differs}"
     else:
-        why = (
-            f"both do the same as long as they last; {name} was told to stop, or had no more to do"
-        )
+        why = _why_ended(over, name, job)
     a_view, b_view = (view_a, None) if over is b else (None, view_a)
     return Judgement(verdict, root, sentence, why, a_view, b_view)

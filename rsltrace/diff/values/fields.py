@@ -15,7 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import (
     array_text,
@@ -35,6 +35,9 @@ _ABSENT = "absent"
 _NO_FIELD = "only one of the types has this field"
 _TEXT_MAX = 60
 _TEXT_BEFORE = 20
+_SORTED_MAX = 1000
+_ITEM_MAX = 2000
+_LIST_MAX = 80
 
 
 def diff_messages(
@@ -172,6 +175,12 @@ def _list_differences(
             note=f"length {len(a)} and {len(b)}",
             first=extra,
         )
+    elif 1 < len(a) <= _SORTED_MAX and rules.empty:
+        texts_a, texts_b = ([preview(item, _ITEM_MAX) for item in side] for side in (a, b))
+        if texts_a != texts_b and sorted(texts_a) == sorted(texts_b):
+            text_a, text_b = (preview(side, _LIST_MAX) for side in (a, b))
+            yield FieldDifference(path, text_a, text_b, note=SAME_ELEMENTS)
+            return
     for place, (one, other) in enumerate(zip(a, b, strict=False)):
         yield from _differences(f"{path}[{place}]", one, other, base, rules)
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
 from rsltrace.diff.values.globs import FieldRules
 
 BINARY_ITEMS_MIN = 65
@@ -149,6 +149,11 @@ def array_text(values: npt.NDArray[Any], count: int = 4) -> str:
     return f"[{', '.join(shown + more)}]" if len(shown) + len(more) != 1 else f"[{shown[0]}]"
 
 
+def _same_elements(a: npt.NDArray[Any], b: npt.NDArray[Any]) -> bool:
+    """Whether two arrays have the same elements, each as often."""
+    return not len(_unequal(np.sort(a), np.sort(b)))
+
+
 def _width(type_name: str) -> int:
     return 32 if type_name == "float32" else 64
 
@@ -257,6 +262,8 @@ def _array_note(
     notes = []
     if len(a) != len(b):
         notes.append(f"length {len(a)} and {len(b)}")
+    if len(a) == len(b) and len(places) > 1 and _same_elements(a[places], b[places]):
+        notes.append(SAME_ELEMENTS)
     if binary and len(places):
         notes.append(f"first at byte {places[0]}")
     if a.dtype.kind == "f":

@@ -7,7 +7,6 @@ it small; what only some events need belongs elsewhere.
 from __future__ import annotations
 
 import contextlib
-import struct
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -17,10 +16,9 @@ from rsltrace.middleware.events.entity_book import EntityBook
 from rsltrace.middleware.events.event import Door, Event, OutsideEvent, Owner
 from rsltrace.middleware.events.outcome import Outcome
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.operation import pack_operation
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.recorder import Recorder
-
-_pack_value = struct.Struct("<Bq").pack
 
 
 class Dispatcher:
@@ -143,7 +141,7 @@ class Dispatcher:
         if self.recorder is None:
             self.unrecorded += 1
             return 0
-        return self.recorder.output(kind, entity, hash64(_pack_value(operation, value)))
+        return self.recorder.output(kind, entity, hash64(pack_operation(operation, value)))
 
     def draw(self, entity: int, draw: int) -> None:
         """Write down what chance has decided, as an output of the event under way."""

@@ -55,7 +55,7 @@ def irrelevant(name: str) -> Callable[[Change], Change]:
 @irrelevant("what is recorded")
 def record(rng: random.Random, b: World) -> str:
     b.job["record"] = {"exclude": ["/parameter_events"]}
-    return r"record"
+    return r"record\."
 
 
 @irrelevant("livelock limit")

@@ -34,9 +34,7 @@ def parameter(rng: random.Random) -> Planted:
     value = node.parameters["gain"] + rng.choice((0.05, 1.0))
     b.entry(node.name)["parameters"]["gain"] = value
     says = (r"gain", rf"{node.parameters['gain']}\b.*{re.escape(str(value))}")
-    return Planted(
-        a, b, Truth(("environment",), node.full_name, says=says, never=NEVER, independent=None)
-    )
+    return Planted(a, b, Truth(("environment",), node.full_name, says=says, never=NEVER))
 
 
 @fault("constant in code")
@@ -81,7 +79,6 @@ def period(rng: random.Random) -> Planted:
             first=(rf"period.*{was} → {now} ms",),
             says=(rf"code of module {node.module}",),
             never=NEVER,
-            independent=None,
         ),
     )
 
@@ -113,7 +110,6 @@ def drawn_delay(rng: random.Random) -> Planted:
         ("draw",),
         says=(r"\bseed\b", r"delay"),
         never=(NOT_DETERMINISTIC, r"different number of times"),
-        independent=None,
     )
     return Planted(a, b, truth)
 
@@ -184,7 +180,6 @@ def outage(rng: random.Random) -> Planted:
             ("draw", "timing", "missing"),
             says=(r"outage",),
             never=NEVER,
-            independent=None,
         ),
     )
 
@@ -211,7 +206,6 @@ def loss(rng: random.Random) -> Planted:
             first=(r"lost", re.escape(topic)),
             says=(r"drop",),
             never=(NOT_DETERMINISTIC, r"different number of times"),
-            independent=None,
         ),
     )
 
@@ -276,7 +270,7 @@ def executors(rng: random.Random) -> Planted:
 @fault("smallest time step")
 def time_step(rng: random.Random) -> Planted:
     a = random_world(rng)
-    b = changed(a, "min_time_step", "7ms")
+    b = changed(a, "min_time_step", "61ms")
     return Planted(
         a, b, Truth(("timing",), says=(r"min_time_step",), never=NEVER, independent=None)
     )
@@ -299,7 +293,7 @@ def clock(rng: random.Random) -> Planted:
     node.callbacks[0].lines.insert(1, "value = value + self.get_clock().now().nanoseconds * 1e-9")
     a.job["clocks"] = [{"node": node.full_name, "offset": "1ms"}]
     b = changed(a, "clocks", [{"node": node.full_name, "offset": "3ms"}])
-    return Planted(a, b, Truth(says=(r"clocks",), never=NEVER, independent=None))
+    return Planted(a, b, Truth(says=(r"clocks",), never=NEVER))
 
 
 @fault("on_exception")

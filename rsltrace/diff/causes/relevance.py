@@ -1,0 +1,174 @@
+"""Which of the settings that differ can be why two runs diverge at a place.
+
+A key that only says what is recorded, a delay of a topic that is not there, the code of another
+node: they differ, and explain nothing. To blame them hides what is not deterministic.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from functools import cached_property
+from typing import Any
+
+from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.result.traces import Setting
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.finding import Source
+from rsltrace.trace.reader import Trace
+
+_NEVER = frozenset(("record", "livelock_limit", "stop", "vars"))
+_WHEN = frozenset(
+    ("timer_ties", "policy", "execution", "delay", "min_time_step", "executors", "bags")
+)
+"""Keys that decide when something happens and whether it arrives, not what a callback does."""
+
+_CONSTRUCTING = frozenset(("parameters", "parameter_files", "name", "namespace", "remappings"))
+"""Keys of a node that its constructor shows, if they change anything."""
+
+_CODE = "code of module "
+_DRAWING_POLICY = "permutation"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where two runs diverge, as far as it matters for what can be the cause.
+
+    ``nodes`` are the full names of those involved; ``constructing`` says that a node is being made,
+    ``inside`` that a callback got the same at the same time, ``drawn`` that chance decided.
+    """
+
+    nodes: frozenset[str]
+    constructing: bool = False
+    inside: bool = False
+    drawn: bool = False
+
+
+@dataclass
+class Relevance:
+    """Judges settings for the two runs."""
+
+    run_a: Run
+    run_b: Run
+
+    def of(self, settings: Sequence[Setting], place: Place) -> tuple[Setting, ...]:
+        """Return the settings that can be why the runs diverge there."""
+        return tuple(setting for setting in settings if self._can_matter(setting, place))
+
+    def _can_matter(self, setting: Setting, place: Place) -> bool:
+        if setting.place.startswith(_CODE):
+            return self._is_code_of(setting.place.removeprefix(_CODE), place)
+        key, *rest = setting.key.split(".") if setting.key else [""]
+        if key in _NEVER or (key in _WHEN and place.inside):
+            return False
+        if key == "seed":
+            return place.drawn or self._draws(place)
+        if key == "delay":
+            return self._is_of_the_graph(setting, rest)
+        if key == "nodes" and len(rest) > 1:
+            if rest[1] in _CONSTRUCTING and not place.constructing:
+                return False
+            owners = self._nodes_of(rest[0])
+            return not owners or bool(owners & place.nodes)
+        return True
+
+    def _is_code_of(self, module: str, place: Place) -> bool:
+        """Whether a module is one that the nodes may use: not that of another node alone."""
+        owners = {name for name, of in self._modules.items() if of == module}
+        return not owners or not place.nodes or bool(owners & place.nodes)
+
+    def _draws(self, place: Place) -> bool:
+        """Whether a node draws random numbers; what the guard does not see is taken for drawn."""
+        if any(_value(job, "policy", "order") == _DRAWING_POLICY for job in self._jobs):
+            return not place.inside
+        if any(job.get("clocks") for job in self._jobs) or not all(map(_is_guarded, self._jobs)):
+            return True
+        return any(
+            count.source is Source.RANDOM and (not place.nodes or count.node in place.nodes)
+            for trace in self._traces
+            for count in trace.guarded
+        )
+
+    def _is_of_the_graph(self, setting: Setting, rest: Sequence[str]) -> bool:
+        """Whether a delay is of a topic or service that there is."""
+        if rest[:1] in (["topics"], ["services"]) and len(rest) > 1:
+            return self._has_topic(rest[1])
+        if rest:
+            return True
+        for text in (setting.a, setting.b):
+            try:
+                delay = json.loads(text) if text else {}
+            except ValueError:
+                return True
+            if not isinstance(delay, dict) or {*delay} - {"topics", "services"}:
+                return True
+            globs = [glob for part in delay.values() if isinstance(part, dict) for glob in part]
+            if any(self._has_topic(glob) for glob in globs):
+                return True
+        return False
+
+    def _has_topic(self, glob: str) -> bool:
+        return any(fnmatchcase(name, glob) for name in self._names)
+
+    def _nodes_of(self, entry: str) -> set[str]:
+        """Return the full names of the nodes of an entry of ``nodes:`` (its number or name)."""
+        found: set[str] = set()
+        for job in self._jobs:
+            for number, node in enumerate(job.get("nodes") or []):
+                if isinstance(node, dict) and entry in (str(number), node.get("name")):
+                    target = node.get("node") or ""
+                    found |= {name for name, of in self._classes if of == target}
+        return found
+
+    @cached_property
+    def guard_is_off(self) -> bool:
+        """Whether one of the runs had ``guard: false``."""
+        return not all(map(_is_guarded, self._jobs))
+
+    @cached_property
+    def _traces(self) -> tuple[Trace, Trace]:
+        return self.run_a.trace, self.run_b.trace
+
+    @cached_property
+    def _jobs(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        return resolved_job(self._traces[0]), resolved_job(self._traces[1])
+
+    @cached_property
+    def _names(self) -> frozenset[str]:
+        return frozenset(e.name for trace in self._traces for e in trace.entities.values())
+
+    @cached_property
+    def _classes(self) -> frozenset[tuple[str, str]]:
+        """Return (full name, class as ``module:Class``) of all nodes."""
+        return frozenset(
+            (entity.name, entity.type)
+            for trace in self._traces
+            for entity in trace.entities.values()
+            if entity.kind is EntityKind.NODE
+        )
+
+    @cached_property
+    def _modules(self) -> dict[str, str]:
+        return {name: of.partition(":")[0] for name, of in self._classes if of}
+
+
+def resolved_job(trace: Trace) -> dict[str, Any]:
+    """Return a job with all defaults, nothing where the trace does not have it."""
+    try:
+        value = json.loads(trace.job.get("resolved") or "{}")
+    except ValueError:  # of a later version, or damaged: the job files themselves are compared
+        return {}
+    return value if isinstance(value, dict) else {}
+
+
+def _is_guarded(job: dict[str, Any]) -> bool:
+    return _value(job, "guard", "enabled") is not False
+
+
+def _value(job: dict[str, Any], *keys: str) -> Any:
+    value: Any = job
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value
