@@ -14,7 +14,6 @@ from rsltrace.doors.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.services import ClientHandle, ServiceHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.doors.rclpy.wire.interfaces import type_name
 from rsltrace.model.event import EventKind
@@ -41,7 +40,6 @@ class Part(ReceiverHandle):
         """Let rclpy take the oldest arrival and execute it, as one event."""
         if not self.may_run():
             return
-        begin(self.wrapper.callback_group, self.wrapper)
         origin = self.queue[0][self.origin]
         start_coroutine(self.stacks, self, ACTION, self.owner.execute, (self,), *origin)
 

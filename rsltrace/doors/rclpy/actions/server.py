@@ -11,7 +11,6 @@ from rsltrace.doors.rclpy.actions.goal_handle import GoalHandle
 from rsltrace.doors.rclpy.actions.parts import ACTION, ActionHandle, GoalService
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import start_coroutine
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.middleware.services import RequestId
@@ -203,9 +202,8 @@ class _Expiry:
         if mailbox is not None and mailbox.keeps(self):
             return
         self.wrapper = server.find_waitable()
-        if self.wrapper is None:
+        if self.wrapper is None or server.stacks.groups.must_wait(self, self.wrapper):
             return
-        begin(self.wrapper.callback_group, self.wrapper)
         handle: Any = self  # has what start_coroutine needs, but no place in the trace of its own
         start_coroutine(server.stacks, handle, ACTION, server.expire, (), NO_EVENT, 0, 0)
 

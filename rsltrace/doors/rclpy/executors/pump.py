@@ -13,7 +13,7 @@ from typing import Any
 
 from rsltrace.doors.rclpy.handles.waitables import activate_node
 from rsltrace.doors.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
-from rsltrace.doors.rclpy.stacks.callback_groups import begin, is_busy
+from rsltrace.doors.rclpy.stacks.callback_groups import begin, is_busy, is_custom
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
@@ -179,7 +179,7 @@ class Pump:
         """Let the execution time of a callback pass, on the stack and in the group that ran it."""
         wrapper = getattr(item, "wrapper", None)
         group = getattr(wrapper, "callback_group", None)
-        held = group is not None and not is_busy(group, wrapper)
+        held = group is not None and not is_custom(group) and not is_busy(group, wrapper)
         if held:
             begin(group, wrapper)
         try:

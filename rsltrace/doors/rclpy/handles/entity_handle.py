@@ -7,7 +7,7 @@ from typing import Any
 
 from rsltrace.doors.rclpy.handles.destroyable import Destroyable
 from rsltrace.doors.rclpy.handles.node import NodeHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import exclusive
+from rsltrace.doors.rclpy.stacks.callback_groups import exclusive, is_custom
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.middleware.entity import DomainEntity, Runnable, callback_name
@@ -30,6 +30,8 @@ class EntityHandle(Destroyable, DomainEntity):
     begins_active = False
     stacks: Stacks
     wrapper: Any = None
+    own_group = False
+    """Whether its callback group is of a class of the user's own."""
     _listed: tuple[Any, Any] | None = None
     """Node and wrapper, if somebody else has met them while looking for its own."""
 
@@ -73,6 +75,7 @@ class EntityHandle(Destroyable, DomainEntity):
         """Start to run: owner and callback are known now."""
         self.wrapper = wrapper
         self.node = node
+        self.own_group = is_custom(getattr(wrapper, "callback_group", None))
         self.active = True
         self.activate()
 
@@ -157,7 +160,7 @@ class ReceiverHandle(EntityHandle, Receiver):
         if not self.queue or wrapper is None or self.destroyed:
             return False
         group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is None:  # nearly always
+        if getattr(group, "_active_entity", group) is None and not self.own_group:  # nearly always
             return True
         return not self.stacks.groups.must_wait(self, wrapper)
 

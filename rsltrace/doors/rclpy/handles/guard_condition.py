@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.model.entity import EntityKind
@@ -63,7 +62,6 @@ class GuardConditionHandle(EntityHandle):
         self._triggered = False
         callback = wrapper.callback
         if is_coroutine_function(callback):
-            begin(wrapper.callback_group, wrapper)
             start_coroutine(self.stacks, self, _GUARD, callback, (), *self._cause, 0)
         else:
             self.dispatcher.execute(

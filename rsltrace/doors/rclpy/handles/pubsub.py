@@ -8,7 +8,6 @@ from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle, ReceiverHan
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import qos_of
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import message_type
@@ -112,7 +111,6 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         message = data if wrapper.raw else self._deserialize(data)
         args = (message, _message_info(delivery)) if self._with_info else (message,)
         if self._coroutine:
-            begin(wrapper.callback_group, wrapper)
             start_coroutine(
                 self.stacks, self, SUBSCRIPTION, callback, args, event, position, digest
             )

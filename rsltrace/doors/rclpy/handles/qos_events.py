@@ -8,7 +8,6 @@ from typing import Any
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.qos.status import (
@@ -96,15 +95,15 @@ class EventHandle(EntityHandle):
         wrapper = self.wrapper
         if wrapper is None or self.destroyed:
             return
+        if not self.has_news():
+            self._queued = False
+            return
         if self.stacks.groups.must_wait(self, wrapper):
             return
         self._queued = False
-        if not self.has_news():
-            return
         status = self.take_event()
         callback = wrapper.callback
         if is_coroutine_function(callback):
-            begin(wrapper.callback_group, wrapper)
             start_coroutine(self.stacks, self, _QOS_EVENT, callback, (status,), *self._cause, 0)
         else:
             self.dispatcher.execute(

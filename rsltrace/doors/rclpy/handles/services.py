@@ -17,7 +17,6 @@ from rsltrace.doors.rclpy.handles.introspection import (
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import profile_of, qos_of
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, is_coroutine_function, start_coroutine
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import service_type
@@ -91,7 +90,6 @@ class ServiceHandle(ServiceEndHandle, Service):
         request = self._request.deserialize(data)
         wrapper = self.wrapper
         if is_coroutine_function(wrapper.callback):
-            begin(wrapper.callback_group, wrapper)
             start_coroutine(
                 self.stacks,
                 self,

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin, is_busy
+from rsltrace.doors.rclpy.stacks.callback_groups import is_busy
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.middleware.timer import TIMER, Timer
@@ -51,7 +51,11 @@ class TimerHandle(EntityHandle, Timer):
                 return
             loop.timers.add(state)
         group = wrapper.callback_group
-        if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
+        if self.own_group:
+            if not self.stacks.groups.enter(self, wrapper, self.activate):
+                loop.timers.remove(state)
+                return
+        elif getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
             loop.timers.remove(state)
             self.stacks.groups.park(group, self, self.activate)
             return
@@ -66,7 +70,6 @@ class TimerHandle(EntityHandle, Timer):
         state.call(loop.now_ns)
         loop.timers.ran(state)
         if self._coroutine:
-            begin(group, wrapper)
             start_coroutine(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             dispatcher.execute(

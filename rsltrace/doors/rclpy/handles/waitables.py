@@ -14,7 +14,6 @@ from typing import Any
 
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.wait_set import WaitSetHandle
-from rsltrace.doors.rclpy.stacks.callback_groups import begin
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.model.event import NO_EVENT, EventKind
@@ -74,10 +73,10 @@ class UserWaitable:
             return
         if self._closed or self.node.destroyed:
             return
-        if self.stacks.groups.must_wait(self, self.wrapper):
+        ready = self._set.ready_now()
+        if ready and self.stacks.groups.must_wait(self, self.wrapper):
             return
         self._queued = False
-        ready = self._set.ready_now()
         if not ready:
             self._look_again()
             return
@@ -86,7 +85,6 @@ class UserWaitable:
         cause, digest = self._cause, 0
         if getattr(handle, "queue", None):
             *cause, digest = handle.queue[0][handle.origin]
-        begin(self.wrapper.callback_group, self.wrapper)
         here: Any = self  # has what start_coroutine needs
         start_coroutine(self.stacks, here, int(_KINDS[name]), self._execute, (), *cause, digest)
 

@@ -160,7 +160,12 @@ def _hold_group(stacks: Stacks) -> object:
     event = stacks.event
     wrapper: Any = getattr(event.handle, "wrapper", None)
     group = getattr(wrapper, "callback_group", None)
-    if event.on_end is None and group is not None and not groups.is_busy(group, wrapper):
+    if (
+        event.on_end is None
+        and group is not None
+        and not groups.is_custom(group)  # that of a callback is held already
+        and not groups.is_busy(group, wrapper)
+    ):
         groups.begin(group, wrapper)
         event.on_end = lambda: stacks.groups.end(group, wrapper)
     return group

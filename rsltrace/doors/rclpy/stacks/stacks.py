@@ -79,7 +79,7 @@ class Stacks:
         self.dispatcher = domain.dispatcher
         self.event = domain.event
         self.ending = Ending()
-        self.groups = CallbackGroups(domain.loop)
+        self.groups = CallbackGroups(domain)
         self.programs = Programs()
         self.threads = Threads()
         self.coroutines = Coroutines(domain)

@@ -53,6 +53,8 @@ def start_coroutine(
     from rclpy.task import Task
 
     wrapper = handle.wrapper
+    group = wrapper.callback_group
+    stacks.groups.begin_coroutine(group, wrapper)
     run = TaskRun(
         stacks.coroutines,
         Task(callback, args, None, executor=executor_of(stacks, handle)),
@@ -60,7 +62,7 @@ def start_coroutine(
         node=handle.node,
         kind=kind,
         label=handle.describe,
-        on_end=lambda: stacks.groups.end(wrapper.callback_group, wrapper),
+        on_end=lambda: stacks.groups.end(group, wrapper),
         mailbox=handle.node.mailbox if handle.node is not None else None,
     )
     run.cause_event, run.cause_output, run.input_hash = cause_event, cause_output, input_hash
