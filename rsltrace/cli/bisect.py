@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from rsltrace.campaign.bisect.runs import Runner
     from rsltrace.campaign.bisect.search import Found
     from rsltrace.campaign.processes import Processes
+    from rsltrace.job import Job
 
 _BEFORE, _AFTER = "before.mcap", "after.mcap"
 
@@ -119,8 +120,12 @@ def bisect(
     _check_ends(repository, *ends)
     processes = Processes()
     check = _check(expression, shell, processes)
-    links = [*_untracked(repository, given, files), *(path.resolve() for path in shared)]
+    job = _job_here(given)
+    links = [*_untracked(repository, job, files), *(path.resolve() for path in shared)]
     say_progress: Callable[[str], object] = (lambda text: None) if quiet else tell
+    notes = [] if job is None else list(_same_everywhere(repository, job))
+    for note in notes:
+        tell(f"note: {note}")
     with terminated(), Worktree(repository, links) as tree:
         runner = Runner(repository, tree, tuple(given.arguments(tree.path)), processes, timeout)
         try:
@@ -177,20 +182,48 @@ def _check_ends(repository: Repository, good: Any, bad: Any) -> None:
         )
 
 
-def _untracked(repository: Repository, given: Given, files: list[Path]) -> Iterator[Path]:
+def _job_here(given: Given) -> Job | None:
+    """Return the job in the checkout; None if it is broken: what counts is that of a revision."""
+    try:
+        return job_of(given.words, given.launch, given.skip, given.overrides)[0]
+    except JobError:
+        return None
+
+
+def _untracked(repository: Repository, job: Job | None, files: list[Path]) -> Iterator[Path]:
     """Yield what the job here names in the checkout and git does not track: it is shared."""
     candidates = list(files)
-    try:
-        job, _ = job_of(given.words, given.launch, given.skip, given.overrides)
-    except JobError:
-        pass  # the one here may be broken: what counts are those of the revisions
-    else:
+    if job is not None:
         texts = _texts(job.resolved())
         candidates += [job.resolve(text) for text in texts if text and len(text) < 4096]
     for path in dict.fromkeys(Path(os.path.normpath(path)) for path in candidates):
         inside = path.is_relative_to(repository.top) and path != repository.top
         if inside and os.path.lexists(path) and not repository.has_tracked(path):
             yield path
+
+
+def _same_everywhere(repository: Repository, job: Job) -> Iterator[str]:
+    """Yield notes on code that no revision has another version of, as far as runs are concerned."""
+    from rsltrace.campaign.bisect.runs import python_folders
+    from rsltrace.replay.code import code_of, file_of
+
+    relative = [path for path in job.search_path if not os.path.isabs(path)]
+    folders = [*map(str, python_folders(repository)), *(str(job.resolve(p)) for p in relative)]
+    found = [(one.name, one.file) for one in code_of(job, {}) if one.file is not None]
+    for name, file in found:
+        is_ours = file.resolve().is_relative_to(repository.top)
+        is_module = all(part.isidentifier() for part in name.split("."))
+        if is_ours and is_module and file_of(name, folders, installed=False) is None:
+            yield (
+                f"{name} is loaded from {file} at every revision: name its folder, relative to the "
+                "job, in search_path"
+            )
+    if found and not any(file.resolve().is_relative_to(repository.top) for _, file in found):
+        name, file = found[0]
+        yield (
+            f"none of the job's code lies in {repository.top}: {name} is loaded from {file} at "
+            "every revision"
+        )
 
 
 def _texts(value: Any) -> Iterator[str]:

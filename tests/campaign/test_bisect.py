@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import types
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,11 @@ import pytest
 
 from rsltrace.campaign.bisect.expression import Expression
 from rsltrace.campaign.bisect.repository import Repository
+from rsltrace.campaign.bisect.runs import python_folders
 from rsltrace.campaign.bisect.worktree import Worktree
+from rsltrace.cli.bisect import _same_everywhere
 from rsltrace.errors import BisectError, RsltraceError
+from rsltrace.job import load_job
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -110,7 +114,6 @@ def test_the_commit_that_changed_the_digest_is_named_and_the_checkout_is_as_it_w
     robot: Robot,
 ) -> None:
     good = robot.commit("Begin", job__yaml=JOB, steps__py=ONE)
-    robot.commit("Say more", README__md="more")
     changed = robot.commit("Twice as fast\n\nand why", steps__py=TWO)
     robot.commit("Say even more", README__md="even more")
     (robot.top / "steps.py").write_text("not committed, and no Python")
@@ -122,7 +125,7 @@ def test_the_commit_that_changed_the_digest_is_named_and_the_checkout_is_as_it_w
     assert result["first"]["commit"] == changed
     assert result["first"]["subject"] == "Twice as fast"
     assert result["files"] == ["steps.py"]
-    assert result["before"] == result["first"]["parents"][0], "the commit before it was run, too"
+    assert result["before"] == result["first"]["parents"][0] == good
     assert [one["answer"] for one in result["tried"][:2]] == ["good", "bad"]
     assert result["diff"]["verdict"] == "same-input-different-output"
     after = robot.state()
@@ -130,6 +133,7 @@ def test_the_commit_that_changed_the_digest_is_named_and_the_checkout_is_as_it_w
     assert done.stderr.startswith(f"good  {good[:7]}"), "progress is told"
 
 
+@LONG
 def test_what_does_not_run_is_skipped_and_the_answer_is_a_range(
     robot: Robot, tmp_path: Path
 ) -> None:
@@ -287,6 +291,33 @@ def test_a_check_looks_at_a_trace() -> None:
             assert Expression(text).holds(trace) is holds, text
         with pytest.raises(BisectError, match="there is no topic /nothing"):
             Expression("last('/nothing').data > 1").holds(trace)
+
+
+def test_packages_that_are_installed_in_place_are_those_of_the_revision(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ``pip install -e`` has them: on Python's path, or known to a finder of setuptools'."""
+    (robot.top / "src/steps").mkdir(parents=True)
+    (robot.top / "flat").mkdir()
+    (robot.top / "build").mkdir()
+    (robot.top / "build/copied.py").write_text("")
+    (robot.top / "src/steps/__init__.py").write_text("")
+    (robot.top / "flat/x.py").write_text("")
+    (robot.top / "job.yaml").write_text(
+        "nodes: [{node: 'steps:Steps'}, {node: 'copied:Copied'}]\nstop: {duration: 1s}\n"
+    )
+    robot.commit("Begin", __gitignore="build")
+    finder = type("Finder", (), {"__module__": "__editable___robot_finder", "find_spec": None})
+    module = types.ModuleType("__editable___robot_finder")
+    module.MAPPING = {"x": str(robot.top / "flat/x")}  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr(sys, "meta_path", [*sys.meta_path, finder])
+    for name in ("src", "build"):
+        monkeypatch.syspath_prepend(str(robot.top / name))
+    repository = Repository.of(robot.top / "job.yaml")
+    assert python_folders(repository) == [robot.top / "src", robot.top / "flat"]
+    (note,) = _same_everywhere(repository, load_job(robot.top / "job.yaml"))
+    assert note.startswith(f"copied is loaded from {robot.top}/build/copied.py at every revision")
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])

@@ -234,6 +234,7 @@ def test_what_if(folder: Path, tmp_path: Path, trace: Trace) -> None:
         assert branch.digest != trace.digest
 
 
+@pytest.mark.long
 def test_what_if_of_a_job(folder: Path, tmp_path: Path) -> None:
     with DebugSession(folder / "job.yaml", overrides=["stop.duration=0.2s"]) as session:
         session.run_to("0.1s")

@@ -219,18 +219,30 @@ def test_edits_that_change_nothing(folder: Path) -> None:
 )
 def test_what_cannot_be_edited_leaves_no_branch(folder: Path, edit: str, said: str | None) -> None:
     output = folder / "never.mcap"
+    output.unlink(missing_ok=True)
     if said is None:
-        rsltrace.replay(folder / "run.mcap", edits=edit, trust=True)
+        assert rsltrace.replay(folder / "run.mcap", edits=edit, trust=True).diverged
         return
-    output.write_bytes((folder / "run.mcap").read_bytes())
     with pytest.raises(EditError) as caught:
-        rsltrace.replay(folder / "run.mcap", edits=edit, output=output, force=True, trust=True)
-    assert said in str(caught.value)
-    assert output.read_bytes() == (folder / "run.mcap").read_bytes()
-    output.unlink()
-    with pytest.raises(EditError):
         rsltrace.replay(folder / "run.mcap", edits=edit, output=output, trust=True)
-    assert [path for path in folder.iterdir() if path.name.startswith("never")] == []
+    assert said in str(caught.value)
+    assert [path for path in folder.iterdir() if "never" in path.name] == []
+
+
+def test_what_cannot_be_edited_leaves_what_is_there(folder: Path) -> None:
+    output = folder / "kept.mcap"
+    recorded = (folder / "run.mcap").read_bytes()
+    output.write_bytes(recorded)
+    with pytest.raises(EditError):
+        rsltrace.replay(
+            folder / "run.mcap",
+            edits='1s: node("/filter").stat = 1',
+            output=output,
+            force=True,
+            trust=True,
+        )
+    assert output.read_bytes() == recorded
+    assert [path.name for path in folder.iterdir() if "kept" in path.name] == ["kept.mcap"]
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,25 +51,10 @@ class Runner:
         """The present folder, in the worktree or as seen from there."""
         return self.worktree.path(Path.cwd())
 
-    @property
-    def python_path(self) -> list[str]:
-        """The folders of the worktree that stand for those of the checkout on Python's path.
-
-        So a package that is installed in place (``pip install -e``) is that of the revision.
-        """
-        found = []
-        for entry in dict.fromkeys(sys.path):
-            path = Path(entry or ".").resolve()
-            if path == OWN_FOLDER or not path.is_relative_to(self.repository.top):
-                continue  # this program itself is the same at every revision
-            if path.is_relative_to(Path(sys.prefix).resolve()) or not path.is_dir():
-                continue
-            found.append(str(self.worktree.path(path)))
-        return found
-
     def _environment(self) -> Mapping[str, str]:
         given = os.environ.get("PYTHONPATH")
-        path = [*self.python_path, *([given] if given else [])]
+        folders = map(str, map(self.worktree.path, python_folders(self.repository)))
+        path = [*folders, *([given] if given else [])]
         return {
             **os.environ,
             "PYTHONPATH": os.pathsep.join(path),
@@ -77,3 +62,24 @@ class Runner:
             # Sources of the same length within the same second: bytecode would be another's.
             "PYTHONDONTWRITEBYTECODE": "1",
         }
+
+
+def python_folders(repository: Repository) -> list[Path]:
+    """Return the folders of a checkout on Python's path, of packages that are installed in place
+    (``pip install -e``): those of a revision stand for them."""
+    found = []
+    for entry in dict.fromkeys([*sys.path, *_known_to_finders()]):
+        path = Path(entry or ".").resolve()
+        if path == OWN_FOLDER or not path.is_relative_to(repository.top):
+            continue  # this program itself is the same at every revision
+        if not path.is_relative_to(Path(sys.prefix).resolve()) and repository.has_tracked(path):
+            found.append(path)
+    return found
+
+
+def _known_to_finders() -> Iterator[str]:
+    """Yield the folders of packages that setuptools' finders know, rather than Python's path."""
+    for finder in sys.meta_path:
+        module = sys.modules.get(getattr(finder, "__module__", ""))
+        for place in getattr(module, "MAPPING", {}).values():
+            yield os.path.dirname(place)
