@@ -6,6 +6,7 @@ import os
 import re
 import sys
 from types import FrameType, MethodType
+from weakref import WeakSet
 
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.model.finding import Source
@@ -28,7 +29,18 @@ def is_by_address(thing: object) -> bool:
         return is_by_address(thing.__self__)  # type: ignore[attr-defined]
     if thing is None:
         return sys.version_info < (3, 12)
-    return getattr(kind, "__hash__", None) is _ALIKE
+    return getattr(kind, "__hash__", None) is _ALIKE or kind in _by_address
+
+
+def hashed_by_address(frame: FrameType) -> None:
+    """Remember of the ``__hash__`` method that runs in ``frame`` that addresses are in its hash."""
+    names = frame.f_code.co_varnames
+    if names and frame.f_code.co_argcount:
+        _by_address.add(type(frame.f_locals.get(names[0])))
+
+
+_by_address: WeakSet[type] = WeakSet()
+"""Types whose hashes are made of those of objects that are hashed by address."""
 
 
 def text_with_address(text: str) -> None:

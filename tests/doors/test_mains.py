@@ -406,6 +406,14 @@ def test_a_main_that_has_cleaned_up_has_spun_all_the_same(simulate: Any) -> None
     assert note.endswith("program ended at 0.500000000 s")
 
 
+def test_what_a_main_returns_is_its_exit_status(simulate: Any) -> None:
+    assert simulate(main_spec(lambda: 3)).result.exit_code == 3
+    assert simulate(main_spec(lambda: 0)).result.exit_code == 0
+    result = simulate(main_spec(lambda: "no camera")).result
+    assert result.exit_code == 1
+    assert result.notes[0].endswith("exited with 1 at 0.000000000 s: no camera")
+
+
 def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
     log: list[Any] = []
 

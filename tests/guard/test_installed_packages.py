@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -142,6 +143,40 @@ def test_numbers_are_kept_for_as_long_as_an_object_lives() -> None:
     del a, b, circle
     gc.collect()
     assert not numbers._kept
+
+
+DATACLASSES = """
+@dataclasses.dataclass(frozen=True)
+class Key:
+    owner: object
+    number: int
+
+@dataclasses.dataclass(frozen=True)
+class Plain:
+    number: float
+"""
+KEYS = """
+keys = {Key(Owner(), number) for number in range(50)} | {Key(None, 50)}
+self.say([key.number for key in keys])
+self.say(len({Plain(number / 2) for number in range(3)}))
+"""
+
+
+def test_what_a_hash_method_does_is_no_finding_and_its_objects_are_in_order(tmp_path: Path) -> None:
+    """Natively the order goes by the addresses of the owners (and of None before Python 3.12)."""
+    from rsltrace.job import load_job
+    from rsltrace.run import record
+    from rsltrace.trace.reader import Trace
+
+    code = node_code(KEYS, imports="import dataclasses", module=DATACLASSES + "class Owner: pass")
+    (tmp_path / "m.py").write_text(code)
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 0.7s}\n")
+    result = record(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
+    numbers = json.loads(texts[0])[0]
+    assert numbers == sorted(range(51), key=lambda number: f"{number},")
+    assert {(met.call, met.mode.value) for met in result.guarded} == {("order of a set", "virtual")}
 
 
 TESTS = """

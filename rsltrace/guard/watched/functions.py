@@ -18,7 +18,7 @@ from functools import partial
 from types import BuiltinFunctionType
 from typing import Any
 
-from rsltrace.guard.addresses import is_by_address
+from rsltrace.guard.addresses import hashed_by_address, is_by_address
 from rsltrace.guard.callers import user_frame
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
@@ -121,7 +121,11 @@ def _hashing(real: Callable[[Any], int]) -> Any:
         if is_by_address(thing):
             guard = engaged()
             frame = sys._getframe(1)
-            if guard is not None and guard.is_user(frame):
+            if guard is None:
+                return value
+            if frame.f_code.co_name == "__hash__":
+                hashed_by_address(frame)  # matters where a set of such objects is gone through
+            elif guard.is_user(frame):
                 kind = type(thing).__qualname__
                 guard.watched(Source.ADDRESS, f"hash() of {kind}", value, frame)
         return value

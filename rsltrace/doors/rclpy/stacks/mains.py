@@ -52,7 +52,9 @@ def _run(stacks: Stacks, program: Program) -> None:
     assert program.entry is not None
     error: BaseException | None = None
     try:
-        program.entry.make()
+        status = program.entry.make()
+        if status is not None:  # a console script is sys.exit(main())
+            raise SystemExit(status)
     except BaseException as raised:
         error = raised
     try:
