@@ -17,11 +17,13 @@ goes back another."""
 
 @dataclass(order=True)
 class Checkpoint:
-    """A process asleep at an index (and time, in ns)."""
+    """A process asleep at an index (and time, in ns); ``bytes`` is its memory (PSS) when last
+    looked at."""
 
     index: int
     stamp_ns: int
     process: SimProcess = field(compare=False)
+    bytes: int = field(default=0, compare=False)
 
 
 class Checkpoints:

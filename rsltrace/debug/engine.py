@@ -12,7 +12,7 @@ import socket
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsltrace.debug import inspection
 from rsltrace.debug.conditions.message_fields import loaded_fields
@@ -35,6 +35,13 @@ _LOOK_EVERY = 64
 _NEVER = 1 << 62
 _cpu_s: Callable[[], float] = copy_of(time.process_time)  # type: ignore[arg-type]
 _getpid: Callable[[], int] = copy_of(os.getpid)  # type: ignore[arg-type]
+
+
+class Copy(NamedTuple):
+    """A copy of this process: its id, and the socket to it."""
+
+    pid: int
+    end: socket.socket
 
 
 class Engine:
@@ -320,8 +327,7 @@ class Engine:
         """Answer with a copy of this process that stands where this one does."""
         other = self._forked()
         if other is not None:
-            with other:
-                self.lines.send({"id": self._id, "ok": {}}, other.fileno())
+            self._hand_over(other, {"id": self._id, "ok": {"pid": other.pid}})
 
     def _leave_checkpoint(self) -> None:
         """Leave a copy asleep here, and go on."""
@@ -335,15 +341,15 @@ class Engine:
         if other is None:
             self._serve()
             return
-        with other:
-            self.lines.send({"notice": "checkpoint", "position": self.position()}, other.fileno())
+        position = self.position()
+        self._hand_over(other, {"notice": "checkpoint", "pid": other.pid, "position": position})
         now_s = _cpu_s()
         # Checkpoints shall not take more than a fraction of the time, dear ones not either.
         self._checkpoint_s = max(now_s - began_s, self._checkpoint_s * 0.75)
         self._next_checkpoint_s = now_s + max(self._goal.interval_s, 8 * self._checkpoint_s)
 
-    def _forked(self) -> socket.socket | None:
-        """Fork; return the socket to the copy, or None in the copy, whose ``lines`` are new.
+    def _forked(self) -> Copy | None:
+        """Fork; return the copy, or None in the copy itself, whose ``lines`` are new.
 
         :raises DebugError: why there can be no copy.
         """
@@ -355,22 +361,25 @@ class Engine:
             raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
         try:
-            is_copy = fork_beside(self._supervisor, pairs)
+            pid = fork_beside(self._supervisor, pairs)
         except BaseException:
             ours.close()
             theirs.close()
             raise
-        if not is_copy:
+        if pid:
             theirs.close()
-            return ours
+            return Copy(pid, ours)
         ours.close()
         self.lines.close()
         self.lines = Lines(theirs)
         self.lines.move_high()
-        pid = _getpid()
-        self.session.changes_process(pid, pairs)
-        self.lines.send({"notice": "copy", "pid": pid})
+        self.session.changes_process(_getpid(), pairs)
         return None
+
+    def _hand_over(self, copy: Copy, message: Message) -> None:
+        """Send a message with the socket to a copy, which is then the supervisor's."""
+        with copy.end:
+            self.lines.send(message, copy.end.fileno())
 
     def _own_descriptors(self) -> list[int]:
         return [self.lines.fileno(), *self.ledger.history.descriptors]
@@ -391,8 +400,7 @@ class Engine:
                 self.lines.send(answer)
             end_process(0)
         assert ours is not None
-        with ours:
-            self.lines.send({"id": self._id, "ok": {"apart": True}}, ours.fileno())
+        self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
 
     def _begin_pdb(self, address: str) -> bool:
         """Let a copy call the next callback under ``pdb``; True in the copy.
@@ -406,8 +414,7 @@ class Engine:
             self._pdb_address = address
             self._goal, self._mark, self.is_next = Goal(), _NEVER, False
             return True
-        with ours:
-            self.lines.send({"id": self._id, "ok": {"apart": True}}, ours.fileno())
+        self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
         return False
 
     def _call_under_pdb(self, callback: Callable[..., Any], args: tuple[Any, ...]) -> None:

@@ -13,12 +13,14 @@ import fcntl
 import os
 import socket
 import stat
+import struct
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 
 from rsltrace.errors import DebugError
 
 _PR_SET_PDEATHSIG = 1
+_PID = struct.Struct("<q")
 _SIGKILL = 9
 _LOOK_US = 200
 _c = ctypes.PyDLL(None, use_errno=True)  # keeps Python's lock, which nobody else would release
@@ -80,31 +82,42 @@ def why_not(kept: Iterable[int], idle: frozenset[int], pairs: Pairs) -> str:
     return f"a node shares memory with other processes ({shared})" if shared else ""
 
 
-def fork_beside(parent: int, pairs: Pairs) -> bool:
-    """Fork a process that is a child of ``parent`` (a subreaper); True in the new one.
+def fork_beside(parent: int, pairs: Pairs) -> int:
+    """Fork a process that is a child of ``parent`` (a subreaper); return its id, 0 in itself.
 
     Both go on from here with files of their own (what one reads moves no position of the other's)
     and with ``pairs`` of their own, which are empty.
 
     :raises DebugError: if no process can be made.
     """
-    pid = _fork()
-    if pid == 0:
-        # Between the two: with its end ``parent`` becomes the new process's parent.
-        second, between = -1, os.getpid()
-        with suppress(BaseException):
-            _reopen_files()
-            _renew(pairs)
-            second = int(_c.fork())
-        if second:
-            end_process(int(second < 0))
-        die_with_parent(parent, between)
-        return True
-    with suppress(ChildProcessError):
-        _, status = os.waitpid(pid, 0)
-        if status:
-            raise DebugError("no process can be made for a checkpoint (see ulimit -u)")
-    return False
+    told, tell = os.pipe()
+    try:
+        pid = _fork()
+        if pid == 0:
+            # Between the two: with its end ``parent`` becomes the new process's parent.
+            second, between = -1, os.getpid()
+            with suppress(BaseException):
+                _reopen_files()
+                _renew(pairs)
+                second = int(_c.fork())
+                if second > 0:
+                    os.write(tell, _PID.pack(second))
+            if second:
+                end_process(int(second < 0))
+            die_with_parent(parent, between)
+            return 0
+        with suppress(ChildProcessError):  # a node ignores the ends of its children
+            os.waitpid(pid, 0)
+        os.close(tell)
+        tell = -1
+        data = os.read(told, _PID.size)
+    finally:
+        os.close(told)
+        if tell >= 0:
+            os.close(tell)
+    if not data:
+        raise DebugError("no process can be made for a checkpoint (see ulimit -u)")
+    return int(_PID.unpack(data)[0])
 
 
 def _fork() -> int:

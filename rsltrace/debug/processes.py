@@ -26,9 +26,9 @@ class Lost(DebugError):
 
 
 class SimProcess:
-    """A process of the simulation. ``pid`` is 0 until it has said it."""
+    """A process of the simulation."""
 
-    def __init__(self, lines: Lines, pid: int = 0) -> None:
+    def __init__(self, lines: Lines, pid: int) -> None:
         self.lines = lines
         self.pid = pid
 
@@ -89,7 +89,7 @@ class Family:
     def kill(self, process: SimProcess) -> None:
         """End a process at once."""
         process.lines.close()
-        if process.pid and process.pid not in self._ended:
+        if process.pid not in self._ended:
             with suppress(ProcessLookupError):
                 os.kill(process.pid, signal.SIGKILL)
         self.reap()

@@ -16,7 +16,7 @@ from rsltrace.errors import DebugError
 _INTERVAL_S = 0.05
 _APART_LIMIT_S = 20.0
 _PAUSE_LIMIT_S = 5.0
-_WEIGHED_EVERY = 8
+_NEARLY = 0.8
 _PIECE_BYTES = 1 << 16
 
 
@@ -43,7 +43,7 @@ class Tree:
         self._waiting = waiting
         self._checkpoints = Checkpoints(int(spec["checkpoints"]))
         self._memory_max = int(spec["memory_mib"]) << 20
-        self._since_weighed = 0
+        self._weighed = 0
         self._cursor: SimProcess
         self._is_quiet = False
         self._paused_s: float | None = None
@@ -96,7 +96,7 @@ class Tree:
         answer = self._ask(self._cursor, request, whole=True)
         if "with" not in answer:
             return answer["ok"]
-        copy = SimProcess(Lines(_socket(answer["with"][0])))
+        copy = SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
         try:
             return self._ask(copy, None, limit_s=limit_s)
         finally:
@@ -265,7 +265,7 @@ class Tree:
         :raises Refused: there can be none.
         """
         answer = self._ask(process, {"do": "fork"}, whole=True)
-        return SimProcess(Lines(_socket(answer["with"][0])))
+        return SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
 
     def _no_checkpoints(self, why: str) -> None:
         if why != self._why_no_checkpoints:
@@ -282,11 +282,10 @@ class Tree:
         while len(self._checkpoints) > self._checkpoints.count_max:
             if not self._drop_one(cursor):
                 return
-        self._since_weighed += 1
-        if self._since_weighed >= _WEIGHED_EVERY:
-            self._since_weighed = 0
-            while self.memory() > self._memory_max and self._drop_one(cursor):
-                pass
+        self._weigh_next()
+        while self._memory_known() > _NEARLY * self._memory_max:
+            if self.memory() <= self._memory_max or not self._drop_one(cursor):
+                return
 
     def _drop_one(self, cursor: int) -> bool:
         worst = self._checkpoints.least_useful(cursor)
@@ -294,9 +293,22 @@ class Tree:
             self._forget(worst)
         return worst is not None
 
+    def _weigh_next(self) -> None:
+        """Look at the memory of one checkpoint, in turns: all of them would take long."""
+        everyone = self._checkpoints.all()
+        if everyone:
+            self._weighed += 1
+            one = everyone[self._weighed % len(everyone)]
+            one.bytes = memory_bytes(one.process.pid)
+
+    def _memory_known(self) -> int:
+        return sum(one.bytes for one in self._checkpoints.all())
+
     def memory(self) -> int:
         """Return how much memory the checkpoints take, in bytes (PSS)."""
-        return sum(memory_bytes(one.process.pid) for one in self._checkpoints.all())
+        for one in self._checkpoints.all():
+            one.bytes = memory_bytes(one.process.pid)
+        return self._memory_known()
 
     def described(self) -> Message:
         """Return what checkpoints there are, as an answer has it."""
@@ -363,8 +375,6 @@ class Tree:
                     self._pass_output_on()
                     raise Lost(self.family.how_ended(process))
                 self._wait_for(process, limit_s)
-            elif message.get("notice") == "copy":
-                process.pid = message["pid"]
             elif message.get("notice") == "checkpoint":
                 self._add(message)
             elif message.get("notice") == "no checkpoint":
@@ -373,15 +383,18 @@ class Tree:
                 return message
 
     def _add(self, message: Message) -> None:
-        copy = SimProcess(Lines(_socket(message["with"][0])))
+        copy = SimProcess(Lines(_socket(message["with"][0])), message["pid"])
         position = message["position"]
         one = Checkpoint(int(position["index"]), int(position["stamp_ns"]), copy)
         if not self._checkpoints.add(one):
             self.family.kill(copy)
-        elif len(self._checkpoints) > self._checkpoints.count_max:
-            worst = self._checkpoints.least_useful(one.index)
-            if worst is not None:
-                self._forget(worst)
+            return
+        self._why_no_checkpoints = ""
+        one.bytes = memory_bytes(copy.pid)
+        self._weigh_next()
+        is_heavy = self._memory_known() > self._memory_max
+        if is_heavy or len(self._checkpoints) > self._checkpoints.count_max:
+            self._drop_one(one.index)
 
     def _wait_for(self, process: SimProcess | None, limit_s: float | None) -> None:
         """Wait until somebody says something: a process, the client, a node that prints."""
