@@ -20,7 +20,7 @@ from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from rsltrace.guard.callers import is_user_file
+from rsltrace.guard.callers import in_import, is_user_file
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import tell
@@ -35,6 +35,7 @@ _LOOKS_MAX = 250
 """Longer is not counted. (Python keeps one object of each number up to this forever.)"""
 
 _JOIN_S = 1.0
+_NO_PACKAGES: frozenset[str] = frozenset()
 _DEBUGGERS = ("/pdb.py", "/bdb.py", "/pudb/", "/ipdb/", "/IPython/", "/pydevd", "/debugpy/")
 
 
@@ -101,6 +102,8 @@ class Watchdog:
         frames = list(_frames(sys._current_frames().get(self._thread)))
         if any(part in frame.f_code.co_filename for frame in frames for part in _DEBUGGERS):
             return False  # somebody is looking at a standstill that they have made themselves
+        if frames and in_import(frames[0], _NO_PACKAGES):
+            return False  # a large library takes its time, on a slow disk above all
         in_event = any(_is_execute(frame) for frame in frames)
         handle = domain.event.handle if in_event else None
         who = "the run, outside of any callback," if handle is None else handle.describe()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import signal
@@ -11,6 +12,7 @@ import time
 from _thread import allocate_lock
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -109,6 +111,42 @@ def test_a_busy_loop_is_named_with_its_line(
     first = next(n for n, line in enumerate(lines, 1) if "def __call__" in line)
     places = [f"{__file__}:{n} in __call__" for n in range(first, first + 11)]
     assert any(place in said for place in places), said
+
+
+LIBRARY = """
+import sys
+looks = sys.modules["looks_of_this_test"].looks
+for _ in range(9):
+    arrivals = looks._arrivals
+    looks._turn.release()
+    while looks._arrivals == arrivals:
+        pass
+"""
+
+
+@pytest.mark.parametrize("name", ["torchvision", "my_own_package"])
+def test_the_import_of_a_library_may_take_its_time(
+    busy: Looks,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+) -> None:
+    (tmp_path / "site-packages").mkdir()
+    (tmp_path / "site-packages" / f"{name}.py").write_text(LIBRARY)
+    monkeypatch.syspath_prepend(str(tmp_path / "site-packages"))
+    here = ModuleType("looks_of_this_test")
+    here.looks = busy  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, here.__name__, here)
+    monkeypatch.delitem(sys.modules, name, raising=False)
+
+    def import_it(count: int) -> None:
+        if count == 2:
+            importlib.import_module(name)
+
+    record(import_it, tmp_path / "a.mcap")
+    said = capsys.readouterr().err
+    assert said.count("rsltrace: note:") == (name == "my_own_package"), said
 
 
 def test_there_is_at_most_one_note_in_a_minute(
