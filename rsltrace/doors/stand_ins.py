@@ -58,6 +58,10 @@ class _AbsentPublisher(Publisher):
         if not isinstance(subscription, _AbsentSubscription):
             super().connect(subscription)
 
+    def send_history(self, subscription: Subscription) -> None:
+        if not isinstance(subscription, _AbsentSubscription):
+            super().send_history(subscription)
+
     def is_heard(self) -> bool:
         """Return whether what it sends matters to anybody now, or may later."""
         return bool(self.subscriptions) or self._history is not None

@@ -19,7 +19,8 @@ from rsltrace.loop.stop import Progress, Stop
 from rsltrace.model.event import EventKind
 
 NEVER = 1 << 64
-_HELD = ("subscription", "timer", "client", "service", "guard_condition", "qos_event")
+_QOS_EVENT = "qos_event"
+_HELD = ("subscription", "timer", "client", "service", "guard_condition", "task", _QOS_EVENT)
 
 
 @dataclass(slots=True)
@@ -106,11 +107,10 @@ class FedLoop(EventLoop):
         step = self.script.next
         if step is None and self.now_ns >= self.script.end_ns:
             return False
-        if self.tasks:
-            self.tasks.popleft().dispatch()
-            return True
         if step is not None and step.stamp_ns > self.now_ns:
             step = None
+        if self.tasks and self._run_task(step):
+            return True
         if step is not None and step.perform is not None:
             step.done = True
             step.perform()
@@ -122,6 +122,11 @@ class FedLoop(EventLoop):
         step.done = True  # what should have happened does not: the code has changed
         return True
 
+    def _run_task(self, step: Step | None) -> bool:
+        """Run what the last event has left to do at once."""
+        self.tasks.popleft().dispatch()
+        return True
+
     def _dispatch_one(self, step: Step | None) -> bool:
         """Dispatch what is ready or due; ``step`` is the event that the recording has next."""
         if self.ready:
@@ -131,17 +136,12 @@ class FedLoop(EventLoop):
         if timers.next_ns > self.now_ns:
             return False
         owner: Any = timers.head.owner  # type: ignore[union-attr]
-        if step is not None and step.kind == EventKind.TIMER:
-            due, _ = timers.due(self.now_ns)
-            owners: list[Any] = [timer.owner for timer in due]
-            fits = (one for one in owners if self.script.entity(one.entity_id) == step.entity)
-            owner = next(fits, owner)
         owner.dispatch()
         return True
 
 
 class FedOrderedLoop(FedLoop, OrderedLoop):
-    """The loop of jobs with a policy, executors or execution times, fed.
+    """The loop of jobs that say who runs next, fed: policies, executors, execution times, ties.
 
     The recording says what ran when, so neither policy nor executors are asked. Where callbacks
     have to wait for workers (``has_workers``), what the recording knows runs when it ran there;
@@ -155,6 +155,15 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
         due, after = self.timers.due(self.now_ns)
         free = (timer for timer in due if not self._is_held(self.place(timer.owner)))  # type: ignore[arg-type]
         return next(free, after)
+
+    def _run_task(self, step: Step | None) -> bool:
+        for index, place in enumerate(self._tasks.places):
+            if not self._is_held(place) or (step is not None and self._is_that_of(place, step)):
+                del self._tasks.places[index]
+                item: Any = place.candidate.item
+                item.dispatch()
+                return True
+        return False
 
     def _dispatch_one(self, step: Step | None) -> bool:
         due, _ = self.timers.due(self.now_ns)
@@ -172,33 +181,46 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
         return True
 
     def _recorded_choice(self, places: list[Place], step: Step | None) -> Place | None:
-        entity = self.script.entity
         if step is not None:
             for place in places:
-                if entity(place.candidate.entity_id) == step.entity:
+                if not _goes_elsewhere(place.candidate.item) and self._is_that_of(place, step):
                     return place
         free = [place for place in places if not self._is_held(place)]
-        for place in free:
-            if not _is_handed_over(place.candidate.item):
-                return place
+        if not free or not _goes_elsewhere(free[0].candidate.item) or _looks(free[0]):
+            return free[0] if free else None
         # An executor of the user's own takes them in the order in which it gets them.
-        following = self.script.following
-        return min(free, key=lambda p: following(entity(p.candidate.entity_id)), default=None)
+        others = [p for p in free if _goes_elsewhere(p.candidate.item) and not _looks(p)]
+        entity, following = self.script.entity, self.script.following
+        return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
+
+    def _is_that_of(self, place: Place, step: Step) -> bool:
+        candidate = place.candidate
+        recorded = self.script.entity(candidate.entity_id)
+        if recorded < 0 and candidate.kind == _QOS_EVENT:  # which has its id when it runs first
+            return step.kind == EventKind.QOS_EVENT
+        return recorded == step.entity
 
     def _is_held(self, place: Place) -> bool:
         """Whether it waits until the recording has it."""
         candidate = place.candidate
-        return (
-            self.has_workers
-            and candidate.kind in _HELD
-            and not _is_handed_over(candidate.item)
-            and self.script.entity(candidate.entity_id) >= 0
-        )
+        if not self.has_workers or candidate.kind not in _HELD or _is_handed_over(candidate.item):
+            return False
+        return candidate.kind == _QOS_EVENT or self.script.entity(candidate.entity_id) >= 0
 
 
 def _is_handed_over(item: Any) -> bool:
     """Whether an executor of the user's own runs it."""
     return getattr(getattr(item, "node", None), "mailbox", None) is not None
+
+
+def _looks(place: Place) -> bool:
+    """Whether it is a call that only looks whether something has come, and has no event then."""
+    return bool(getattr(place.candidate.item, "quiet", False))
+
+
+def _goes_elsewhere(item: Any) -> bool:
+    """Whether it is no event itself: it is handed over, or a blocked call goes on."""
+    return _is_handed_over(item) or hasattr(item, "quiet")
 
 
 def _sooner(own_ns: int | None, step: Step | None) -> int | None:

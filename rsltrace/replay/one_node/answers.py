@@ -42,11 +42,13 @@ class Answers:
             self._got.setdefault(cause, int(row["entity"]))
         for index in np.flatnonzero(~own & np.isin(events["kind"], _BEGIN)).tolist():
             row = events[index]
-            asked = self._asked.pop((int(row["cause_event"]), int(row["cause_output"])), None)
+            asked = self._asked.get((int(row["cause_event"]), int(row["cause_output"])))
             if asked is not None:
                 self._open.setdefault(int(row["entity"]), []).append((index, *asked))
+        taken = {asked[1:] for waiting in self._open.values() for asked in waiting}
         for client, number in self._asked.values():
-            self._untaken.setdefault(client, []).append(number)
+            if (client, number) not in taken:
+                self._untaken.setdefault(client, []).append(number)
 
     def of(self, event: int, position: int, service: int) -> tuple[int, int] | None:
         """Return the client (of the recording) that a response goes to, and which of its requests

@@ -69,7 +69,8 @@ class FedSession(Session):
         self.end_ns = self.script.end_ns
 
     def _kind_of_loop(self) -> type[EventLoop]:
-        return FedOrderedLoop if is_ordered(self.job) else FedLoop
+        ordered = is_ordered(self.job) or self.job.timer_ties != "creation"
+        return FedOrderedLoop if ordered else FedLoop
 
     def _order_events(self, stack: ExitStack) -> None:
         loop = self.loop
