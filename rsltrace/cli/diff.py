@@ -119,6 +119,11 @@ class Tolerance(_Type):
     help="It is enough if recordings that are cut agree until there.",
 )
 @click.option(
+    "--again",
+    metavar="FILE",
+    help="Say which of A and B a third trace repeats where they diverge: A, B, or neither.",
+)
+@click.option(
     "-o",
     "--output",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -139,6 +144,7 @@ def diff(
     by: str,
     check: bool,
     as_far_as_they_go: bool,
+    again: str | None,
     output: Path | None,
 ) -> int:
     """Find where A and B first diverge, and why.
@@ -154,6 +160,8 @@ def diff(
     nobody knows, unless --as-far-as-they-go is enough), 2 for trouble, 3 if they are equal within
     tolerance and not identical.
     """
+    if again is not None:
+        return _which(golden, others, again)
     options = DiffOptions(
         context=context,
         everything=everything,
@@ -194,6 +202,20 @@ def _diff(
     from rsltrace.diff.result.exit_codes import exit_code_of_several
 
     return EXIT_USAGE if trouble else exit_code_of_several(one.exit_code for one in done)
+
+
+def _which(a: str, others: Sequence[str], again: str) -> int:
+    """Say which of two traces a third one repeats."""
+    from rsltrace.diff.file_kind import is_recording
+    from rsltrace.diff.traces.reproduction import reproduction
+    from rsltrace.words.phrases import as_sentence
+
+    if len(others) != 1 or any(map(is_recording, (a, *others, again))):
+        raise click.UsageError("--again needs two traces to compare a third one with")
+    with _opened(a) as one, _opened(others[0]) as other, _opened(again) as third:
+        found = reproduction(one, other, third)
+    say(_encodable(as_sentence(found.sentence)))
+    return found.exit_code
 
 
 def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool) -> Diff | BagDiff:

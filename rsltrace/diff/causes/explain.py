@@ -287,8 +287,9 @@ class Explainer:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
-                again = f"{record.command} --until {until} -o again.mcap --force"
-                return f"{again}; rsltrace diff {path_a} again.mcap"
+                last = max(v.stamp_ns for v in (judgement.a, judgement.b) if v is not None)
+                again = f"{record.command} --until {format_seconds(last)} -o again.mcap --force"
+                return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
         path = path_a if judgement.a is not None else path_b
         node = view.entity.node
         choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""

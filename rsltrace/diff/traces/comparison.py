@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from fnmatch import fnmatchcase
 from itertools import islice
 
 from rsltrace.diff.alignment.blocks import (
@@ -29,6 +30,9 @@ from rsltrace.diff.traces.counts import EventCounts
 from rsltrace.diff.traces.ended_runs import failure_text, failures, judge_end, who_ended
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
+from rsltrace.errors import TraceError, did_you_mean
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 DIVERGENCES_MAX = 10
@@ -42,8 +46,27 @@ _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
 
 
 def compare(a: Trace, b: Trace, start: int, options: DiffOptions) -> Diff:
-    """Return the diff of two runs that differ from event ``start`` on."""
+    """Return the diff of two runs that differ from event ``start`` on.
+
+    Raises TraceError if neither run has a node or topic that is asked for.
+    """
+    _check_names(a, b, options)
     return _Comparison(a, b, start, options).run()
+
+
+def _check_names(a: Trace, b: Trace, options: DiffOptions) -> None:
+    entities = [entity for trace in (a, b) for entity in trace.entities.values()]
+    nodes = {entity.name for entity in entities if entity.kind is EntityKind.NODE}
+    names = {entity.name for entity in entities}
+    for what, globs, known in (
+        ("node", options.nodes, nodes),
+        ("topic or service", options.topics, names),
+    ):
+        for glob in globs:
+            if not any(fnmatchcase(name, glob) for name in known):
+                raise TraceError(
+                    f"neither run has a {what} {printable(glob)}{did_you_mean(glob, known)}"
+                )
 
 
 class _Comparison:
