@@ -96,6 +96,8 @@ class Editing:
             if not edit.of_event:
                 self._try(edit, self._between)
         changed: tuple[Any, ...] | None = event
+        if event[3] == EventKind.BAG:  # a topic's next message may be the one of this very event
+            changed = (*event[:4], event[0].send, *event[5:])
         for edit in due:
             if edit.of_event and changed is not None and self.error is None:
                 changed = self._try(edit, self._event, changed)

@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import rsltrace
+from rsltrace.bag.export import export_bag
 from rsltrace.cli.main import cli
 from rsltrace.errors import EditError
 from rsltrace.job import load_job
@@ -189,6 +190,24 @@ def test_a_branch_of_a_branch(folder: Path) -> None:
         values(folder / "branch.mcap", "/speed"),
     )
     assert second == [*first[:20], *first[21:]]
+
+
+def test_messages_of_a_bag(folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "nodes_of_replay.py").write_text(NODES)
+    export_bag(folder / "run.mcap", tmp_path / "bag")
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: 'nodes_of_replay:Filter'}]\nbags: [{path: bag, topics: [/speed]}]\n"
+    )
+    run(load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    speed = values(tmp_path / "run.mcap", "/speed")
+    branch(tmp_path, '3s: drop("/speed")')
+    assert values(tmp_path / "branch.mcap", "/speed") == speed[:-1]
+    fifth = events(tmp_path / "run.mcap", EventKind.BAG, "/speed")[4]
+    branch(tmp_path, f"{fifth}: message.data = -1", '2.95s: topic("/speed").data += 1')
+    expected = [*speed[:4], -1.0, *speed[5:-1], speed[-1] + 1]
+    assert values(tmp_path / "branch.mcap", "/speed") == expected
+    branch(tmp_path, f"{fifth}: drop()")
+    assert values(tmp_path / "branch.mcap", "/speed") == [*speed[:4], *speed[5:]]
 
 
 def test_edits_that_change_nothing(folder: Path) -> None:
