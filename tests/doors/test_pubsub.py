@@ -107,6 +107,44 @@ def test_raw_subscriptions_and_raw_publications(simulate: Any) -> None:
     assert got == [b"\x00\x01\x00\x00\x04\x00\x00\x00abc\x00"]
 
 
+def test_raw_bytes_from_another_process_are_padded_to_four(simulate: Any) -> None:
+    """As Fast DDS gives them: measured between two processes, and within one."""
+    got: list[bytes] = []
+    again: list[str] = []
+
+    class Talks(Node):
+        def __init__(self) -> None:
+            super().__init__("talks")
+            self.publisher = self.create_publisher(String, "s", 10)
+            self.create_timer(1.0, lambda: self.publisher.publish(String(data="abcd")))
+
+    class Passes(Node):
+        def __init__(self) -> None:
+            super().__init__("passes")
+            publisher = self.create_publisher(String, "t", 10)
+            self.create_subscription(String, "s", got.append, 10, raw=True)
+            self.create_subscription(String, "s", publisher.publish, 10, raw=True)
+
+    class Hears(Node):
+        def __init__(self) -> None:
+            super().__init__("hears")
+            self.create_subscription(String, "t", lambda m: again.append(m.data), 10)
+
+    recorded = simulate(Talks, Passes, Hears, duration=1)
+    assert got == [b"\x00\x01\x00\x00\x05\x00\x00\x00abcd\x00\x00\x00\x00"]
+    assert again == ["abcd"]
+    with recorded.trace() as trace:
+        kept = [bytes(data) for topic in ("/s", "/t") for *_, data in trace.messages(topic)]
+    assert kept == [got[0][:-3]] * 2  # canonical
+
+    def both() -> list[Node]:
+        return [Talks(), Passes()]
+
+    got.clear()
+    simulate(both, duration=1)
+    assert got == [kept[0]]
+
+
 def test_message_info_carries_simulated_stamps(simulate: Any) -> None:
     infos: list[dict[str, Any]] = []
 
