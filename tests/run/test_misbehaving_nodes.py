@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -297,13 +298,15 @@ def test_a_hang_up_closes_the_trace_unless_it_is_ignored(
 ) -> None:
     wait = "open('waits', 'w').close()\n        while not os.path.exists('go'): sum(range(100_000))"
     job_file(JOB, NODE % wait)
+    wanted = signal.SIG_IGN if ignored else signal.SIG_DFL
     command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "run.mcap", "-q"]
     process = subprocess.Popen(
-        ["nohup", *command] if ignored else command,
+        command,
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        preexec_fn=partial(signal.signal, signal.SIGHUP, wanted),  # nohup may have started us
     )
     out = tmp_path / "run.mcap"
     while not (tmp_path / "waits").exists():
