@@ -230,6 +230,17 @@ class DebugSession:
         """
         return str(self._ask("pdb", address=address)["raised"])
 
+    def debugpy(self, port: int = 5678) -> str:
+        """Run on in a copy under ``debugpy``, at a port of this machine (0: any that is free).
+
+        A notice ``debugpy`` says that it waits for an editor. That stops in the first line of the
+        next callback, and wherever it has breakpoints; simulated time stands still meanwhile. The
+        session stands where it stood. Returns why it is over: the editor has disconnected, say.
+
+        :raises DebugError: nothing follows, the run cannot be copied, or debugpy is missing.
+        """
+        return str(self._ask("debugpy", port=port)["ended"])
+
     def node(self, name: str) -> dict[str, str]:
         """Return the attributes of a node and its parameters, as Python shows them."""
         return dict(self._ask("node", name=name))

@@ -10,14 +10,15 @@ from __future__ import annotations
 import os
 import socket
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsltrace.debug import inspection
 from rsltrace.debug.conditions.message_fields import loaded_fields
 from rsltrace.debug.conditions.names import Names, names_of
 from rsltrace.debug.conditions.text import parse_condition
+from rsltrace.debug.debuggers import debugger
 from rsltrace.debug.forking import end_process, fork_beside, why_not
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described
@@ -75,7 +76,8 @@ class Engine:
         self._checkpoint_s = 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
-        self._pdb_address = ""
+        self._apart_calls: Callable[..., None] | None = None
+        """What calls callbacks in a copy made for a debugger."""
         dispatcher = session.world.domain.dispatcher
         self._end_event = dispatcher.end_event
         self._execute = dispatcher.execute
@@ -98,9 +100,8 @@ class Engine:
             event = self.event
             event.handle, event.entity, event.node, event.kind = handle, entity, node, kind
             self._about_to_run()
-        if self._pdb_address:
-            callback, args, *cause = rest
-            rest = (lambda *_: self._call_under_pdb(callback, args), (), *cause)
+        if self._apart_calls is not None:
+            rest = (self._apart_calls, rest[:2], *rest[2:])
         self._execute(handle, entity, node, kind, *rest)
 
     def _differs(self) -> None:
@@ -260,8 +261,8 @@ class Engine:
                 if request["do"] == "run":
                     if self._begin(request):
                         return
-                elif request["do"] == "pdb":
-                    if self._begin_pdb(request["address"]):
+                elif request["do"] in ("pdb", "debugpy"):
+                    if self._begin_apart(request):
                         return
                 else:
                     self._do(request)
@@ -402,30 +403,34 @@ class Engine:
         assert ours is not None
         self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
 
-    def _begin_pdb(self, address: str) -> bool:
-        """Let a copy call the next callback under ``pdb``; True in the copy.
+    def _begin_apart(self, request: Message) -> bool:
+        """Let a copy call what follows under a debugger; True in the copy.
 
         :raises DebugError: there can be no copy, or nothing follows.
         """
         if self.over:
             raise DebugError(f"nothing follows: {self.over}")
         ours = self._forked()
-        if ours is None:
-            self._pdb_address = address
-            self._goal, self._mark, self.is_next = Goal(), _NEVER, False
-            return True
-        self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
-        return False
-
-    def _call_under_pdb(self, callback: Callable[..., Any], args: tuple[Any, ...]) -> None:
-        """Call the callback for which this copy was made, and end."""
-        from rsltrace.debug.callback_pdb import call_under_pdb
-
+        if ours is not None:
+            self._hand_over(ours, {"id": self._id, "ok": {"pid": ours.pid}})
+            return False
         try:
-            answer: Message = {"ok": {"raised": call_under_pdb(callback, args, self._pdb_address)}}
+            self._apart_calls = debugger(self, request)
         except BaseException as error:
-            answer = {"error": said(error)}
-        with engage(None), suppress(BaseException):
+            self.end_apart(error=said(error))
+        self._goal, self._mark, self.is_next = Goal(), _NEVER, False
+        self.ledger.on_difference = lambda: None  # who debugs may change things
+        return True
+
+    @contextmanager
+    def outside(self) -> Iterator[None]:
+        """Do what is no part of the run, on whatever stack."""
+        with engage(None), self.session.world.domain.dispatcher.outside_events():
+            yield
+
+    def end_apart(self, **answer: Any) -> None:
+        """End this copy with an answer."""
+        with self.outside(), suppress(BaseException):
             self.lines.send(answer)
         end_process(0)
 

@@ -46,7 +46,8 @@ class Supervisor:
             "inspect": self._pass_on,
             "evaluate": self._pass_on_apart,
             "node": self._pass_on_apart,
-            "pdb": self._pdb,
+            "pdb": self._debug,
+            "debugpy": self._debug,
             "event": self._pass_on,
             "sent_by": self._sent_by,
             "last_changed": self._last_changed,
@@ -196,10 +197,11 @@ class Supervisor:
     def _pass_on(self, request: Message) -> Any:
         return self.tree.ask_cursor({k: v for k, v in request.items() if k != "id"})
 
-    def _pdb(self, request: Message) -> Any:
-        answer = self.tree.ask_apart({"do": "pdb", "address": str(request["address"])}, None)
+    def _debug(self, request: Message) -> Any:
+        """Let a copy run on under a debugger of Python, until that is told to end."""
+        answer = self.tree.ask_apart({k: v for k, v in request.items() if k != "id"}, None)
         if "raised" not in answer:
-            raise DebugError(f"no callback follows: {answer.get('text', '')}")
+            return {"ended": answer.get("text", "the end of the run"), "raised": ""}
         return answer
 
     def _pass_on_apart(self, request: Message) -> Any:

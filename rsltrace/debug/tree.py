@@ -377,6 +377,8 @@ class Tree:
                 self._wait_for(process, limit_s)
             elif message.get("notice") == "checkpoint":
                 self._add(message)
+            elif message.get("notice") == "debugpy":
+                self._tell(message)
             elif message.get("notice") == "no checkpoint":
                 self._no_checkpoints(message["text"])
             else:

@@ -225,6 +225,18 @@ def _pdb(shell: Prompt, rest: str) -> None:
     shell.show([show.position_line(shell.session.position)])
 
 
+@_add("debugpy", usage="[PORT]", topic="looking")
+def _debugpy(shell: Prompt, rest: str) -> None:
+    """Run on in a copy of the run, for an editor (VS Code) to stop in: port 5678.
+
+    The editor stops in the first line of the next callback, and where it has breakpoints; simulated
+    time stands still meanwhile. When it disconnects, or with Ctrl-C, this prompt is back, and the
+    run stands where it stood.
+    """
+    shell.show([shell.session.debugpy(_count(rest, 5678))])
+    shell.show([show.position_line(shell.session.position)])
+
+
 # -- searching -------------------------------------------------------------------------------------
 
 
