@@ -115,6 +115,9 @@ pictures: $(INSTALLED)
 	cd $(SAMPLE) && $(VIEW) --export $(PICTURES)/view_two.svg
 	cd sample_traces/delayed_input && $(abspath $(BIN))/rsltrace view a.mcap --at 252 \
 		--export $(PICTURES)/view.svg
+	cd sample_traces/schedule && $(abspath $(BIN))/rsltrace view a.mcap --live --at 20 --keys \
+		"B slash t o r q u e colon space d a t a space greater_than_sign space 1 enter full_stop" \
+		--export $(PICTURES)/view_live.svg
 	cd sample_traces/schedule && $(VIEW) --light --keys p --export $(PICTURES)/view_plot.svg
 	cd $(SAMPLE) && $(abspath $(BIN))/rsltrace rerun a.mcap b.mcap -o $(abspath $(OUT))/pictures.rrd --force
 	$(BIN)/python -m rsltrace_viewer.rerun_export.picture $(OUT)/pictures.rrd \

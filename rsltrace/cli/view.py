@@ -7,6 +7,9 @@ import os
 import re
 import shlex
 import sys
+from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +20,7 @@ from rsltrace.errors import OutputError, SetupError, TraceError
 from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
+    from rsltrace_viewer.session import Session
     from rsltrace_viewer.terminal.app import ViewerApp
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
@@ -29,6 +33,16 @@ _PORT = 8321
 @click.option("--filter", "filter_text", default="", metavar="TEXT", help="Show only some events.")
 @click.option("--light", is_flag=True, help="Dark on light.")
 @click.option("--follow", is_flag=True, help="Follow a trace that is still being recorded.")
+@click.option(
+    "--live", is_flag=True, help="Execute TRACE's job again: stepping runs it, forwards and back."
+)
+@click.option(
+    "--job-folder",
+    type=click.Path(path_type=Path),
+    metavar="DIR",
+    help="With --live: the folder of the job file (default: that of the trace, or this one).",
+)
+@click.option("--trust", is_flag=True, help="With --live: run the code that TRACE names unasked.")
 @click.option(
     "--export",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -44,6 +58,9 @@ def view(
     filter_text: str,
     light: bool,
     follow: bool,
+    live: bool,
+    job_folder: Path | None,
+    trust: bool,
     export: Path | None,
     size: str,
     keys: str,
@@ -52,6 +69,10 @@ def view(
 ) -> None:
     """Look at TRACE, or compare two: step through events, follow causes, read messages.
 
+    With --live, the job in TRACE runs again as one steps: each event is verified, and shown with
+    what it changed in its node and with the source of its callback. This runs code, under the
+    conditions of "rsltrace replay".
+
     Without a TRACE, offers those of this folder. Inside, ? shows all keys and q quits.
     """
     _check_installed("textual")
@@ -59,18 +80,19 @@ def view(
         raise click.UsageError("view shows one trace or compares two; `rsltrace diff` takes more")
     if follow and len(traces) > 1:
         raise click.UsageError("--follow works with one trace")
+    if live and (len(traces) != 1 or follow):
+        raise click.UsageError("--live works with one trace, whole or cut, and without --follow")
+    if not live and (trust or job_folder is not None):
+        raise click.UsageError("--trust and --job-folder are for --live")
     if serve:
         _serve(port)
         return
-    from rsltrace_viewer.terminal.app import ViewerApp, open_session
-
     chosen = traces or _choose(exporting=export is not None)
     if not chosen:
         return
-    session = open_session(*chosen)
-    try:
-        app = ViewerApp(
-            session,
+    with ExitStack() as stack:
+        session, made = _opened(stack, chosen, live=live, job_folder=job_folder, trust=trust)
+        app = made(
             start=None if at is None else _place(session, at),
             light=light,
             follow=follow,
@@ -80,8 +102,35 @@ def view(
             _export(app, export, _parse_size(size), keys.split())
         else:
             _run(app)
-    finally:
-        session.close()
+
+
+def _opened(
+    stack: ExitStack,
+    traces: tuple[Path, ...],
+    *,
+    live: bool,
+    job_folder: Path | None,
+    trust: bool,
+) -> tuple[Session, Callable[..., ViewerApp]]:
+    """Open what is to be shown; return it, and what makes the app for it."""
+    from rsltrace_viewer.terminal.app import ViewerApp, open_session
+
+    if not live:
+        session = open_session(*traces)
+        stack.callback(session.close)
+        return session, partial(ViewerApp, session)
+    from rsltrace_viewer.live.app import LiveApp
+    from rsltrace_viewer.live.execution import Execution
+    from rsltrace_viewer.live.state import LiveSession
+    from rsltrace_viewer.model.run import Run
+
+    from rsltrace.debug.client import DebugSession
+
+    run = Run.open(traces[0])
+    stack.callback(run.close)
+    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=trust))
+    shown = LiveSession(run)
+    return shown, partial(LiveApp, shown, Execution(debugged, run))
 
 
 def _check_installed(package: str) -> None:

@@ -30,12 +30,14 @@ Message = tuple[int, "BagPublisher", bytes]
 class Player:
     """Publishes a stream of recorded messages, one event each.
 
-    ``on_end`` is called when the last message has been published.
+    ``name`` says whose they are, for errors. ``on_end`` is called when the last message has been
+    published.
     """
 
     def __init__(
-        self, domain: Domain, messages: Iterator[Message], on_end: Callable[[], None]
+        self, domain: Domain, messages: Iterator[Message], name: str, on_end: Callable[[], None]
     ) -> None:
+        self._name = name
         self._dispatcher = domain.dispatcher
         self._messages = messages
         self._on_end = on_end
@@ -63,7 +65,7 @@ class Player:
             data = publisher.canonical(self._raw)
         except ValueError as error:
             raise BagError(
-                f"message {self.played + 1} of the bag, on {publisher.topic}, is not a "
+                f"message {self.played + 1} of {self._name}, on {publisher.topic}, is not a "
                 f"{publisher.type_name}: {error}"
             ) from error
         digest = self._hash(data)

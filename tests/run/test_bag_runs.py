@@ -125,7 +125,7 @@ def test_a_message_that_is_not_of_its_type_is_named(record_job: Any, tmp_path: P
         words = writer.add_connection("/words", "std_msgs/msg/String", typestore=store)
         writer.write(words, 5, b"\x00\x01\x00\x00\xff\x00\x00\x00a\x00")
     result = record_job("nodes: [{node: nodes_under_test:Hearer}]\nbags: [bag]\n", HEARER)
-    assert "message 1 of the bag, on /words, is not a std_msgs/msg/String" in str(result.error)
+    assert "message 1 of the bag bag, on /words, is not a std_msgs/msg/String" in str(result.error)
     with Trace.open(result.path) as trace:
         assert trace.complete
 

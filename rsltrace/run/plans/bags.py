@@ -263,7 +263,9 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
         merged = heapq.merge(*streams, key=lambda message: message[0])
     if told:
         merged = _with_progress(merged, told[0], _span_ns(bags))
-    Player(domain, merged, on_end).start()
+    paths = " and ".join(entry.spec.path for entry in bags)
+    name = f"the {'bag' if len(bags) == 1 else 'bags'} {paths}"
+    Player(domain, merged, name, on_end).start()
 
 
 def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:

@@ -68,6 +68,7 @@ def _begin(case: Case, corpus: Corpus) -> str:
         "screen.svg",
         "graph.svg",
         "new.yaml",
+        "job.schema.json",
         "job.yaml",
     )
     return _state(case.folder)

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 from textual.app import SystemCommand
 from textual.binding import Binding
 from textual.screen import Screen
+from textual.widget import Widget
 
 from rsltrace.errors import TraceError
 from rsltrace.words.times import parse_stamp
@@ -17,7 +18,7 @@ from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.follow import Follow
-from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.keys import KEYS, keys_of
 from rsltrace_viewer.terminal.questions import parse_index, question_of
 from rsltrace_viewer.terminal.screens.help import HelpScreen
 from rsltrace_viewer.terminal.stepping import Stepping
@@ -26,7 +27,7 @@ from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt
 from rsltrace_viewer.terminal.widgets.timeline import Timeline
 
-_ONLY = ("only-timeline", "only-inspector", "only-lanes")
+_ONLY = ("only-timeline", "only-inspector", "only-lanes", "only-source")
 
 
 class ViewerApp(Stepping):
@@ -179,13 +180,16 @@ class ViewerApp(Stepping):
         else:
             self.go(session.place_at_time(event.position), centre=True)
 
+    def panes(self) -> list[Widget]:
+        """The parts of the screen that one can go to."""
+        return [self.timeline, self.inspector, self.lanes]
+
     def action_pane(self, step: int) -> None:
         """Go to the next part of the screen."""
         if len(self.screen_stack) > 1:
             self.screen.focus_next()
             return
-        panes = [self.timeline, self.inspector, self.lanes]
-        shown = [pane for pane in panes if pane.display and pane.size.height]
+        shown = [pane for pane in self.panes() if pane.display and pane.size.height]
         place = shown.index(self.focused) if self.focused in shown else -step
         shown[(place + step) % len(shown)].focus()
 
@@ -208,7 +212,7 @@ class ViewerApp(Stepping):
 
     def action_help(self) -> None:
         """Show all keys."""
-        self.push_screen(HelpScreen(two=self.session.b is not None))
+        self.push_screen(HelpScreen(two=self.session.b is not None, live=self.live))
 
     def action_plot(self) -> None:
         """Open the plots."""
@@ -271,9 +275,8 @@ class ViewerApp(Stepping):
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
         """Offer all keys by their help in the command palette."""
         yield from super().get_system_commands(screen)
-        for key in KEYS:
-            if self.session.b is not None or not key.two:
-                yield SystemCommand(f"{key.help}", f"key {key.shown}", self._runner(key.action))
+        for key in keys_of(two=self.session.b is not None, live=self.live):
+            yield SystemCommand(f"{key.help}", f"key {key.shown}", self._runner(key.action))
 
     def _runner(self, action: str) -> Any:
         async def run() -> None:

@@ -35,6 +35,7 @@ JUMP = "Jump"
 FIND = "Search and filter"
 LOOK = "Look"
 COMPARE = "Two traces"
+RUN = "Run (--live)"
 
 KEYS: tuple[Key, ...] = (
     Key("down,j", "↓ j", "step(1)", "next event", MOVE, "next", 1),
@@ -113,17 +114,40 @@ KEYS: tuple[Key, ...] = (
     Key("q", "q", "quit", "quit", LOOK, "quit", 0),
 )
 
+LIVE_KEYS: tuple[Key, ...] = (
+    Key(
+        "full_stop",
+        ".",
+        "run(1)",
+        "run on to the next breakpoint, or to the end",
+        RUN,
+        ". , run",
+        1,
+    ),
+    Key("comma", ",", "run(-1)", "run back to the last breakpoint, or to the begin", RUN),
+    Key("B", "B", "ask('breakpoint')", "set a breakpoint", RUN, "break", 1),
+    Key("D", "D", "clear", "remove a breakpoint", RUN),
+    Key("E", "E", "ask('watch')", "watch an expression in the node", RUN, "watch", 2),
+    Key("C", "C", "ask('changed')", "to the last change of an attribute", RUN, "changed", 2),
+    Key("T", "T", "ask('first')", "to the first event with a condition", RUN),
+)
+"""What a run takes that goes on; all keys that go to an event execute it."""
+
 _SHOWN = {"next": "↓↑", "cause": "c", "effects": "e"}
 
 
-def footer_keys(*, two: bool, searching: str) -> list[tuple[str, str, str]]:
+def keys_of(*, two: bool, live: bool) -> list[Key]:
+    """Return the keys that do something: with two traces, with a run that goes on."""
+    found = [key for key in KEYS if two or not key.two]
+    return [*LIVE_KEYS, *found] if live else found
+
+
+def footer_keys(*, two: bool, searching: str, live: bool = False) -> list[tuple[str, str, str]]:
     """Return (key as shown, words, action) for the footer, the most needed first."""
-    found = sorted(
-        (key for key in KEYS if key.short and (two or not key.two)), key=lambda key: key.rank
-    )
+    found = sorted((key for key in keys_of(two=two, live=live) if key.short), key=lambda k: k.rank)
     entries = []
     for key in found:
-        if key.short.startswith(("[", "+")):
+        if key.short.startswith(("[", "+", ".")):
             shown, _, words = key.short.rpartition(" ")
         else:
             shown, words = _SHOWN.get(key.short, key.shown.split(" ")[0]), key.short

@@ -39,6 +39,8 @@ class Shell(App[None]):
     """One session on the screen; what one can do with it is added by subclasses."""
 
     TITLE = "rsltrace view"
+    live = False
+    """Whether events are executed."""
     CSS = """
     Screen { layout: vertical; overflow: hidden; }
     #body { height: 1fr; layout: vertical; }
@@ -250,7 +252,7 @@ class Shell(App[None]):
             status = f"{following}{session.place + 1:,}/{session.view.count:,}"
         searching = "match" if session.search is not None else "divergence" if session.b else ""
         self.screen_stack[0].query_one(FooterBar).show(
-            two=session.b is not None, searching=searching, status=status
+            two=session.b is not None, searching=searching, status=status, live=self.live
         )
 
     def _say(self, status: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 from textual.app import ComposeResult
@@ -14,7 +15,7 @@ from textual.widgets import Static
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.lanes import KIND_LETTERS
 from rsltrace_viewer.model.query.fields import FIELDS
-from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.keys import Key, keys_of
 
 _KEY_WIDTH = 13
 _COLUMN = 62
@@ -30,21 +31,23 @@ class HelpScreen(ModalScreen[None]):
                                   border: round $primary; padding: 0 1; }
     """
 
-    def __init__(self, *, two: bool) -> None:
+    def __init__(self, *, two: bool, live: bool = False) -> None:
         super().__init__()
         self._two = two
+        self._live = live
 
     def compose(self) -> ComposeResult:
         """Make the text."""
         with VerticalScroll() as box:
             box.border_title = "rsltrace view: keys"
             box.border_subtitle = "Esc closes, ↓ scrolls"
-            yield Static(help_text(self.app.size.width, two=self._two))
+            yield Static(help_text(self.app.size.width, two=self._two, live=self._live))
 
 
-def help_text(width: int, *, two: bool) -> Content:
+def help_text(width: int, *, two: bool, live: bool = False) -> Content:
     """Return the help for a screen of ``width`` cells: two columns where there is room."""
-    blocks = [_keys_block(group, two) for group in _groups(two)]
+    keys = keys_of(two=two, live=live)
+    blocks = [_keys_block(group, keys) for group in dict.fromkeys(key.group for key in keys)]
     blocks.append(_signs_block(two))
     blocks += [_lanes_block(), _filter_block()]
     if width < 2 * _COLUMN + 6:
@@ -63,14 +66,10 @@ def help_text(width: int, *, two: bool) -> Content:
     return Content("\n").join(lines)
 
 
-def _groups(two: bool) -> list[str]:
-    return list(dict.fromkeys(key.group for key in KEYS if two or not key.two))
-
-
-def _keys_block(group: str, two: bool) -> list[Content]:
+def _keys_block(group: str, keys: Sequence[Key]) -> list[Content]:
     lines = [Content.styled(group, "bold underline")]
-    for key in KEYS:
-        if key.group == group and (two or not key.two):
+    for key in keys:
+        if key.group == group:
             shown = fit(key.shown, _KEY_WIDTH)
             lines.append(Content.assemble("  ", (shown, "bold $text-primary"), key.help))
     if group == "Look":

@@ -51,7 +51,7 @@ class FooterBar(Static):
         super().__init__(id=id)
         self._places: list[tuple[int, str]] = []
 
-    def show(self, *, two: bool, searching: str, status: str) -> None:
+    def show(self, *, two: bool, searching: str, status: str, live: bool = False) -> None:
         """Show the keys, and a status at the right."""
         status = printable(status)
         width = self.size.width - 2
@@ -59,7 +59,7 @@ class FooterBar(Static):
         parts: list[Content | tuple[str, str] | str] = []
         self._places = []
         used = 0
-        for shown, words, action in footer_keys(two=two, searching=searching):
+        for shown, words, action in footer_keys(two=two, searching=searching, live=live):
             length = cells(shown) + cells(words) + 3
             if used + length > room:
                 continue

@@ -1,0 +1,175 @@
+"""Executing the selected event again, in a debugging session; no screen is needed for that.
+
+A session stands between events. The selected event is the one that has ended last: to see what it
+changed, the session goes before it, looks at its node, lets it run, and looks once more.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+from rsltrace.debug.client import DebugSession
+from rsltrace.debug.positions import Breakpoint, Stopped
+from rsltrace.errors import DebugError, RsltraceError
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.timeline.events import node_of
+
+WATCHES_MAX = 8
+_ADDRESS = re.compile(r" at 0x[0-9a-f]+(?=>)")
+"""Of an object without a text of its own: another one each time that it is made again."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The callback of an event: ``line`` is the number of the first of ``lines``."""
+
+    file: str
+    line: int
+    name: str
+    lines: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Executed:
+    """An event that was executed again: the attributes of its node, as Python shows them.
+
+    ``source`` is None for what is no function in Python. ``watched`` are expressions with their
+    values, or why they have none. ``wrong`` says in what the run is not the recorded one; then
+    there is nothing else.
+    """
+
+    index: int
+    node: str
+    before: dict[str, str]
+    after: dict[str, str]
+    source: Source | None
+    watched: tuple[tuple[str, str], ...] = ()
+    wrong: str = ""
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """The attributes that the event set, changed or removed; none where it ended the node."""
+        if not self.after:
+            return ()
+        names = dict.fromkeys((*self.before, *self.after))
+        return tuple(name for name in names if self.before.get(name) != self.after.get(name))
+
+
+@dataclass(frozen=True, slots=True)
+class Stop:
+    """Where a run has stopped: at ``event``. ``why`` is for people."""
+
+    event: int
+    why: str
+    breakpoint: Breakpoint | None = None
+
+
+class Superseded(Exception):
+    """Something else was asked for in the meantime."""
+
+
+class Execution:
+    """Drives a debugging session of ``run``'s trace, for one thread at a time."""
+
+    def __init__(self, session: DebugSession, run: Run) -> None:
+        self.session = session
+        self.watches: list[str] = []
+        self._run = run
+
+    def at(self, index: int, wanted: Callable[[], bool]) -> Executed:
+        """Execute an event, and stand behind it. ``wanted`` is asked now and then.
+
+        :raises Superseded: it is not wanted any more.
+        :raises DebugError, ReplayError: the session is over, or cannot go there.
+        """
+        name = node_of(self._run, self._run.event(index))
+        stopped = self._reach(index, wanted)
+        before = self._attributes(name)
+        if stopped.reason != "diverged":
+            stopped = self._reach(index + 1, wanted)
+        if stopped.reason == "diverged":
+            return Executed(index, name, {}, {}, None, wrong=stopped.text or "the run diverged")
+        return Executed(
+            index,
+            name,
+            before,
+            self._attributes(name),
+            self._source(),
+            tuple((text, self._value(text, name)) for text in self.watches),
+        )
+
+    def run_on(self, index: int, wanted: Callable[[], bool]) -> Stop:
+        """Run on behind an event, to the next at which a breakpoint stops, or to the end.
+
+        :raises Superseded: it is not wanted any more.
+        """
+        self._reach(index + 1, wanted)
+        return self._stop(self.session.go_on())
+
+    def run_back(self, index: int, wanted: Callable[[], bool]) -> Stop:
+        """Run back to the last event before this one at which a breakpoint stops, or to the first.
+
+        :raises Superseded: it is not wanted any more.
+        """
+        self._reach(index + 1, wanted)
+        while True:
+            stop = self._stop(self.session.reverse_go_on())
+            if stop.event != index or stop.breakpoint is None:
+                return stop
+            if not wanted():
+                raise Superseded
+
+    def changed_last(self, node: str, attribute: str) -> int:
+        """Return the event that changed an attribute last, up to where the session stands."""
+        return max(self.session.last_changed(node, attribute).index - 1, 0)
+
+    def true_first(self, condition: str) -> int:
+        """Return the event with which a condition became true first."""
+        found = self.session.first_true(condition)
+        return found.index if found.is_next else max(found.index - 1, 0)
+
+    def _reach(self, index: int, wanted: Callable[[], bool]) -> Stopped:
+        while True:
+            if not wanted():
+                raise Superseded
+            stopped = self.session.go_to(index)
+            if stopped.reason != "paused":
+                return stopped
+
+    def _stop(self, stopped: Stopped) -> Stop:
+        place = stopped.position
+        event = place.index if place.is_next else place.index - 1
+        why = {
+            "end": "the end of the run",
+            "begin": "the begin of the run",
+            "paused": "stopped",
+            "diverged": stopped.text or "the run diverged",
+        }.get(stopped.reason, stopped.reason)
+        if stopped.breakpoint is not None:
+            why = f"breakpoint {stopped.breakpoint.number}: {stopped.breakpoint.text}"
+        return Stop(min(max(event, 0), max(self._run.count - 1, 0)), why, stopped.breakpoint)
+
+    def _attributes(self, node: str) -> dict[str, str]:
+        with suppress(DebugError):  # not constructed yet, or destroyed
+            found = self.session.node(node)
+            return {name: _ADDRESS.sub("", value) for name, value in found.items()}
+        return {}
+
+    def _source(self) -> Source | None:
+        found: dict[str, Any] | None = self.session.inspect("source")
+        if not found:
+            return None
+        lines = tuple(str(line) for line in found["lines"])
+        return Source(str(found["file"]), int(found["line"]), str(found["name"]), lines)
+
+    def _value(self, expression: str, node: str) -> str:
+        for owner in (node, None):
+            try:
+                return str(self.session.evaluate(expression, owner))
+            except RsltraceError as error:
+                why = (str(error).splitlines() or [""])[0]
+        return why
