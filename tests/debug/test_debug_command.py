@@ -133,6 +133,15 @@ def test_pdb_in_the_first_line_of_a_callback(folder: Path) -> None:
     assert answers["print last > 0"] == ["True"]
 
 
+def test_what_if_at_the_prompt(folder: Path) -> None:
+    edit = 'edit node("/filter").state = 1000.0'
+    done = script(folder, ["goto 300", edit, "print filter.state", "keep if.mcap", "edit what"])
+    assert said(done)["print filter.state"] == ["1000.0"], done.stderr
+    assert said(done)["keep if.mcap"] == ["wrote if.mcap"]
+    assert "an edit is one of" in done.stdout + done.stderr
+    (folder / "if.mcap").unlink()
+
+
 def test_a_script_ends_at_the_first_command_that_is_wrong(folder: Path) -> None:
     done = script(folder, ["break /smooth: data > 3", "break /smoth: data > 3", "continue"])
     assert done.returncode == 2

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 
+from rsltrace.debug.positions import Stopped
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.commands import Commands, Prompt
 from rsltrace.debug.prompt.pdb_terminal import talk
@@ -284,6 +285,32 @@ def _as_condition(text: str, shell: Prompt) -> str:
             return text
         return f"when {text}"
     return text
+
+
+# -- what if ---------------------------------------------------------------------------------------
+
+
+@_add("edit", usage="EDIT", topic="what if")
+def _edit(shell: Prompt, rest: str) -> None:
+    """Change something from here on, and go on in the branch that comes of it.
+
+    message.data = 3.0                what the event that follows receives
+    topic("/odom").x += 1             the next message on a topic
+    node("/ekf").P[0][0] = 1e-3       an attribute
+    parameters("/ekf")["rate"] = 20   a parameter
+    drop()  delay("5ms")  defer()     the event that follows: not, later, after the others
+    812: drop()                       the same at event 812, or at a time (2.5s: ...)
+    """
+    position = shell.session.edit(rest)
+    shell.stopped(Stopped("step", position))
+
+
+@_add("keep", usage="FILE", topic="what if")
+def _keep(shell: Prompt, rest: str) -> None:
+    """Write the trace of the branch in which the session is since an edit."""
+    if not rest:
+        raise DebugError("where to? keep FILE, as branch.mcap")
+    shell.show([f"wrote {shell.session.branch(rest)}"])
 
 
 # -- the rest --------------------------------------------------------------------------------------
