@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,20 @@ from tests.run.test_recorded_order import ALL, MIXED
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]
+
+
+SHORT = ("job_heap", "sensor_fusion", "missing_event", "delayed_input")
+SHORT_FEATURES = ("", "a policy of one's own", "delays", "execution times")
+
+
+def some(all_of_them: Iterable[Any], short: tuple[str, ...]) -> list[Any]:
+    """Return parameters; those that name none of ``short`` are for the long campaigns."""
+    found = []
+    for one in all_of_them:
+        values = one if isinstance(one, tuple) else (one,)
+        is_short = values[0] in short or any(name and name in values[0] for name in short)
+        found.append(pytest.param(*values, marks=() if is_short else pytest.mark.long))
+    return found
 
 
 def nodes_of(trace: Path) -> list[str]:
@@ -67,7 +81,7 @@ def unchanged(
         assert once_more.compared == result.compared
 
 
-@pytest.mark.parametrize(("job", "overrides"), EXAMPLES)
+@pytest.mark.parametrize(("job", "overrides"), some(EXAMPLES, SHORT))
 def test_each_node_of_the_examples(
     job: str, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -79,7 +93,7 @@ def test_each_node_of_the_examples(
     unchanged(tmp_path / "run.mcap", (ROOT / job).parent, without=("/monitor",))
 
 
-@pytest.mark.parametrize("feature", ["", *FEATURES])
+@pytest.mark.parametrize("feature", some(["", *FEATURES], SHORT_FEATURES))
 def test_mains_threads_services_and_blocking_calls(feature: str, tmp_path: Path) -> None:
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
     (tmp_path / "job.yaml").write_text(ALL + FEATURES.get(feature, "") + "seed: 5\n")

@@ -220,7 +220,7 @@ FEATURES = {
     "clocks": "clocks: [{node: /several, offset: -20ms, "
     "random_jumps: {every: 100ms, most: 5ms}}]\n",
 }
-SHORT = ("plain", "losses", "shared executors", "ties")
+SHORT = ("losses", "shared executors")
 
 
 def check(tmp_path: Path, feature: str, stop: str) -> None:
