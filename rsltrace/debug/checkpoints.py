@@ -10,6 +10,9 @@ from rsltrace.debug.processes import SimProcess
 _NEAR_EVENTS = 2_000
 """Closer to the cursor than this, all places are equally worth a checkpoint."""
 
+COUNT_MAX = 500
+"""Each has a socket to the supervisor, which may have a thousand."""
+
 LADDER = (2048, 128, 8)
 """How many events before a goal checkpoints are left on the way there: who goes back one event
 goes back another."""

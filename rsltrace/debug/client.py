@@ -55,10 +55,11 @@ class DebugSession:
         """Open a trace or a job.
 
         ``job_folder`` and ``trust`` are those of ``rsltrace.replay``. There are ``checkpoints`` at
-        most (0: none; going back is then running again from the beginning), in ``memory_mib`` at
-        most. ``echo`` has nodes' log records printed; what they print comes as notices of kind
-        ``output`` to ``on_notice``, which is called with every notice (docs/debug-protocol.md).
-        ``overrides`` are settings for a job, as ``--set`` of ``rsltrace record``.
+        most (500 are the most; 0: none, and going back is running again from the beginning), in
+        ``memory_mib`` at most. ``echo`` has nodes' log records printed; what they print comes as
+        notices of kind ``output`` to ``on_notice``, which is called with every notice (see
+        docs/debug-protocol.md). ``overrides`` are settings for a job, as ``--set`` of
+        ``rsltrace record``.
 
         :raises ReplayError, TraceError: the trace cannot be replayed here, or is not trusted.
         :raises JobError, SetupError, BagError: its job cannot run.

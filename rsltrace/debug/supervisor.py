@@ -68,7 +68,7 @@ class Supervisor:
         except RsltraceError as error:
             if not isinstance(error, ClientGone):
                 self.client.send({"notice": "failed", "error": _said(error)})
-        except BrokenPipeError:
+        except ConnectionError:
             pass
         finally:
             self.tree.family.kill_all()

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from typing import Any
 
-from rsltrace.debug.checkpoints import Checkpoint, Checkpoints
+from rsltrace.debug.checkpoints import COUNT_MAX, Checkpoint, Checkpoints
 from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.processes import Family, Lost, SimProcess, memory_bytes
 from rsltrace.errors import DebugError
@@ -41,7 +41,7 @@ class Tree:
         self._spec = {**spec, "supervisor": os.getpid()}
         self._client = client
         self._waiting = waiting
-        self._checkpoints = Checkpoints(int(spec["checkpoints"]))
+        self._checkpoints = Checkpoints(min(int(spec["checkpoints"]), COUNT_MAX))
         self._memory_max = int(spec["memory_mib"]) << 20
         self._weighed = 0
         self._cursor: SimProcess
