@@ -27,7 +27,7 @@ class Cold(Node):
 
     def tick(self):
         if self.imports:
-            import draws_when_imported
+            import toolz
         said = [
             tempfile.mktemp(), secrets.token_hex(4), random.Random().random(), platform.node(),
             mimetypes.guess_type("a.png")[0], str(zoneinfo.ZoneInfo("Europe/Berlin")),
@@ -50,6 +50,8 @@ class Reader(Node):
         self.create_timer(0.1, lambda: os.environ.get("NOTHING"))
 """
 
+LIBRARY_NAME = "toolz"
+"""Of a library by its name (``rsltrace.guard.libraries``); this one only draws when imported."""
 LIBRARY = """
 import os, random, secrets, time
 DRAWN = (os.urandom(8), random.random(), random.Random().random(), secrets.token_hex(), time.time())
@@ -91,9 +93,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[st
     """What came of each job, recorded in one fresh process: bytes, calls, what the node said."""
     pytest.importorskip("rclpy")
     folder = tmp_path_factory.mktemp("twice")
-    installed = folder / "lib" / "site-packages"  # what lies in such a folder is a library
+    installed = folder / "lib" / "site-packages"
     installed.mkdir(parents=True)
-    (installed / "draws_when_imported.py").write_text(LIBRARY)
+    (installed / f"{LIBRARY_NAME}.py").write_text(LIBRARY)
     (folder / "cold.py").write_text(NODE)
     for name, nodes in JOBS.items():
         job = {"nodes": nodes, "stop": {"duration": "0.35s"}, "guard": {"pin": False}}

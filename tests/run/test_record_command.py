@@ -13,6 +13,7 @@ import subprocess
 import sys
 import termios
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,8 @@ def test_a_run_that_is_ended_before_it_begins_has_the_status_of_its_signal(
     rsltrace: Any, job_file: Any, tmp_path: Path, name: str, code: int
 ) -> None:
     job_file(ENDLESS, f"import os, signal\nos.kill(os.getpid(), signal.{name})\n")
-    done = rsltrace("record", "job.yaml", "-o", "out.mcap")
+    unignored = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)  # nohup may have started us
+    done = rsltrace("record", "job.yaml", "-o", "out.mcap", preexec_fn=unignored)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
 
