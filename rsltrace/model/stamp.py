@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 NS_PER_S = 1_000_000_000
+_IN_FULL_NS = 1_000_000 * NS_PER_S
 
 
 def format_seconds(stamp_ns: int) -> str:
@@ -13,8 +14,13 @@ def format_seconds(stamp_ns: int) -> str:
 
 
 def format_duration(duration_ns: int) -> str:
-    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``."""
+    """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``.
+
+    A million seconds and more are told in full: they are times since 1970.
+    """
     size = abs(duration_ns)
+    if size >= _IN_FULL_NS:
+        return f"{format_seconds(duration_ns).rstrip('0').rstrip('.')} s"
     for unit, scale in (("s", NS_PER_S), ("ms", 1_000_000), ("us", 1_000)):
         if size >= scale:
             return f"{duration_ns / scale:.6g} {unit}"

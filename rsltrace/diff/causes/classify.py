@@ -210,6 +210,8 @@ def _one_sided(case: Case) -> Judgement:
     sentence = f"{phrase(one)} {at_time(one.stamp_ns)} happened only in {has}"
     if case.lost:
         sentence += f": {case.lost}"
+    elif case.periods is not None:
+        sentence += f": timer period {durations(*case.periods)}"
     elif instead is not None:
         sentence += f"; {has_not} went on with {phrase(instead)} {at_time(instead.stamp_ns)}"
     cause = case.cause_a if a else case.cause_b

@@ -128,12 +128,16 @@ class Explainer:
         )
 
     def _periods(self, a: EventView | None, b: EventView | None) -> tuple[int, int] | None:
-        if a is None or b is None or a.kind is not EventKind.TIMER:
+        view = a or b
+        if view is None or view.kind is not EventKind.TIMER:
             return None
+        number = self.run_a.matching.by_key[view.entity]
         found = []
-        for run, view in ((self.run_a, a), (self.run_b, b)):
-            entity = run.trace.entities[run.trace.event(view.index).entity]
-            found.append(entity.detail.get("period_ns"))
+        for run in (self.run_a, self.run_b):
+            table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
+            ids = (table == number).nonzero()[0]
+            detail = run.trace.entities[int(ids[0])].detail if len(ids) else {}
+            found.append(detail.get("period_ns"))
         one, other = found
         if isinstance(one, int) and isinstance(other, int) and one != other:
             return one, other

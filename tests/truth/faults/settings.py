@@ -73,7 +73,7 @@ def period(rng: random.Random) -> Planted:
         a,
         b,
         Truth(
-            ("timing",),
+            ("timing", "extra", "missing"),
             node.full_name,
             node.callbacks[0].entity,
             first=(rf"period.*{was} → {now} ms",),
