@@ -48,7 +48,9 @@ def _catmull_rom(p0: Point, p1: Point, p2: Point, p3: Point, t: float) -> Point:
 
 
 def _resample(points: Sequence[Point], spacing: float) -> list[Point]:
-    length = sum(distance(a, b) for a, b in pairwise(points))
+    length = 0.0
+    for a, b in pairwise(points):  # from Python 3.12 on, sum() rounds in another way
+        length += distance(a, b)
     # Stretched a little, so that a whole number of spacings fits.
     step = length / max(1, round(length / spacing))
     result = [points[0]]
