@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sysconfig
+from functools import cache
 from types import FrameType
 
 from rsltrace.guard.libraries import is_library
@@ -49,6 +50,12 @@ def _kind_of(file: str) -> int:
     return kind
 
 
+@cache
+def _is_installed(file: str) -> bool:
+    """Whether a file lies among what is installed, be it a library's or the user's."""
+    return any(part in file for part in _INSTALLED)
+
+
 def _calls_back(file: str) -> bool:
     if file.startswith(_HERE):
         return file == _CALLS_BACK
@@ -74,35 +81,42 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     """Return the innermost frame of user code that led to ``frame``, or None if none did.
 
     User code is what is neither Python's nor a library's, or in ``packages`` (where nodes are), and
-    a callback in a library. What a library does while it is
-    imported is not the user's doing, nor is what rsltrace and rclpy do for themselves. A thread
-    is the doing of whoever started it, even if it runs nothing but Python's own code.
+    a callback in a library. What an installed package does while it is imported is not the user's
+    doing, nor is what rsltrace and rclpy do for themselves. A thread is the doing of whoever
+    started it, even if it runs nothing but Python's own code.
     """
-    library = standard = None
+    installed = library = standard = None
     while frame is not None:
         file = frame.f_code.co_filename
         kind = _kind_of(file)
-        if kind == _USER or (packages and is_in(frame, packages)):
-            return frame
-        if kind == _LIBRARY:
+        if packages and is_in(frame, packages):
+            return installed or frame
+        if kind == _USER:
+            if not _is_installed(file):
+                return installed or frame
+            installed = installed or frame  # unless it is being imported
+        elif kind == _LIBRARY:
             library = frame
         elif kind == _STANDARD:
             standard = frame
         elif file == _THREADS:
-            return library or standard
+            return installed or library or standard
         elif kind == _OURS:
-            return library if _calls_back(file) else None
+            return installed or (library if _calls_back(file) else None)
         elif kind == _IMPORT:
             return None
         frame = frame.f_back
-    return None
+    return installed
 
 
 def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
-    """Return whether a library is being imported, rather than user code run or imported."""
+    """Return whether something that is installed is being imported, rather than user code run."""
     while frame is not None:
-        kind = _kind_of(frame.f_code.co_filename)
-        if kind in (_USER, _OURS) or (packages and is_in(frame, packages)):
+        file = frame.f_code.co_filename
+        kind = _kind_of(file)
+        if kind == _OURS or (kind == _USER and not _is_installed(file)):
+            return False
+        if packages and is_in(frame, packages):
             return False
         if kind == _IMPORT:
             return True

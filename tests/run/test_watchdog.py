@@ -132,9 +132,10 @@ def test_the_import_of_a_library_may_take_its_time(
     monkeypatch: pytest.MonkeyPatch,
     name: str,
 ) -> None:
-    (tmp_path / "site-packages").mkdir()
-    (tmp_path / "site-packages" / f"{name}.py").write_text(LIBRARY)
-    monkeypatch.syspath_prepend(str(tmp_path / "site-packages"))
+    folder = tmp_path / ("src" if name == "my_own_package" else "site-packages")
+    folder.mkdir()
+    (folder / f"{name}.py").write_text(LIBRARY)
+    monkeypatch.syspath_prepend(str(folder))
     here = ModuleType("looks_of_this_test")
     here.looks = busy  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, here.__name__, here)
