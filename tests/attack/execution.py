@@ -52,7 +52,7 @@ def preload(*, ros: bool) -> None:
                 importlib.import_module(module.name)
     for name in ("aiohttp", "fsspec.implementations.http", "textual.app", "rosbags.rosbag2"):
         importlib.import_module(name)
-    b"".decode("utf-8-sig")  # another user may not be able to read Python's own files
+    b"x".decode("utf-8-sig")  # another user may not be able to read Python's own files
     if ros:
         for name in ("rclpy.node", "std_msgs.msg", "std_srvs.srv", "rsltrace.run"):
             importlib.import_module(name)

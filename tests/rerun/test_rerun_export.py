@@ -320,8 +320,18 @@ def test_what_was_there_stays_until_the_recording_is_whole(tmp_path: Path) -> No
     ("schema", "why"),
     [
         ("p/E[] all\n====\nMSG: p/E\n", "a sequence of p/msg/E, which has no fields"),
-        ("p/T[2000] t\n====\nMSG: p/T\np/U[2000] u\n====\nMSG: p/U\nint8 x\n", "4000000 values"),
+        (
+            "p/T[2000] t\n====\nMSG: p/T\np/U[2000] u\n====\nMSG: p/U\nint8 x\n",
+            " values, more than 1048576",
+        ),
         ("nowhere/Type t\n", "is not usable"),
+        (
+            "p/T0 t\n"
+            + "".join(f"====\nMSG: p/T{n}\np/T{n + 1} a\np/T{n + 1} b\n" for n in range(24))
+            + "====\nMSG: p/T24\n",
+            " values, more than 1048576",
+        ),
+        ("p/E[] all\n====\nMSG: p/E\np/F f\n====\nMSG: p/F\n", "a sequence of p/msg/E, which"),
     ],
 )
 def test_topics_whose_types_ask_for_everything_are_left_out(

@@ -49,7 +49,8 @@ _WHERE = ("constructor", "timer", "timer", "message", "destroy")
 _SIGNALS_OF = {
     "abort": {-6},
     "segfault": {-11},
-    "kill_self": {-9},
+    "kill_self": {-9, 137},
+    "set_timer": {-14},  # of its own, if a slow machine takes longer than it to close the run
     "terminate_self": {143},
     "hang_up_self": {129},
     "interrupt_self": {130},

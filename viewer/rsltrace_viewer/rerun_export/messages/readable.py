@@ -42,7 +42,10 @@ class _EmptyItems(Exception):
 
 
 def _values(name: str, types: dict[str, Any], known: dict[str, int]) -> int:
-    """Return how many values a message has at least. ``types`` do not contain themselves."""
+    """Return how many values a message has at least, the messages in it among them.
+
+    ``types`` do not contain themselves. Raises _EmptyItems.
+    """
     if name not in known:
         known[name] = sum(_values_of(field, types, known) for _, field in types[name][1])
     return known[name]
@@ -53,11 +56,33 @@ def _values_of(field: Any, types: dict[str, Any], known: dict[str, int]) -> int:
     if kind == Nodetype.BASE:
         return 1
     if kind == Nodetype.NAME:
-        return _values(detail, types, known)
+        return 1 + _values(detail, types, known)
     item, size = detail
-    each = _values_of(item, types, known)
     if kind == Nodetype.SEQUENCE:
-        if not each:
+        if _is_empty(item, types):
             raise _EmptyItems(item[1])
+        _values_of(item, types, known)  # within limits, and no sequences of nothing in it
         return 1
-    return int(size) * each
+    return int(size) * _values_of(item, types, known)
+
+
+def _is_empty(field: Any, types: dict[str, Any]) -> bool:
+    """Whether a field has no bytes: messages of messages of nothing."""
+    kind, detail = field
+    if kind == Nodetype.ARRAY:
+        return _is_empty(detail[0], types)
+    return kind == Nodetype.NAME and _has_no_bytes(detail, types, {})
+
+
+def _has_no_bytes(name: str, types: dict[str, Any], known: dict[str, bool]) -> bool:
+    if name not in known:
+        known[name] = all(
+            (kind == Nodetype.NAME and _has_no_bytes(detail, types, known))
+            or (
+                kind == Nodetype.ARRAY
+                and detail[0][0] == Nodetype.NAME
+                and _has_no_bytes(detail[0][1], types, known)
+            )
+            for _, (kind, detail) in types[name][1]
+        )
+    return known[name]
