@@ -50,7 +50,8 @@ def preload(*, ros: bool) -> None:
         if module.name.split(".")[1] in roots and not module.name.endswith("__main__"):
             with contextlib.suppress(ImportError):
                 importlib.import_module(module.name)
-    for name in ("aiohttp", "fsspec.implementations.http", "textual.app", "rosbags.rosbag2"):
+    modules = ["aiohttp", "fsspec.implementations.http", "textual.app", "rosbags.rosbag2"]
+    for name in (*modules, "tty", "textual.drivers.linux_driver"):
         importlib.import_module(name)
     b"x".decode("utf-8-sig")  # another user may not be able to read Python's own files
     if ros:
