@@ -51,7 +51,8 @@ def preload(*, ros: bool) -> None:
             with contextlib.suppress(ImportError):
                 importlib.import_module(module.name)
     modules = ["aiohttp", "fsspec.implementations.http", "textual.app", "rosbags.rosbag2"]
-    for name in (*modules, "tty", "textual.drivers.linux_driver"):
+    modules += ["tty", "html", "rich._export_format", "textual.drivers.linux_driver"]
+    for name in modules:
         importlib.import_module(name)
     b"x".decode("utf-8-sig")  # another user may not be able to read Python's own files
     if ros:
