@@ -15,6 +15,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.guard.pin import PINNED, has_fixed_addresses, pin
@@ -45,7 +46,11 @@ class Forks:
     ) -> subprocess.CompletedProcess[str]:
         """Run the command as ``subprocess.run`` with captured text would."""
         with self._one_at_a_time:
-            return self._run(list(words), cwd, env, timeout_s)
+            try:
+                return self._run(list(words), cwd, env, timeout_s)
+            except BaseException:
+                self.close()  # whatever it still has to say is no answer to what comes next
+                raise
 
     def _run(
         self, words: list[str], cwd: Path, env: Mapping[str, str], timeout_s: float
@@ -58,7 +63,7 @@ class Forks:
             os.close(write)
         texts = ["", ""]
         readers = [
-            threading.Thread(target=_read, args=(read, texts, number))
+            threading.Thread(target=_read, args=(read, texts, number), daemon=True)
             for number, (read, _) in enumerate(pipes)
         ]
         for reader in readers:
@@ -69,7 +74,9 @@ class Forks:
             reader.join(timeout_s)
             if reader.is_alive():
                 timed_out = True
-                os.kill(pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):  # somebody else holds the pipe
+                    os.kill(pid, signal.SIGKILL)
+                break
         status = int(server.recv(100))
         if timed_out:
             raise subprocess.TimeoutExpired(words, timeout_s, *texts)
@@ -91,8 +98,10 @@ class Forks:
         """End the process."""
         if self._socket is not None:
             self._socket.close()
+            self._socket = None
         if self._server is not None:
             self._server.wait(60)
+            self._server = None
 
 
 def _read(descriptor: int, texts: list[str], number: int) -> None:

@@ -248,8 +248,13 @@ def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
 
     ends: list[Callable[[Stop], None]] = []
     old: dict[int, Any] = {}
+    process = os.getpid()
 
     def handle(number: int, frame: object) -> None:
+        if os.getpid() != process:  # forked by a node: no run to end, so as if nobody had asked
+            signal.signal(number, old[number])
+            os.kill(os.getpid(), number)
+            return
         if not ends:
             raise KeyboardInterrupt(128 + number)
         end, name = ends.pop(), _ENDS[signal.Signals(number)]

@@ -321,3 +321,19 @@ def test_a_hang_up_closes_the_trace_unless_it_is_ignored(
         trace.check()
         assert trace.complete
         assert trace.digest == output.split()[1]
+
+
+def test_a_child_that_a_node_has_forked_ends_when_it_is_told_to(
+    job_file: Callable[..., Path], rsltrace: Any
+) -> None:
+    evil = (
+        "self.child = os.fork()\n"
+        "        while not self.child:\n            time.sleep(0.01)\n"
+        "        os.kill(self.child, signal.SIGTERM)\n"
+        "        status = os.waitpid(self.child, 0)[1]\n"
+        "        self.get_logger().info(f'ended by {os.waitstatus_to_exitcode(status)}')"
+    )
+    job_file(JOB, NODE % evil)
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    assert "ended by -15" in done.stderr, done.stderr
+    assert done.returncode == 0, done.stderr

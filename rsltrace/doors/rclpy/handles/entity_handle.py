@@ -63,7 +63,7 @@ class EntityHandle(Destroyable, DomainEntity):
         have thousands of timers."""
         for node in self._candidates():
             mine = None
-            for handle, wrapper in self._listed_by(node):
+            for handle, wrapper in self._listed_by(node.wrapper):
                 handle._listed = node, wrapper
                 if handle is self:
                     mine = wrapper
@@ -87,9 +87,9 @@ class EntityHandle(Destroyable, DomainEntity):
         self.wrapper = self._listed = None
         self.active = False
 
-    def _listed_by(self, node: NodeHandle) -> Iterator[tuple[Any, Any]]:
-        """Yield the handles of its kind that a node lists, each with its wrapper."""
-        for wrapper in getattr(node.wrapper, self.lists):
+    def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield the handles of its kind that an rclpy node lists, each with its wrapper."""
+        for wrapper in getattr(node, self.lists, ()):
             yield wrapper.handle, wrapper
 
     def _candidates(self) -> Iterator[Any]:
@@ -116,7 +116,11 @@ class EntityHandle(Destroyable, DomainEntity):
         return callback_name(self.user_callback())
 
     def user_callback(self) -> object:
-        return getattr(self.wrapper, "callback", None)
+        wrapper = self.wrapper
+        if wrapper is None and isinstance(self.node, NodeHandle) and self.node.made is not None:
+            listed = self._listed_by(self.node.made)  # its constructor waits
+            wrapper = next((one for handle, one in listed if handle is self), None)
+        return getattr(wrapper, "callback", None)
 
     def runnable(self) -> Runnable:
         node = self.node

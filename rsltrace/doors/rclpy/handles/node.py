@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import sys
+import weakref
+from collections.abc import Callable, Iterable, Sequence
 from itertools import count
 from typing import Any, Protocol
 
@@ -21,6 +23,9 @@ from rsltrace.middleware.entity import DomainEntity, callback_name
 from rsltrace.middleware.events.census import Asker
 from rsltrace.middleware.graph import Graph, action_names_and_types, names_and_types
 from rsltrace.middleware.participant import Participant, full_name
+
+_FRAMES_MAX = 10
+"""Between the boundary and the constructor of ``rclpy.Node`` are two or three."""
 
 
 class LogSink(Protocol):
@@ -93,6 +98,7 @@ class NodeHandle(Destroyable, Participant):
         self.mailbox: Mailbox | None = None
         self.rosout: DomainEntity | None = None
         self.log_exceptions = entry is not None and entry.log_exceptions
+        self._made = _node_being_made()
         self.user_waitables: dict[Any, Any] = {}
         self.waitable_count = 0
         domain.graph.add_node(self)
@@ -241,10 +247,15 @@ class NodeHandle(Destroyable, Participant):
     # -- the trace -----------------------------------------------------------------------------
 
     def trace_type(self) -> str:
-        return "" if self.wrapper is None else class_name(type(self.wrapper))
+        return "" if self.made is None else class_name(type(self.made))
 
     def user_callback(self) -> object:
-        return None if self.wrapper is None else type(self.wrapper)  # its constructor
+        return None if self.made is None else type(self.made)  # its constructor
+
+    @property
+    def made(self) -> Any:
+        """The ``rclpy.Node``, also while its constructor waits; None if it is gone."""
+        return self._made() if self.wrapper is None else self.wrapper
 
     def timer_periods(self) -> Iterable[tuple[str, int]]:
         timers = () if self.wrapper is None else self.wrapper.timers
@@ -259,6 +270,19 @@ class NodeHandle(Destroyable, Participant):
         self._logs.detach(self)
         if self.rosout is not None:
             self.rosout.destroy()
+
+
+def _node_being_made() -> Callable[[], Any]:
+    """Return a reference to the ``rclpy.Node`` whose constructor makes a handle."""
+    frame = sys._getframe(2)
+    for _ in range(_FRAMES_MAX):
+        made = frame.f_locals.get("self")
+        if frame.f_code.co_name == "__init__" and isinstance(made, sys.modules["rclpy.node"].Node):
+            return weakref.ref(made)
+        if frame.f_back is None:
+            break
+        frame = frame.f_back
+    return lambda: None
 
 
 def class_name(cls: type) -> str:

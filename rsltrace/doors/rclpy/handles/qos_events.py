@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
-from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.middleware.entity import callback_name
@@ -61,8 +60,8 @@ class EventHandle(EntityHandle):
         self._cause = (NO_EVENT, 0)
         parent.events.listeners[self._name] = self
 
-    def _listed_by(self, node: NodeHandle) -> Iterator[tuple[Any, Any]]:
-        for waitable in node.wrapper.waitables:
+    def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        for waitable in node.waitables:
             handle = getattr(waitable, "_EventHandler__event", None)
             if handle is not None:
                 yield handle, waitable
