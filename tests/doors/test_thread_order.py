@@ -7,6 +7,7 @@ import json
 import subprocess
 import sys
 import threading
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,16 @@ pytestmark = pytest.mark.ros
 PROGRAM = Path(__file__).with_name("thread_order_program.py")
 
 
+@pytest.fixture
+def as_it_was() -> Iterator[None]:
+    """What the program sets for its process it sets for this one, too, which has more to test."""
+    interval, hook = sys.getswitchinterval(), threading.excepthook
+    yield
+    sys.setswitchinterval(interval)
+    threading.excepthook = hook
+
+
+@pytest.mark.usefixtures("as_it_was")
 def test_threads_take_turns_as_natively(simulate: Any, capfd: Any) -> None:
     done = subprocess.run([sys.executable, PROGRAM], capture_output=True, text=True, check=True)
     natively = json.loads(done.stdout)
