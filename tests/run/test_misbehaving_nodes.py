@@ -327,8 +327,11 @@ def test_a_child_that_a_node_has_forked_ends_when_it_is_told_to(
     job_file: Callable[..., Path], rsltrace: Any
 ) -> None:
     evil = (
-        "self.child = os.fork()\n"
+        "ready, begun = os.pipe()\n"
+        "        self.child = os.fork()\n"
+        "        self.child or os.write(begun, b'.')\n"  # a signal before that may be lost
         "        while not self.child:\n            time.sleep(0.01)\n"
+        "        os.read(ready, 1)\n"
         "        os.kill(self.child, signal.SIGTERM)\n"
         "        status = os.waitpid(self.child, 0)[1]\n"
         "        self.get_logger().info(f'ended by {os.waitstatus_to_exitcode(status)}')"
