@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 from rsltrace_viewer.model.query.conditions import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import KEYS
 from rsltrace_viewer.terminal.screens.help import HelpScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen, PlotView
@@ -42,6 +44,28 @@ def test_stepping_and_edges(made: Path, run: Run, drive: Drive) -> None:
         assert viewer.place == run.count - 1
 
     drive(made, steps)
+
+
+def test_the_inspector_follows_an_event_that_gets_another_place(
+    pair: tuple[Path, Path], drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A block of the comparison arrives between a step and what the inspector shows of it."""
+    inspected = []
+    monkeypatch.setattr(
+        ViewerApp, "_show_inspector", lambda app, **_: inspected.append(app.session.place)
+    )
+
+    async def steps(viewer: Any) -> None:
+        viewer.app.go(3)
+        viewer.app.session.place = 5
+        for _ in range(100):
+            await asyncio.sleep(0.03)
+            if not viewer.app.busy:
+                break
+        assert not viewer.app.busy
+        assert inspected[-1] == 5
+
+    drive(pair, steps)
 
 
 def test_the_cursor_is_always_in_sight(long: Path, drive: Drive) -> None:

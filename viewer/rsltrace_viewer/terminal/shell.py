@@ -15,6 +15,7 @@ from textual import events
 from textual.app import App, ComposeResult
 from textual.containers import Container
 from textual.geometry import Size
+from textual.timer import Timer
 from textual.worker import get_current_worker
 
 from rsltrace.errors import RsltraceError
@@ -73,6 +74,7 @@ class Shell(App[None]):
         """Whether something is about to be drawn that is not yet: for pictures and tests."""
         self._start = start
         self._status = ""
+        self._soon: Timer | None = None
         self.following = False
         self.theme = "textual-light" if light else "textual-dark"
 
@@ -273,15 +275,15 @@ class Shell(App[None]):
         self._show_lanes()
         self._show_footer()
         self.busy = True
-        self.set_timer(_INSPECT_S, self._inspect_if_still(session.place))
+        if self._soon is not None:
+            self._soon.stop()
+        self._soon = self.set_timer(_INSPECT_S, self._inspect)
 
-    def _inspect_if_still(self, place: int) -> Any:
-        def inspect() -> None:
-            if self.session.place == place and self.screen_stack:
-                self._show_inspector()
-                self.busy = False
-
-        return inspect
+    def _inspect(self) -> None:
+        # Whatever is selected now: the comparison may have given the event another place.
+        if self.screen_stack:
+            self._show_inspector()
+            self.busy = False
 
     def on_resize(self, event: events.Resize) -> None:
         """Use the new size, which the app and its parts will have a moment later."""
