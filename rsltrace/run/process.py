@@ -14,11 +14,13 @@ from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsltrace.doors.rclpy.wire.interface_classes import forget_interfaces
 from rsltrace.guard.callers import is_own
 from rsltrace.guard.guard import engage
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 from rsltrace.mcap.descriptor import Descriptor
+from rsltrace.workspace.imports import unbuilt_packages
 
 if TYPE_CHECKING:
     from rsltrace.middleware.events.dispatcher import Dispatcher
@@ -158,7 +160,12 @@ def search_path(job: Job) -> Iterator[None]:
     old_path, old_modules = list(sys.path), set(sys.modules)
     sys.path[:0] = folders
     try:
-        yield
+        with unbuilt_packages([Path(folder) for folder in folders]) as workspace:
+            try:
+                yield
+            finally:
+                if workspace.made:
+                    forget_interfaces()
     finally:
         sys.path[:] = old_path
         for name in set(user_modules(folders)) - old_modules:

@@ -70,6 +70,11 @@ def nested_class(namespaces: list[str], name: str) -> type:
     return get_message_class("/".join([*namespaces, name]))
 
 
+def forget_interfaces() -> None:
+    """Look for every class anew: packages are gone that were there for one run only."""
+    _find.cache_clear()
+
+
 @cache
 def _find(name: str) -> type:
     match = _NAME.fullmatch(name)

@@ -12,6 +12,7 @@ import sys
 from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 SEPARATOR = "---"
 _SECTIONS = {
@@ -55,6 +56,20 @@ def installed_type_hash(name: str) -> str | None:
         return next((str(h["hash_string"]) for h in hashes if h["type_name"] == name), None)
     except (ValueError, KeyError, TypeError):
         return None  # of a ROS version that describes types otherwise
+
+
+def installed_description(name: str) -> Any:
+    """Return the type description of an interface by its full name, as JSON has it, or None."""
+    package, kind, type_ = name.split("/")
+    path = _installed_file(package, kind, f"{type_}.json")
+    return None if path is None else json.loads(path.read_text("utf-8"))
+
+
+def installed_file_text(name: str) -> str | None:
+    """Return the whole text of the file that an interface is defined in, or None."""
+    package, kind, type_ = name.split("/")
+    path = _installed_file(package, kind, f"{type_.partition('_')[0]}.{kind}")
+    return None if path is None else path.read_text("utf-8", "replace")
 
 
 def _installed_file(package: str, kind: str, file: str) -> Path | None:

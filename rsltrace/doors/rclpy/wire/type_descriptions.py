@@ -2,7 +2,7 @@
 
 rosidl compiles the description of every interface into its type support library. It is read from
 there, through the same pointers that rcl follows: the answer is that of a native node, whether or
-not definition files are installed.
+not definition files are installed. Interfaces that nobody has built have it in a file.
 """
 
 from __future__ import annotations
@@ -23,6 +23,9 @@ from ctypes import (
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
+
+from rsltrace.doors.rclpy.wire.interface_classes import type_name
+from rsltrace.doors.rclpy.wire.interface_files import installed_description, installed_file_text
 
 _get_pointer = ctypes.pythonapi.PyCapsule_GetPointer
 _get_pointer.restype, _get_pointer.argtypes = c_void_p, (ctypes.py_object, c_char_p)
@@ -127,6 +130,8 @@ def type_description(interface: Any) -> TypeDescription | None:
         metaclass.__import_type_support__()
     if metaclass._TYPE_SUPPORT is None:
         return None
+    if type(metaclass._TYPE_SUPPORT).__name__ != "PyCapsule":
+        return _from_file(type_name(interface))
     if hasattr(interface, "Goal"):
         kind = "action"
     else:
@@ -147,6 +152,38 @@ def type_description(interface: Any) -> TypeDescription | None:
             (_text(source.type_name), _text(source.encoding), _text(source.contents))
             for source in _items(sources)
         ),
+    )
+
+
+def _from_file(name: str) -> TypeDescription | None:
+    """Read what rosidl has written down of an interface whose type support is not compiled."""
+    read = installed_description(name)
+    if read is None:
+        return None
+    whole, hashes = read["type_description_msg"], read["type_hashes"]
+    types = [whole["type_description"], *whole["referenced_type_descriptions"]]
+    text = installed_file_text(name)
+    kind = name.split("/")[1]
+    return TypeDescription(
+        type_hash=next(h["hash_string"] for h in hashes if h["type_name"] == name),
+        types=tuple(
+            (
+                described["type_name"],
+                tuple(
+                    (
+                        field["name"],
+                        field["type"]["type_id"],
+                        field["type"]["capacity"],
+                        field["type"]["string_capacity"],
+                        field["type"]["nested_type_name"],
+                        field["default_value"],
+                    )
+                    for field in described["fields"]
+                ),
+            )
+            for described in types
+        ),
+        sources=() if text is None else ((name, kind, text),),
     )
 
 

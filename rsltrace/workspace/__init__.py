@@ -1,0 +1,1 @@
+"""ROS packages in source folders, as nobody has built them: their interfaces and their shares."""

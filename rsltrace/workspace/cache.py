@@ -1,0 +1,63 @@
+"""Folders that are made once and used again: by name, complete or not there at all."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable
+from functools import cache
+from pathlib import Path
+
+
+def key_of(parts: Iterable[str | bytes]) -> str:
+    """Return a name for what is made of these parts."""
+    digest = hashlib.sha256()
+    for part in parts:
+        data = part if isinstance(part, bytes) else part.encode("utf-8", "surrogateescape")
+        digest.update(len(data).to_bytes(8, "little") + data)
+    return digest.hexdigest()[:20]
+
+
+def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
+    """Return the folder ``kind/name`` of the cache; if it is not there, ``make`` fills it.
+
+    Runs that are made at the same time may both fill one: the first to be ready counts.
+    """
+    place = _root() / kind / name
+    if place.is_dir():
+        return place
+    place.parent.mkdir(parents=True, exist_ok=True)
+    made = Path(tempfile.mkdtemp(dir=place.parent, prefix=".new-"))
+    try:
+        make(made)
+        made.chmod(0o755)
+        try:
+            made.rename(place)
+        except OSError:
+            if not place.is_dir():
+                raise
+    finally:
+        shutil.rmtree(made, ignore_errors=True)
+    return place
+
+
+@cache
+def _root() -> Path:
+    """Return the user's folder for caches, or one for this process if that cannot be written."""
+    folder = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(folder) if os.path.isabs(folder) else Path("~/.cache").expanduser()
+    try:
+        (root / "rsltrace").mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=root / "rsltrace").close()
+    except (OSError, RuntimeError):
+        import atexit
+
+        scratch = tempfile.mkdtemp(prefix="rsltrace-")
+        atexit.register(shutil.rmtree, scratch, ignore_errors=True)
+        return Path(scratch)
+    return root / "rsltrace"
+
+
+__all__ = ["cached_folder", "key_of"]

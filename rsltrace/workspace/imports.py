@@ -1,0 +1,180 @@
+"""Lets user code import interfaces and find shares of packages that nobody has built.
+
+Both are looked for only when somebody asks: most jobs never do. What is built comes first.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from rsltrace.guard.guard import engage
+from rsltrace.workspace.interfaces import interface_prefix
+from rsltrace.workspace.packages import SourcePackage, source_packages
+from rsltrace.workspace.share import share_prefix
+
+_KINDS = ("msg", "srv", "action")
+_SUPPORT = "_s__rosidl_typesupport_c"
+
+
+class Workspace:
+    """The packages in and below some folders, as far as they have not been built."""
+
+    def __init__(self, folders: Sequence[Path]) -> None:
+        self._folders = folders
+        self._packages: dict[str, SourcePackage] | None = None
+        self._prefixes: dict[str, Path] = {}
+        self.made: set[str] = set()
+        """Packages whose interfaces somebody has imported."""
+
+    @property
+    def packages(self) -> dict[str, SourcePackage]:
+        """The packages by name; looked for once."""
+        if self._packages is None:
+            with engage(None):
+                self._packages = source_packages(self._folders)
+        return self._packages
+
+    def interfaces(self, name: str) -> Path | None:
+        """Return the folder with a package's classes, made if need be; None if it has none.
+
+        :raises JobError, SetupError: if they cannot be made.
+        """
+        package = self.packages.get(name)
+        if package is None or not package.interfaces:
+            return None
+        if name not in self._prefixes:
+            with engage(None):  # what that takes is none of the node's doing
+                self._prefixes[name] = interface_prefix(package, self.packages)
+            self.made.add(name)
+        return self._prefixes[name] / "site-packages" / name
+
+    def prefix(self, name: str) -> str | None:
+        """Return a prefix with the ``share`` of a package, or None if it is none of these."""
+        package = self.packages.get(name)
+        if package is None:
+            return None
+        with engage(None):
+            return str(share_prefix(package))
+
+
+class _Kinds:
+    """Finds ``package.msg`` and its like before anybody takes a folder of sources for it."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return the spec of a module that was made of interface files, or None."""
+        package, _, rest = name.partition(".")
+        if rest not in _KINDS and rest != package + _SUPPORT:
+            return None
+        built = PathFinder.find_spec(name, path)
+        if built is not None and built.origin is not None:
+            return None
+        folder = self._workspace.interfaces(package)
+        if folder is None:
+            return None
+        file = folder / rest / "__init__.py" if rest in _KINDS else folder / f"{rest}.py"
+        return _spec(name, file) if file.is_file() else None
+
+
+class _Packages:
+    """Finds the package itself, if it has nothing but interfaces and so no Python sources."""
+
+    def __init__(self, workspace: Workspace) -> None:
+        self._workspace = workspace
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """Return the spec of a package with interfaces that nobody else has found, or None."""
+        if "." in name:
+            return None
+        folder = self._workspace.interfaces(name)
+        return None if folder is None else _spec(name, folder / "__init__.py")
+
+
+def _spec(name: str, file: Path) -> ModuleSpec | None:
+    folder = [str(file.parent)] if file.name == "__init__.py" else None
+    return spec_from_file_location(name, file, submodule_search_locations=folder)
+
+
+@contextmanager
+def unbuilt_packages(folders: Sequence[Path]) -> Iterator[Workspace]:
+    """Let the packages in ``folders`` be used as if they were built, and forget them afterwards."""
+    workspace = Workspace(folders)
+    before, after = _Kinds(workspace), _Packages(workspace)
+    sys.meta_path.insert(0, before)
+    sys.meta_path.append(after)
+    try:
+        with ExitStack() as stack:
+            if find_spec("ament_index_python") is not None:
+                _put_into_index(stack, workspace)
+            yield workspace
+    finally:
+        sys.meta_path.remove(before)
+        sys.meta_path.remove(after)
+        for name in [name for name in sys.modules if name.partition(".")[0] in workspace.made]:
+            sys.modules.pop(name)
+
+
+def _put_into_index(stack: ExitStack, workspace: Workspace) -> None:
+    """Let the ament index know the workspace, and the wheels of this Python."""
+    from ament_index_python import resources, search_paths
+
+    paths: Callable[[], list[str]] = search_paths.get_search_paths
+    resource: Callable[[str, str], tuple[str, str]] = resources.get_resource
+    listed: Callable[[str], dict[str, str]] = resources.get_resources
+
+    def get_search_paths() -> list[str]:
+        known = paths() if os.environ.get("AMENT_PREFIX_PATH") else []
+        with engage(None):
+            has_wheels = Path(sys.prefix, "share", "ament_index").is_dir()
+        return [*known, sys.prefix] if has_wheels and sys.prefix not in known else known
+
+    def get_resource(resource_type: str, resource_name: str) -> tuple[str, str]:
+        try:
+            return resource(resource_type, resource_name)
+        except LookupError:
+            prefix = workspace.prefix(resource_name) if resource_type == "packages" else None
+            if prefix is None:
+                raise
+            return "", prefix
+
+    def get_resources(resource_type: str) -> dict[str, str]:
+        found = dict(listed(resource_type))
+        if resource_type == "packages":
+            for name in workspace.packages.keys() - found.keys():
+                found[name] = workspace.prefix(name) or ""
+        return found
+
+    for real, ours in (
+        (paths, get_search_paths),
+        (resource, get_resource),
+        (listed, get_resources),
+    ):
+        _exchange(stack, real, ours)
+
+
+def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., Any]) -> None:
+    """Exchange a function of the index in all modules of it that have its name."""
+    name = real.__name__
+    for module in list(sys.modules.values()):
+        if not module.__name__.startswith("ament_index_python"):
+            continue
+        if getattr(module, name, None) is real:
+            stack.callback(setattr, module, name, real)
+            setattr(module, name, ours)
+
+
+__all__ = ["Workspace", "unbuilt_packages"]

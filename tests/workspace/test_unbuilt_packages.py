@@ -1,0 +1,246 @@
+"""Packages that nobody ran colcon on: their interfaces are classes, their shares are found."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.errors import JobError
+from rsltrace.job import load_job
+from rsltrace.run import run
+from rsltrace.trace.reader import Trace
+from rsltrace.workspace import cache
+from rsltrace.workspace.interfaces import interface_prefix
+from rsltrace.workspace.packages import SourcePackage, source_packages
+from rsltrace.workspace.share import share_prefix
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+pytest.importorskip("rosidl_adapter", reason="needs ROS's rosidl")
+
+_NODE = """
+import os
+from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
+from arm.msg import Joint
+from arm_interfaces.action import Move
+from arm_interfaces.srv import Grip
+from rclpy.action import ActionClient, ActionServer
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message, serialize_message
+
+class Arm(Node):
+    def __init__(self):
+        super().__init__("arm")
+        self.joints = self.create_publisher(Joint, "joint", 10)
+        self.create_subscription(Joint, "joint", self.on_joint, 10)
+        self.create_service(Grip, "grip", self.grip)
+        self.grip_client = self.create_client(Grip, "grip")
+        self.server = ActionServer(self, Move, "move", self.move)
+        self.mover = ActionClient(self, Move, "move")
+        with open(os.path.join(get_package_share_directory("arm"), "limits.yaml")) as file:
+            self.get_logger().info("limits " + file.read().strip())
+        assert os.path.isdir(get_package_share_directory("std_msgs"))
+        assert "arm_interfaces" in get_packages_with_prefixes()
+        self.create_timer(1.0, self.start)
+
+    def start(self):
+        joint = Joint(place=Joint.ELBOW, name="left")
+        assert deserialize_message(serialize_message(joint), Joint) == joint
+        self.joints.publish(joint)
+        self.grip_client.call_async(Grip.Request(force=2.0)).add_done_callback(self.say)
+        self.mover.send_goal_async(Move.Goal(to=3), feedback_callback=self.on_feedback)
+
+    def on_joint(self, joint):
+        self.get_logger().info(f"{joint.name} {joint.place} {joint.gains.tolist()}")
+
+    def grip(self, request, response):
+        response.joint.place = int(request.force)
+        return response
+
+    def say(self, future):
+        self.get_logger().info(f"place {future.result().joint.place}")
+
+    def move(self, goal):
+        goal.publish_feedback(Move.Feedback(at=goal.request.to))
+        goal.succeed()
+        return Move.Result()
+
+    def on_feedback(self, message):
+        self.get_logger().info(f"at {message.feedback.at}")
+"""
+
+_SETUP = """
+from glob import glob
+from setuptools import find_packages, setup
+setup(name="arm", packages=find_packages(), data_files=[
+    ("share/ament_index/resource_index/packages", ["resource/arm"]),
+    ("share/arm", glob("config/*.yaml")),
+])
+"""
+
+_FILES = {
+    "src/arm_interfaces/package.xml": "<package><name>arm_interfaces</name></package>",
+    "src/arm_interfaces/srv/Grip.srv": "float32 force\n---\narm/Joint joint\n",
+    "src/arm_interfaces/action/Move.action": "int8 to\n---\n---\nint8 at\n",
+    "src/arm/package.xml": "<package><name>arm</name></package>",
+    "src/arm/setup.py": _SETUP,
+    "src/arm/config/limits.yaml": "1 to 2",
+    "src/arm/msg/Joint.msg": (
+        "uint8 ELBOW=7\nstd_msgs/Header header\nuint8 place\n"
+        "string<=8 name\nfloat64[2] gains [1, 2]\n"
+    ),
+    "src/arm/arm/__init__.py": "",
+    "src/arm/arm/node.py": _NODE,
+    "job.yaml": (
+        "search_path: [src, src/arm]\nnodes: [{node: 'arm.node:Arm'}]\nstop: {time: 1.5s}\n"
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def caches(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    with pytest.MonkeyPatch.context() as patch:
+        folder = tmp_path_factory.mktemp("cache")
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        patch.delenv("AMENT_PREFIX_PATH", raising=False)
+        cache._root.cache_clear()
+        yield folder
+    cache._root.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory, caches: Path) -> tuple[Path, list[Any]]:
+    """The job recorded twice: with an empty cache, and with what the first run left there."""
+    folder = tmp_path_factory.mktemp("job")
+    _write(folder, _FILES)
+    job = load_job(folder / "job.yaml")
+    return folder, [run(job, folder / f"{name}.mcap") for name in "ab"]
+
+
+def _write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+def test_interfaces_of_source_folders_are_used_as_if_built(
+    runs: tuple[Path, list[Any]], command: Callable[..., Any]
+) -> None:
+    folder, (first, _) = runs
+    assert first.error is None, first.error
+    shown = command("cat", folder / "a.mcap", "--json").stdout
+    for text in ("limits 1 to 2", "left 7 [1.0, 2.0]", "place 2", "at 3"):
+        assert text in shown
+    with Trace.open(folder / "a.mcap") as trace:
+        schemas = {channel.topic: channel.schema_text for channel in trace.channels.values()}
+    assert "string<=8 name" in schemas["/joint"]
+
+
+def test_the_run_that_makes_the_classes_is_like_the_next(runs: tuple[Path, list[Any]]) -> None:
+    folder, results = runs
+    assert results[0].digest == results[1].digest
+    assert (folder / "a.mcap").read_bytes() == (folder / "b.mcap").read_bytes()
+
+
+def test_nothing_of_it_is_left_behind(runs: tuple[Path, list[Any]]) -> None:
+    assert not [name for name in sys.modules if name.partition(".")[0] in ("arm", "arm_interfaces")]
+    assert not [f for f in sys.meta_path if type(f).__module__.startswith("rsltrace.workspace")]
+
+
+def test_classes_and_hashes_are_those_that_a_build_makes(tmp_path: Path, caches: Path) -> None:
+    share = Path(sys.prefix, "share", "std_srvs")
+    if not (share / "srv" / "SetBool.json").is_file():
+        pytest.skip("needs the definitions of std_srvs")
+    _write(tmp_path, {"package.xml": "<package><name>std_srvs</name></package>"})
+    (tmp_path / "srv").mkdir()
+    (tmp_path / "srv" / "SetBool.srv").write_bytes((share / "srv" / "SetBool.srv").read_bytes())
+    packages = source_packages([tmp_path])
+    made = interface_prefix(packages["std_srvs"], packages)
+    (site,) = import_module("std_srvs").__path__
+    for ours, built in (
+        (made / "site-packages/std_srvs/srv/_set_bool.py", Path(site, "srv", "_set_bool.py")),
+        (made / "share/std_srvs/srv/SetBool.json", share / "srv" / "SetBool.json"),
+    ):
+        assert ours.read_text() == built.read_text()
+
+
+def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
+    from std_srvs.srv import SetBool
+
+    from rsltrace.doors.rclpy.wire.type_descriptions import _from_file, type_description
+
+    built, read = type_description(SetBool), _from_file("std_srvs/srv/SetBool")
+    assert built is not None
+    assert read is not None
+    assert (read.type_hash, read.types) == (built.type_hash, built.types)
+
+
+@pytest.mark.parametrize(
+    ("files", "said"),
+    [
+        ({"msg/Oops.msg": "float6 x\n"}, r"msg/Oops\.msg: rosidl cannot read it: 'float6' is an"),
+        ({"msg/Far.msg": "moon_msgs/Rock rock\n"}, r"msg/Far\.msg: it uses types of .*'moon_msgs'"),
+    ],
+)
+def test_files_that_cannot_be_understood_are_named(
+    tmp_path: Path, caches: Path, files: dict[str, str], said: str
+) -> None:
+    _write(tmp_path, {"package.xml": "<package><name>odd</name></package>", **files})
+    packages = source_packages([tmp_path])
+    with pytest.raises(JobError, match=said):
+        interface_prefix(packages["odd"], packages)
+    left = [path.name for path in (caches / "rsltrace" / "interfaces").iterdir()]
+    assert not [name for name in left if name.startswith((".new", "odd"))]
+
+
+def test_packages_are_found_as_colcon_finds_them(tmp_path: Path) -> None:
+    xml = "<package><name>{}</name></package>"
+    _write(
+        tmp_path,
+        {
+            "a/package.xml": xml.format("a"),
+            "a/inner/package.xml": xml.format("in_a_package"),
+            "deep/er/b/package.xml": xml.format("b"),
+            "ignored/COLCON_IGNORE": "",
+            "ignored/c/package.xml": xml.format("c"),
+            "build/d/package.xml": xml.format("d"),
+            ".hidden/e/package.xml": xml.format("e"),
+            "broken/package.xml": "<package>",
+        },
+    )
+    assert sorted(source_packages([tmp_path])) == ["a", "b"]
+    scripts = tmp_path / "a" / "scripts"
+    scripts.mkdir()
+    assert sorted(source_packages([scripts])) == ["a"]
+
+
+def test_shares_are_laid_out_as_cmake_installs_them(tmp_path: Path, caches: Path) -> None:
+    cmake = """
+        project(rover)
+        install(DIRECTORY launch/ DESTINATION share/${PROJECT_NAME})  # its content
+        install(DIRECTORY maps models DESTINATION share/${PROJECT_NAME}/data
+                PATTERN "*.tmp" EXCLUDE)
+        install(FILES config/rover.yaml DESTINATION "share/${PROJECT_NAME}")
+        install(PROGRAMS scripts/go.py DESTINATION lib/${PROJECT_NAME})
+    """
+    names = ("launch/all.launch.py", "maps/m.pgm", "models/r.urdf", "config/rover.yaml")
+    _write(
+        tmp_path,
+        {
+            "package.xml": "<package><name>rover</name></package>",
+            "CMakeLists.txt": cmake,
+            **dict.fromkeys((*names, "scripts/go.py"), "x"),
+        },
+    )
+    share = share_prefix(SourcePackage("rover", tmp_path)) / "share" / "rover"
+    for name in (*names, "all.launch.py", "rover.yaml", "data/maps/m.pgm", "data/models/r.urdf"):
+        assert (share / name).read_text() == "x", name
+    assert not (share / "go.py").exists()
+    assert not re.search("CMake", " ".join(os.listdir(share)))
