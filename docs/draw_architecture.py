@@ -42,7 +42,7 @@ BOXES = (
     Box(192, 284, 432, 128, "rclpy", "", ROOM),
     Box(192, 416, 211, 28, "player", "", ROOM, 48),
     Box(413, 416, 211, 28, "driver", "", ROOM, 54),
-    Box(236, 458, 196, 54, "job · launch", "what a run is to do", RUNNING),
+    Box(180, 458, 278, 54, "job · launch · workspace", "what a run is to do, with what", RUNNING),
     Box(468, 458, 168, 54, "guard", "clocks, chance, files", RUNNING),
     Box(180, 522, 456, 66, "middleware", "graph, QoS, links", RUNNING, 56),
     Box(180, 598, 456, 66, "loop", "simulated time", RUNNING, 56),

@@ -37,8 +37,8 @@ def __getattr__(name):
 '''
 
 
-def main() -> int:
-    """Make the prefix that the order on standard input asks for."""
+def main() -> str | None:
+    """Make the prefix that the order on standard input asks for; return what went wrong."""
     order = json.load(sys.stdin)
     package, into = order["package"], Path(order["into"])
     share, site = into / "share" / package, into / "site-packages" / package
@@ -62,13 +62,12 @@ def main() -> int:
         _describe_types(arguments, share, into / "arguments.json")
     except Exception as error:
         return _failed(Path(order["files"][0][0]), error)
-    return 0
+    return None
 
 
-def _failed(place: Path, error: Exception) -> int:
+def _failed(place: Path, error: Exception) -> str:
     said = " ".join(str(error).split()) or type(error).__name__
-    sys.stderr.write(f"\n{json.dumps({'place': str(place), 'error': said})}\n")
-    return 1
+    return f"\n{json.dumps({'place': str(place), 'error': said})}"
 
 
 def _convert(folder: Path, package: str, file: Path, share: Path) -> Path:

@@ -28,6 +28,7 @@ _END = re.compile(
 )
 _ASK = """
 import json, sys, types
+sys.stdout = sys.stderr
 said = {}
 class Setuptools(types.ModuleType):
     def __getattr__(self, name):
@@ -42,7 +43,8 @@ sys.path.insert(0, "")
 sys.argv[:] = ["setup.py"]
 exec(code, {"__name__": "__main__", "__file__": "setup.py"})
 files = [(str(to), [str(file) for file in files]) for to, files in said.get("data_files") or ()]
-print(); print(json.dumps(files))
+sys.stdout.flush()
+json.dump(files, sys.__stdout__)
 """
 """Finds out what a ``setup.py`` tells setuptools, without setuptools."""
 _ASK_SECONDS = 60
@@ -108,7 +110,7 @@ def _of_setup(package: SourcePackage) -> Iterator[tuple[PurePosixPath, Path]]:
             timeout=_ASK_SECONDS,
             check=False,
         )
-        listed = json.loads((done.stdout.strip().splitlines() or ["[]"])[-1])
+        listed = json.loads(done.stdout or "[]")
     except (OSError, ValueError, subprocess.TimeoutExpired):
         return  # what lies in its folder is there all the same
     for folder, files in listed:
