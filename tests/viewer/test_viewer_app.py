@@ -310,12 +310,12 @@ def test_panes_zoom_and_maximise(made: Path, drive: Drive) -> None:
         await viewer.press("z")
         assert not app.query_one("#body").display
         await viewer.press("z", "equals_sign", *["plus"] * 11)
-        assert app.session.window.order
+        assert app.session.lane_window.window.order
         assert "event 0" in viewer.text
         await viewer.press("minus")
-        assert not app.session.window.order
+        assert not app.session.lane_window.window.order
         await viewer.press("0")
-        assert app.session.window == app.session.lane_maker.whole
+        assert app.session.lane_window.window == app.session.lane_window.whole
 
     drive(made, steps)
 

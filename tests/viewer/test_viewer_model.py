@@ -14,7 +14,7 @@ from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector.effects import effects_of
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.lines import Openness, Role
-from rsltrace_viewer.model.lanes import LaneMaker, Window
+from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.rows import FilteredRows
 from rsltrace_viewer.model.run import Run
@@ -22,6 +22,7 @@ from rsltrace_viewer.model.timeline.columns import layout
 from rsltrace_viewer.model.timeline.events import EventTexts
 from rsltrace_viewer.model.timeline.short_names import ShortNames
 from rsltrace_viewer.model.view import SingleView
+from rsltrace_viewer.model.windows import Window
 from rsltrace_viewer.terminal.screens.help import help_text
 
 from rsltrace.model.event import NO_EVENT
@@ -142,36 +143,39 @@ def test_filtered_rows_map_both_ways(long_run: Run) -> None:
         assert rows.near(place) == expected
 
 
-def test_lanes_count_every_event_whatever_the_window(long_run: Run) -> None:
+def test_lanes_show_every_event_whatever_the_window(long_run: Run) -> None:
     run = long_run
-    maker = LaneMaker(run)
+    lanes = LaneWindow([run])
+    maker = lanes.makers[0]
     for number in maker.order():
         maker.summarise(number)
     assert sorted(maker.order()) == list(range(len(run.segments)))
-    lanes = maker.make(maker.whole, 60)
-    assert lanes.known == 1.0
-    assert [lane.label for lane in lanes.lanes] == ["/talker", "/listener", "(run)"]
-    assert all(any(lane.levels) for lane in lanes.lanes)
-    assert lanes.lanes[1].raised == {59}
+    made = lanes.lanes(SingleView(run.count), 0, (0, 0), 60)
+    assert made.known == 1.0
+    assert [lane.label for lane in made.lanes] == ["/talker", "/listener", "(run)"]
+    assert all(any(lane.levels) for lane in made.lanes)
+    last = made.window.column(run.end_ns, 60)
+    assert made.lanes[1].signs == {last: "!"}
+    total = maker.count(made.window, 60).counts.sum()
+    assert total == pytest.approx(run.count, rel=0.001)
     # A narrow window is made of the events themselves.
     stamp = run.stamp(1000)
-    exact = maker.make(Window(stamp, stamp + 1), 1)
-    assert exact.lanes[0].levels == (8,)
+    exact = maker.count(Window(stamp, stamp + 1), 1)
+    assert exact.counts[0].tolist() == [1.0]
 
 
 def test_zooming_in_ends_at_single_events_and_out_at_the_whole_run(long_run: Run) -> None:
     run = long_run
-    maker = LaneMaker(run)
-    window = maker.whole
+    lanes = LaneWindow([run])
     for _ in range(60):
-        window = maker.zoomed(window, 1, 15_000, 80)
-    assert window.order
-    lanes = maker.make(window, 80, 15_000)
-    column = window.column(15_000, 80)
-    assert sum(lane.letters[column] != " " for lane in lanes.lanes) == 1
+        lanes.zoom(1, (0, 15_000), 80)
+    assert lanes.window.order
+    made = lanes.lanes(SingleView(run.count), 15_000, (0, 15_000), 80)
+    column = made.window.column(15_000, 80)
+    assert sum(lane.letters[column] != " " for lane in made.lanes) == 1
     for _ in range(60):
-        window = maker.zoomed(window, -1, 15_000, 80)
-    assert window == maker.whole
+        lanes.zoom(-1, (0, 15_000), 80)
+    assert lanes.window == lanes.whole
 
 
 @pytest.mark.parametrize("columns", [1, 7, 80])

@@ -17,7 +17,9 @@ from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.lines import Line, Openness
-from rsltrace_viewer.model.lanes import LaneMaker, Lanes, Window
+from rsltrace_viewer.model.lane_window import LaneWindow
+from rsltrace_viewer.model.lanes import Lanes
+from rsltrace_viewer.model.logs import Logs, mark_lanes, read_logs
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.parser import parse
@@ -69,9 +71,9 @@ class Session:
         if b is not None:
             self._texts["b"] = EventTexts(b)
         self._names = self._short_names()
-        self.lane_maker = LaneMaker(a)
-        self.window: Window = self.lane_maker.whole
-        self._lanes: tuple[tuple[object, ...], Lanes] | None = None
+        self.lane_window = LaneWindow([run for run in (a, b) if run is not None])
+        self.logs: dict[str, Logs] = {}
+        """The log records of each run, once they are read."""
 
     def close(self) -> None:
         """Close the files."""
@@ -100,11 +102,8 @@ class Session:
         self._names = self._short_names()
         self.view = SingleView(run.count)
         self.rows = AllRows(run.count)
-        whole = self.window == self.lane_maker.whole
-        self.lane_maker = LaneMaker(run)
-        self._lanes = None
-        if whole:
-            self.window = self.lane_maker.whole
+        self.lane_window.replace_run(run)
+        self.logs.clear()
         old.close()
 
     def next_side(self) -> str:
@@ -211,28 +210,31 @@ class Session:
     # Lanes.
 
     def lanes(self, columns: int) -> tuple[Lanes, int]:
-        """Return the lanes, and where the cursor is in them (a time, or an index)."""
-        here = self.current()
-        index = 0
-        if here is not None:
-            run, index = here
-            if run is not self.a:
-                index = self.a.index_at(run.stamp(index)) if self.a.count else 0
-            self.window = self.lane_maker.centred(self.window, index, columns)
-        numbers = self.lane_maker.summaries
-        key = (self.window, columns, numbers, index if self.window.order else -1)
-        if self._lanes is None or self._lanes[0] != key:
-            self._lanes = key, self.lane_maker.make(self.window, columns, index)
-        position = index if self.window.order else self.stamp()
-        return self._lanes[1], position
+        """Return the lanes, and where the cursor is in them (a time, or a place)."""
+        made = self.lane_window.lanes(self.view, self.place, self._in_lanes(), columns)
+        return made, self.place if made.window.order else self.stamp()
 
     def zoom(self, step: int, columns: int) -> None:
         """Zoom the lanes in (1), out (-1), or to the whole run (0)."""
-        index = self.view.a(self.place) if not self.empty else None
-        if step == 0 or index is None:
-            self.window = self.lane_maker.whole
-        else:
-            self.window = self.lane_maker.zoomed(self.window, step, index, columns)
+        self.lane_window.zoom(step, self._in_lanes(), columns)
+
+    def look_through(self) -> Iterator[int]:
+        """Read, a bit at a time, what the lanes need: how busy nodes are, and what went wrong."""
+        runs = {"a": self.a} if self.b is None else {"a": self.a, "b": self.b}
+        for maker in self.lane_window.makers:
+            for number in maker.order():
+                maker.summarise(number)
+                yield number
+        for (name, run), maker in zip(runs.items(), self.lane_window.makers, strict=True):
+            logs = Logs([])
+            for logs in read_logs(run):
+                yield len(logs.lines)
+            yield from mark_lanes(run, maker, logs)
+            self.logs[name] = logs
+
+    def _in_lanes(self) -> tuple[int, int] | None:
+        here = self.current()
+        return None if here is None else (int(here[0] is self.b), here[1])
 
     def own_lane(self) -> str:
         """Return the node of the selected event."""

@@ -18,9 +18,9 @@ from rsltrace.diff.alignment.rows import Run as DiffRun
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
-from rsltrace_viewer.model.lanes import Window
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.view import Sign
+from rsltrace_viewer.model.windows import Window
 
 _EVENTS_PER_BLOCK = 2000
 _ALIGNED_MAX = 2_000_000
@@ -50,6 +50,7 @@ class Comparison:
         self._place_b = array("q")
         self._divergences: list[int] = []
         """Places where rows begin to differ, after one that does not."""
+        self._divergence_stamps: list[int] = []
         self._first_place: int | None = None if first is None else first
         self._end_a = self._end_b = self.agreeing
         self._aligned_blocks: Iterator[AlignedBlock] = iter(())
@@ -127,15 +128,16 @@ class Comparison:
             self.done = True
             return
         for item in block.items:
-            self._add(item, _sign(item, block))
+            self._add(item, _sign(item, block), block.stamp(item))
         self._end_a, self._end_b = block.end_a, block.end_b
         self.done = block.at_end or len(self._a) > _ALIGNED_MAX
 
-    def _add(self, item: EventPair, sign: Sign) -> None:
+    def _add(self, item: EventPair, sign: Sign, stamp_ns: int) -> None:
         place = self.agreeing + len(self._a)
         plain = sign is Sign.MATCH
         if not plain and (not self._signs or self._signs[-1] == _CODES[Sign.MATCH]):
             self._divergences.append(place)
+            self._divergence_stamps.append(stamp_ns)
         self._a.append(item.a)
         self._b.append(item.b)
         self._signs.append(_CODES[sign])
@@ -167,16 +169,14 @@ class Comparison:
             return f"{sign} {self.diff.verdict.value}: {self.diff.sentence}"
         return f"≠ the runs agree for {self.agreeing:,} events; looking for the cause …"
 
-    def divergence_in(self, window: Window) -> int | None:
-        """Return the time (or index in a) of the first difference, for the lanes."""
-        if self._first_place is None:
-            return None
-        index = self.a(self._first_place)
-        if index is None:
-            other = self.b(self._first_place)
-            assert other is not None  # a place stands for something
-            return self.agreeing if window.order else self.run_b.stamp(other)
-        return index if window.order else self.run_a.stamp(index)
+    def divergences_in(self, window: Window, columns: int) -> tuple[int | None, frozenset[int]]:
+        """Return the column of the first divergence (None: none), and those of all in a window."""
+        at = self._divergences if window.order else self._divergence_stamps
+        low, high = bisect_left(at, window.start), bisect_left(at, window.end)
+        found = frozenset(window.column(position, columns) for position in at[low:high])
+        if self._first_place is None or not at:
+            return None, found
+        return window.column(at[0], columns), found
 
     def next_divergence(self, place: int, step: int) -> int | None:
         """Return where the runs next begin to differ after (or before) a place."""

@@ -176,9 +176,13 @@ class ViewerApp(Stepping):
         if session.empty:
             return
         if event.order:
-            self.go(session.view.place_of(min(event.position, session.a.count - 1)), centre=True)
+            self.go(event.position, centre=True)
         else:
             self.go(session.place_at_time(event.position), centre=True)
+
+    def on_lanes_view_zoomed(self, event: LanesView.Zoomed) -> None:
+        """The wheel was turned over the lanes."""
+        self.action_zoom(event.step)
 
     def panes(self) -> list[Widget]:
         """The parts of the screen that one can go to."""
@@ -270,7 +274,13 @@ class ViewerApp(Stepping):
         if run.trace.complete:
             self._follow, self.following = None, False
             self._say("the recording has ended")
-        walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
+        walk(
+            self,
+            "lanes",
+            self.session.look_through(),
+            lambda _, done: self._show_lanes(),
+            at_once_s=0,
+        )
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
         """Offer all keys by their help in the command palette."""

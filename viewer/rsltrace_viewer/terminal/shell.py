@@ -7,7 +7,6 @@ and ``app``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from time import perf_counter
 from typing import Any
 
@@ -114,7 +113,13 @@ class Shell(App[None]):
         self._show_inspector()
         self.busy = False
         self.first_shown()
-        walk(self, "lanes", self._summaries(), lambda _, done: self._show_lanes(), at_once_s=0)
+        walk(
+            self,
+            "lanes",
+            self.session.look_through(),
+            lambda _, done: self._show_lanes(),
+            at_once_s=0,
+        )
         comparison = self.session.comparison
         if comparison is not None and not comparison.identical:
             self.run_worker(self._explain, group="diff", thread=True, exit_on_error=False)
@@ -150,11 +155,6 @@ class Shell(App[None]):
         self._show_header()
         self._show_inspector(top=False)
 
-    def _summaries(self) -> Iterator[int]:
-        for number in self.session.lane_maker.order():
-            self.session.lane_maker.summarise(number)
-            yield number
-
     @property
     def timeline(self) -> Timeline:
         """The list of events."""
@@ -181,9 +181,10 @@ class Shell(App[None]):
         screen.set_class(width >= _WIDE, "wide")
         screen.set_class(height < 16, "low")
         screen.set_class(height < 11 or (width < _WIDE and height < 14), "lowest")
-        self.lanes.fit_labels(self.session.lane_maker.labels, width)
+        labels = self.session.lane_window.labels
+        self.lanes.fit_labels(labels, width, two=self.session.b is not None)
         most = max(4, height // 5)
-        self.lanes.styles.height = min(len(self.session.lane_maker.labels), most) + 1
+        self.lanes.styles.height = min(len(labels), most) + 1
 
     # Drawing.
 
@@ -217,10 +218,13 @@ class Shell(App[None]):
         if not lanes.size.width:
             return
         made, position = session.lanes(lanes.columns)
-        divergence = None
+        first, divergences = None, frozenset[int]()
         if session.comparison is not None:
-            divergence = session.comparison.divergence_in(made.window)
-        lanes.show(made, position, own=session.own_lane(), divergence=divergence)
+            found = session.comparison.divergences_in(made.window, made.columns)
+            first, divergences = found
+        lanes.show(
+            made, position, own=session.own_lane(), divergence=first, divergences=divergences
+        )
 
     def _show_inspector(self, *, top: bool = True) -> None:
         session = self.session

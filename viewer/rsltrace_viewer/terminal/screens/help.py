@@ -104,6 +104,7 @@ def _signs_block(two: bool) -> list[Content]:
 
 def _lanes_block() -> list[Content]:
     lines = [Content.styled("Lanes, zoomed in to one event per column (+)", "bold underline")]
+    lines.append(Content("  ! exception  w warning  g finding  ≠ runs diverge"))
     pairs = [f"{letter} {kind.label}" for kind, letter in KIND_LETTERS.items()]
     for start in range(0, len(pairs), 4):
         lines.append(Content("  " + "  ".join(pairs[start : start + 4])))

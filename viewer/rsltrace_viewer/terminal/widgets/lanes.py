@@ -28,7 +28,17 @@ class LanesView(Widget, can_focus=True):
 
     COMPONENT_CLASSES: ClassVar[set[str]] = {
         f"lanes--{name}"
-        for name in ("axis", "label", "own", "bar", "cursor", "raised", "divergence", "empty")
+        for name in (
+            "axis",
+            "label",
+            "own",
+            "bar",
+            "cursor",
+            "raised",
+            "warning",
+            "divergence",
+            "empty",
+        )
     }
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("left,h", "move(-1)", "a column back", show=False),
@@ -42,18 +52,25 @@ class LanesView(Widget, can_focus=True):
     LanesView > .lanes--bar { color: $text-primary; }
     LanesView > .lanes--cursor { color: $text-accent; background: $accent 30%; text-style: bold; }
     LanesView > .lanes--raised { color: $text-error; text-style: bold; }
+    LanesView > .lanes--warning { color: $text-warning; text-style: bold; }
     LanesView > .lanes--divergence { color: $text-error; background: $error 30%; }
     LanesView > .lanes--empty { color: $text-muted; }
     """
 
     class Picked(Message):
-        """A column was clicked: ``position`` is a time, or an event where each has its column."""
+        """A column was clicked: ``position`` is a time, or a place where each has its column."""
 
-        def __init__(self, position: int, *, order: bool, label: str) -> None:
+        def __init__(self, position: int, *, order: bool) -> None:
             super().__init__()
             self.position = position
             self.order = order
-            self.label = label
+
+    class Zoomed(Message):
+        """The wheel was turned: 1 in, -1 out."""
+
+        def __init__(self, step: int) -> None:
+            super().__init__()
+            self.step = step
 
     class Resized(Message):
         """There is another number of columns."""
@@ -65,6 +82,8 @@ class LanesView(Widget, can_focus=True):
         self._position = 0
         self._own = ""
         self._divergence: int | None = None
+        self._divergences: frozenset[int] = frozenset()
+        self._two = False
         self._label_width = 8
         self._names = ShortNames(())
         self._styles: dict[str, Style] = {}
@@ -72,45 +91,52 @@ class LanesView(Widget, can_focus=True):
     @property
     def columns(self) -> int:
         """How many columns there are for events."""
-        return max(self.size.width - self._label_width - 3, 1)
+        return max(self.size.width - self._before_lanes - 1, 1)
 
-    def fit_labels(self, labels: list[str], width: int) -> None:
-        """Make room for the names of the lanes in ``width`` cells."""
+    @property
+    def _before_lanes(self) -> int:
+        return self._label_width + (4 if self._two else 2)
+
+    def fit_labels(self, labels: list[str], width: int, *, two: bool = False) -> None:
+        """Make room for the names of the lanes (of ``two`` runs) in ``width`` cells."""
+        self._two = two
         shown = [printable(label) for label in labels]
         longest = max(map(cells, shown), default=4)
         self._names = ShortNames(shown)
         self._label_width = max(4, min(longest, _LABEL_MAX, width // 6))
 
-    def show(self, lanes: Lanes, position: int, *, own: str, divergence: int | None = None) -> None:
-        """Show lanes with the cursor at a time (or index), in the lane named ``own``.
+    def show(
+        self,
+        lanes: Lanes,
+        position: int,
+        *,
+        own: str,
+        divergence: int | None = None,
+        divergences: frozenset[int] = frozenset(),
+    ) -> None:
+        """Show lanes with the cursor at a time (or place), in the lane named ``own``.
 
-        ``divergence`` is the time (or index) where two runs diverge.
+        ``divergence`` is the column where two runs diverge first, ``divergences`` are all.
         """
-        before = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
-        axis = self._position
+        before = (self.lanes, self.cursor, self._divergences, self._first_lane())
+        axis, owner = self._position, self._own
         self.lanes = lanes
         self._position = position
         self._own = own
         self.cursor = lanes.window.column(position, lanes.columns)
-        self._divergence = (
-            None if divergence is None else lanes.window.column(divergence, lanes.columns)
-        )
-        now = (self.lanes, self._own, self.cursor, self._divergence, self._first_lane())
+        self._divergence, self._divergences = divergence, divergences
+        now = (self.lanes, self.cursor, self._divergences, self._first_lane())
         width, last = self.size.width, self.size.height - 1
-        if now[0] is before[0] and now[2:] == before[2:] and now[1] in self._labels(lanes):
+        if now[0] is before[0] and now[1:] == before[1:]:
             # Only the name of the lane one is in, and the time, can be different.
-            if now[1] != before[1]:
-                for name in {now[1], before[1]} & set(self._labels(lanes)):
-                    y = self._labels(lanes).index(name) - now[4]
-                    self.refresh(Region(0, y, width, 1))
+            if own != owner:
+                for place, lane in enumerate(lanes.lanes):
+                    if lane.label in (own, owner):
+                        self.refresh(Region(0, place - now[3], width, 1))
             if axis != position:
                 self.refresh(Region(0, last, width, 1))
         else:
             self.refresh()
-
-    @staticmethod
-    def _labels(lanes: Lanes) -> list[str]:
-        return [lane.label for lane in lanes.lanes]
 
     def notify_style_update(self) -> None:
         """Forget the styles of the old theme."""
@@ -121,17 +147,39 @@ class LanesView(Widget, can_focus=True):
         """Count the columns again."""
         self.post_message(self.Resized())
 
-    def on_click(self, event: events.Click) -> None:
-        """Go to the column that was clicked, in the lane that was clicked."""
-        column = event.x - self._label_width - 2
-        if self.lanes is None or not 0 <= column < self.lanes.columns:
+    def on_mouse_down(self, event: events.MouseDown) -> None:
+        """Go to the column under the mouse, and on with it until the button is let go."""
+        if event.button == 1:
+            self.capture_mouse()
+            self._pick(event.x)
+
+    def on_mouse_move(self, event: events.MouseMove) -> None:
+        """Go along while the button is held."""
+        if self.app.mouse_captured is self:
+            self._pick(event.x)
+
+    def on_mouse_up(self, event: events.MouseUp) -> None:
+        """Stay here."""
+        if self.app.mouse_captured is self:
+            self.release_mouse()
+
+    def on_mouse_scroll_up(self, event: events.MouseScrollUp) -> None:
+        """Zoom in."""
+        event.stop()
+        self.post_message(self.Zoomed(1))
+
+    def on_mouse_scroll_down(self, event: events.MouseScrollDown) -> None:
+        """Zoom out."""
+        event.stop()
+        self.post_message(self.Zoomed(-1))
+
+    def _pick(self, x: int) -> None:
+        column = x - self._before_lanes
+        if self.lanes is None or not 0 <= column < self.lanes.columns or column == self.cursor:
             return
-        place = self._first_lane() + event.y
-        names = [lane.label for lane in self.lanes.lanes]
-        label = names[place] if event.y < self.size.height - 1 and place < len(names) else ""
         window = self.lanes.window
         position = window.at(column, self.lanes.columns)
-        self.post_message(self.Picked(position, order=window.order, label=label))
+        self.post_message(self.Picked(position, order=window.order))
 
     def action_move(self, step: int) -> None:
         """Go to the next (or previous) column with something in it."""
@@ -143,7 +191,7 @@ class LanesView(Widget, can_focus=True):
             if any(_has(lane, column) for lane in lanes.lanes):
                 position = lanes.window.at(column, lanes.columns)
                 order = lanes.window.order
-                self.post_message(self.Picked(position, order=order, label=""))
+                self.post_message(self.Picked(position, order=order))
                 return
             column += step
 
@@ -173,20 +221,23 @@ class LanesView(Widget, can_focus=True):
         place = self._first_lane() + y
         if place >= len(self.lanes.lanes):
             return Strip([Piece(" " * width, self._style("empty"))], width)
-        return self._lane(self.lanes.lanes[place], width)
+        return self._lane(place, self.lanes, width)
 
-    def _lane(self, lane: Lane, width: int) -> Strip:
+    def _lane(self, place: int, lanes: Lanes, width: int) -> Strip:
+        lane = lanes.lanes[place]
         own = lane.label == self._own
-        label = self._names.fit(printable(lane.label), self._label_width)
-        pieces = [
-            Piece((">" if own else " ") + label + " ", self._style("own" if own else "label"))
-        ]
+        again = place > 0 and lanes.lanes[place - 1].label == lane.label
+        label = self._names.fit("" if again else printable(lane.label), self._label_width)
+        lead = ">" if own and not again else " "
+        run = f" {lane.run}" if self._two else ""
+        pieces = [Piece(f"{lead}{label}{run} ", self._style("own" if own else "label"))]
         text = lane.letters or "".join(_BLOCKS[level] for level in lane.levels)
         bar = self._style("bar")
         for column, character in enumerate(text):
             style = bar
-            if column in lane.raised:
-                character, style = "!", self._style("raised")
+            if column in lane.signs:
+                character = lane.signs[column]
+                style = self._style("raised" if character == "!" else "warning")
             if column == self._divergence:
                 character = "┆" if character == " " else character
                 style = style + self._style("divergence")
@@ -204,9 +255,9 @@ class LanesView(Widget, can_focus=True):
             scale = "one column is one event"
         else:
             left = f"{format_seconds(window.start)[:-6]} s"
-            right = f"{format_seconds(window.end - 1)[:-6]} s"
+            right = f"{format_seconds(window.end)[:-6]} s"
             here = f"▲ {format_seconds(self._position)[:-3]} s"
-            scale = f"{format_duration(window.length // max(lanes.columns, 1))} per column"
+            scale = f"{format_duration(window.step(lanes.columns))} per column"
         if lanes.known < 1:
             scale += f", {lanes.known:.0%} read"
         line = [" "] * lanes.columns
@@ -215,14 +266,14 @@ class LanesView(Widget, can_focus=True):
         middle = (lanes.columns - len(scale)) // 2
         if abs(self.cursor - lanes.columns // 2) > len(scale) // 2 + len(here) + 2:
             _put(line, middle, scale)
-        if self._divergence is not None and 0 <= self._divergence < lanes.columns:
-            _put(line, self._divergence, "≠")
+        for column in self._divergences:
+            _put(line, column, "≠")
         if 0 <= self.cursor < lanes.columns:
             start = min(self.cursor, max(lanes.columns - len(here), 0))
             text = here if start == self.cursor else f"{here[2:]} ▲"
             start = start if start == self.cursor else self.cursor - len(text) + 1
             _put(line, max(start, 0), text, gap=True)
-        text = " " * (self._label_width + 2) + "".join(line)
+        text = " " * self._before_lanes + "".join(line)
         return Strip([Piece(fit(text, width), self._style("axis"))], width)
 
 
