@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from rsltrace.job.fields import JobFields
 from rsltrace.job.parts.stop import StopSpec
+from rsltrace.job.start_order import start_problems
 from rsltrace.job.values.paths import near_path
 from rsltrace.job.values.problem import Problem
 from rsltrace.job.values.times import format_time
@@ -16,6 +17,7 @@ def contradictions(job: JobFields) -> Iterator[Problem]:
     yield from _something_to_run(job)
     yield from _times_in_order(job)
     yield from _distinct_names(job)
+    yield from start_problems(job)
     yield from _bags_end(job)
     yield from _paths_exist(job)
     yield from _bags_progress(job)

@@ -19,11 +19,15 @@ from rsltrace.launch.values import typed
 
 
 class Evaluation:
-    """Evaluates attributes in the scope of the innermost group of the file being read."""
+    """Evaluates attributes in the scope of the innermost group of the file being read.
+
+    ``delay_ns`` is when what is being read happens, after the launch file has been started.
+    """
 
     def __init__(self, arguments: dict[str, str]) -> None:
         self.launched = Launched()
         self.scope = Scope(configurations=arguments)
+        self.delay_ns = 0
         self._substitutions = Substitutions(self.scope, Path())
 
     @property

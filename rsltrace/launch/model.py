@@ -18,7 +18,8 @@ class LaunchedNode:
 
     ``executable`` is that of ``package``; a component has a ``plugin`` instead. ``name`` and
     ``namespace`` are None where the launch file leaves them to the node. ``where`` is
-    ``file:line:column``, as far as it is known.
+    ``file:line:column``, as far as it is known. It starts ``delay_ns`` after the launch file
+    (``<timer>``).
     """
 
     where: str
@@ -31,6 +32,7 @@ class LaunchedNode:
     remappings: tuple[tuple[str, str], ...] = ()
     arguments: tuple[str, ...] = ()
     ros_arguments: tuple[str, ...] = ()
+    delay_ns: int = 0
 
     @property
     def title(self) -> str:

@@ -119,6 +119,7 @@ class Nodes:
             "namespace": namespace or None,
             "parameters": scope.parameters + self._parameters(element, full_name),
             "remappings": scope.remappings + tuple(remappings),
+            "delay_ns": evaluation.delay_ns,
         }
 
     def _words(self, element: Element, name: str) -> tuple[str, ...]:

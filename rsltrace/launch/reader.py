@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rsltrace.errors import JobError, nearest
 from rsltrace.job.reading.yaml_source import Place
+from rsltrace.job.values.times import parse_time
 from rsltrace.launch.element import Element
 from rsltrace.launch.evaluation import Evaluation
 from rsltrace.launch.model import ENVIRONMENT, Argument, Launched
@@ -71,9 +72,7 @@ class ActionReader(Evaluation):
             "executable": self._process,
             "timer": self._timer,
             "ros_timer": self._timer,
-            "shutdown": lambda element: self.refuse(
-                element, "shutdown", "a run ends by the job's stop: conditions"
-            ),
+            "shutdown": self._shutdown,
         }
 
     # -- files and groups --------------------------------------------------------------------------
@@ -139,6 +138,20 @@ class ActionReader(Evaluation):
             self.refuse(element, f"include of {path.name}", _PYTHON)
             return
         self.include(path, element.need("file").place)
+
+    def _timer(self, element: Element) -> None:
+        element.check(["period"], None)
+        attribute = element.need("period")
+        period = self.text(attribute)
+        try:
+            period_ns = parse_time(float(period))
+        except ValueError:
+            raise attribute.place.error(
+                f"the period of a timer is a number of seconds, not {period!r}"
+            ) from None
+        self.delay_ns += period_ns
+        self._children(element)
+        self.delay_ns -= period_ns
 
     # -- arguments, environment, defaults ----------------------------------------------------------
 
@@ -233,19 +246,13 @@ class ActionReader(Evaluation):
 
     # -- what cannot be simulated ------------------------------------------------------------------
 
+    def _shutdown(self, element: Element) -> None:
+        self.refuse(element, "shutdown", "a run ends by the job's stop: conditions")
+
     def _process(self, element: Element) -> None:
         command = element.get("cmd")
         what = "a process" if command is None else f"process {self.text(command)!r}"
         self.refuse(element, what, "other programs do not run in a simulation")
-
-    def _timer(self, element: Element) -> None:
-        period = self.optional(element, "period")
-        tags = ", ".join(child.tag for child in element.children) or "nothing"
-        self.refuse(
-            element,
-            f"timer of {period} s ({tags})",
-            "a run has all its nodes from the start: move them out of the timer",
-        )
 
 
 def _parse(path: Path, place: Place | None) -> Element:

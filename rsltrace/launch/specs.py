@@ -8,6 +8,7 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.job.values.ros_arguments import split_ros_arguments
 from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import flat, parameters_for
@@ -79,6 +80,8 @@ def _spec(node: LaunchedNode) -> NodeSpec:
         "remappings": dict(reversed(remappings.items())),
         "origin": node.where,
     }
+    if node.delay_ns:
+        values["start_after"] = StartAfterSpec.after(node.delay_ns)
     try:
         if node.plugin:
             module, _, attribute = node.plugin.replace(":", ".").rpartition(".")

@@ -6,6 +6,7 @@ hashes of addresses).
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TypeVar
 
 from rsltrace.errors import UnsupportedError
@@ -20,10 +21,11 @@ EndT = TypeVar("EndT", bound=DomainEntity)
 
 
 class Graph:
-    """The nodes and endpoints of one world."""
+    """The nodes and endpoints of one world. ``joined`` are called with each new node and server."""
 
     def __init__(self) -> None:
         self.nodes: list[Participant] = []
+        self.joined: list[Callable[[DomainEntity], None]] = []
         self._named: dict[str, list[Participant]] = {}
         self._publishers: dict[str, list[Publisher]] = {}
         self._subscriptions: dict[str, list[Subscription]] = {}
@@ -65,6 +67,7 @@ class Graph:
         self.nodes.append(node)
         self._named.setdefault(node.fully_qualified_name, []).append(node)
         node.graph = self
+        self._tell_of(node)
 
     def add_publisher(self, publisher: Publisher) -> None:
         """Connect a new publisher with the subscriptions that are there."""
@@ -91,6 +94,11 @@ class Graph:
         """Make a server known."""
         self._services.setdefault(service.service, []).append(service)
         service.graph = self
+        self._tell_of(service)
+
+    def _tell_of(self, member: DomainEntity) -> None:
+        for listener in self.joined:
+            listener(member)
 
     def remove(self, member: DomainEntity) -> None:
         """Forget a member, and disconnect it from its peers."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 from rsltrace.run.plans.bags import PLAYER
+from rsltrace.run.plans.starts import impossible_starts
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
 
@@ -48,6 +49,7 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
     notes: list[str] = []
     observer = Observer(note=notes.append)
     with kept_process(), Session(job, None, observer=observer) as session:
+        session.whole_graph = True
         session.begin()
         if session.error is not None:
             error = session.error
@@ -56,7 +58,9 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             raise error
         found = overview(session.world.domain.graph, session.world.blocked(), everything=everything)
         found = replace(found, problems=(*found.problems, *_played_and_published(found)))
-        unused = session.unused()
+        graph = session.world.domain.graph
+        never = impossible_starts(session.job, graph, session.start_ns, session.end_ns)
+        unused = (*session.unused(), *never)
         session.stop = Stop("checked")
         session.finish()
         return Checked(session.job, session.start_ns, found, tuple(notes), unused)

@@ -42,6 +42,7 @@ from rsltrace.run.plans.guard import RunGuard, install_guard
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
+from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
 from rsltrace.run.provenance import environment, payload_filter, sources, write_job
@@ -109,6 +110,8 @@ class Session:
     start_ns: int
     end_ns: int | None
     """The latest simulated time the job lets the run reach, if time ends it."""
+    whole_graph = False
+    """Whether entries that would start later are constructed with the others, to be seen."""
 
     def __init__(
         self,
@@ -347,8 +350,11 @@ class Session:
         with self._failures(), self._engaged():
             self.world.plan(self._entries)
             self.world.stacks.programs.fed = bool(self._bags)
+            later = [one for one in self._entries if one.start_after and not self.whole_graph]
+            for entry in later:
+                self.world.starts.add(entry)
             for entry in self._entries:
-                if not self.world.construct(entry):
+                if entry not in later and not self.world.construct(entry):
                     say_where(self.job, entry, self.world.error)
                     break
             if not self.ended:
@@ -356,11 +362,15 @@ class Session:
             if not self.ended:
                 self.world.jump(self.start_ns)
                 self._has_begun = not self.ended
+                self.world.starts.begin(self.start_ns)
 
     def go_on(self) -> None:
         """Run the loop until it ends or its gate pauses it. What goes wrong is in ``error``."""
         with self._failures(), self._engaged():
             self.world.go_on()
+        failed, self.world.starts.failed = self.world.starts.failed, None
+        if failed is not None:
+            say_where(self.job, failed, self.world.error)
 
     @contextmanager
     def _engaged(self) -> Iterator[None]:
@@ -389,7 +399,8 @@ class Session:
         if census is not None:
             rules += unused_rules(self.job, census, self._plan, lasted_ns)
             rules += unused_ros_parameters(self.job, census, parameters)
-        return (*rules, *unused_parameters(self.job, parameters))
+        starts = missed_starts(self.job, self.world.starts.missed()) if lasted else ()
+        return (*rules, *unused_parameters(self.job, parameters), *starts)
 
     def finish(self) -> RunResult:
         """Destroy the nodes, close the trace, and say how it went.
@@ -416,6 +427,7 @@ class Session:
                     "stop_reason": stop.reason,
                     "exit_code": str(exit_code),
                     "ended_after": str(outcome.ended_after),
+                    **self._order_of_starts(),
                     **_waits(error),
                 },
                 replace=self._has_begun or exit_code == 0,
@@ -435,6 +447,16 @@ class Session:
             notes=(*self._notes, *outcome.notes, *unused),
             guarded=self._guarded.counts,
         )
+
+    def _order_of_starts(self) -> dict[str, str]:
+        """Return what a trace keeps of the order of its constructions where it is not the job's."""
+        if all(entry.start_after is None for entry in self._entries):
+            return {}
+        places = [str(self._entries.index(entry)) for entry in self.world.constructed]
+        if self._bags:
+            at_once = sum(entry.start_after is None for entry in self._entries)
+            places.insert(at_once, str(len(self._entries)))  # the player
+        return {"entries": ",".join(places)}
 
 
 def _waits(error: RunError | None) -> dict[str, str]:

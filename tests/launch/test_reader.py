@@ -9,6 +9,7 @@ import pytest
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.launch.model import Launched, LaunchedNode
 from rsltrace.launch.specs import node_specs as specs_of
 from rsltrace.run.plans.executables import why_not
@@ -224,8 +225,6 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
         "function with 'main:'",
         "  a.launch.xml:6:3: process './program': it belongs to no package (pkg=)",
         "  a.launch.xml:7:3: process 'rviz2 -d x': other programs do not run in a simulation",
-        "  a.launch.xml:8:3: timer of 5.0 s (node): a run has all its nodes from the start: move "
-        "them out of the timer",
         "  a.launch.xml:9:3: shutdown: a run ends by the job's stop: conditions",
         "  a.launch.xml:10:3: include of more.launch.py: a Python launch file is a program of "
         "ROS's launch: source a ROS 2 installation (packages launch and launch_ros), or name the "
@@ -233,15 +232,67 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
         "  a.launch.xml:11:36: d/d::T: it is a C++ component: only Python nodes can be simulated",
     ]
     launched = read(UNSUPPORTED)
-    (fine,) = node_specs(launched, skip_unsupported=True)
-    assert fine.name == "fine"
-    assert len(launched.unsupported) == 10
+    timed, fine = node_specs(launched, skip_unsupported=True)
+    assert timed.start_after == StartAfterSpec.after(5_000_000_000)
+    assert (fine.name, fine.start_after) == ("fine", None)
+    assert len(launched.unsupported) == 9
     assert launched.ignored == [
         "a.launch.xml:12:3: launch-prefix, env A: all nodes run in one process"
     ]
 
 
+TIMERS = [
+    """<launch>
+      <arg name="wait" default="2.5"/>
+      <timer period="$(var wait)">
+        <node pkg="demo" exec="talker" name="a"/>
+        <group><push_ros_namespace namespace="n"/>
+          <ros_timer period="0.25"><node pkg="demo" exec="talker" name="b"/></ros_timer>
+        </group>
+        <include file="more.launch.xml"/>
+      </timer>
+      <timer period="1" if="false"><node pkg="demo" exec="talker" name="c"/></timer>
+      <node pkg="demo" exec="talker" name="d"/>
+    </launch>""",
+    """launch:
+      - arg: {name: wait, default: "2.5"}
+      - timer:
+          period: $(var wait)
+          children:
+            - node: {pkg: demo, exec: talker, name: a}
+            - group:
+                - push_ros_namespace: {namespace: n}
+                - ros_timer:
+                    period: 0.25
+                    children: [node: {pkg: demo, exec: talker, name: b}]
+            - include: {file: more.launch.xml}
+      - timer: {period: 1.0, if: "false", children: [node: {pkg: demo, exec: talker, name: c}]}
+      - node: {pkg: demo, exec: talker, name: d}
+    """,
+]
+
+
+@pytest.mark.parametrize("text", TIMERS, ids=["xml", "yaml"])
+def test_timers_start_nodes_later(read: Any, prefix: Path, write: Any, text: str) -> None:
+    more = '<launch><node pkg="demo" exec="talker" name="e"/></launch>'
+    write(more, "more.launch.xml")
+    name = "a.launch.xml" if text.startswith("<") else "a.launch.yaml"
+    made = node_specs(read(text, name), skip_unsupported=False)
+    assert [(one.name, one.start_after and one.start_after.delay_ns) for one in made] == [
+        ("a", 2_500_000_000),
+        ("b", 2_750_000_000),
+        ("e", 2_500_000_000),
+        ("d", None),
+    ]
+
+
 BROKEN = [
+    ("<launch><timer/></launch>", "a.launch.xml:1:9: <timer> needs the attribute 'period'"),
+    (
+        "<launch><timer period='soon'/></launch>",
+        "a.launch.xml:1:16: the period of a timer is a number of seconds, not 'soon'",
+    ),
+    ("<launch><timer period='-1'/></launch>", "a number of seconds, not '-1'"),
     ("<launch><nod/></launch>", "a.launch.xml:1:9: unknown action <nod>; did you mean <node>?"),
     ("<launch>\n <node/></launch>", "a.launch.xml:2:2: <node> needs the attribute 'exec'"),
     (
@@ -379,7 +430,7 @@ def test_the_document_names_all_that_is_read() -> None:
 
     text = (Path(__file__).parents[2] / "docs" / "launch.md").read_text(encoding="utf-8")
     silent = {"push-ros-namespace", "reset_env", "set_use_sim_time", "set_ros_log_dir", "log",
-              "log_info", "executable", "timer", "ros_timer", "shutdown"}  # fmt: skip
+              "log_info", "executable", "shutdown"}  # fmt: skip
     for action in set(ActionReader({})._actions) - silent:
         assert f"`{action}`" in text, action
     for name in set(Substitutions(Scope(), Path())._known) - {"optenv"}:

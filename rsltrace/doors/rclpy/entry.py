@@ -13,6 +13,19 @@ from rsltrace.model.finding import Policy
 
 
 @dataclass(frozen=True, slots=True)
+class StartRule:
+    """When an entry starts that does not start with the run: ``delay_ns`` after all of the others
+    have come true. ``started`` and ``ended`` are keys of other entries."""
+
+    delay_ns: int = 0
+    topic: str | None = None
+    service: str | None = None
+    node: str | None = None
+    started: str | None = None
+    ended: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Entry:
     """One entry of a job, ready to be constructed.
 
@@ -30,6 +43,8 @@ class Entry:
     policy: Policy | None = None
     argv: list[str] | None = None
     """The command line, if ``make`` is a main to be run in a program of its own."""
+    start_after: StartRule | None = None
+    """When it starts, None for those that start with the run."""
 
 
 def ros_arguments(

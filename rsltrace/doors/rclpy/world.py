@@ -35,6 +35,7 @@ from rsltrace.doors.rclpy.stacks.program import Program
 from rsltrace.doors.rclpy.stacks.signals import own_signal_handlers
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_waiting
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.doors.rclpy.stacks.starts import Starts
 from rsltrace.doors.rclpy.stacks.threads import cooperative_threads
 from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.errors import DeadlockError, JobError, RunError
@@ -44,7 +45,7 @@ from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.events.event import OutsideEvent
 from rsltrace.middleware.links import Network
 from rsltrace.middleware.scheduling import Scheduling, SchedulingPlan
-from rsltrace.model.event import EventKind
+from rsltrace.model.event import NO_EVENT, EventKind
 
 
 class World:
@@ -72,7 +73,9 @@ class World:
         self._surroundings = Surroundings(self.stacks, self._logs, self.states)
         self._boundary: Boundary
         self._stack = ExitStack()
-        self._begun = 0
+        self.constructed: list[Entry] = []
+        """The entries in the order in which they have been constructed."""
+        self.starts = Starts(self.stacks, self.construct)
 
     def __enter__(self) -> World:
         stacks = self.stacks
@@ -166,22 +169,27 @@ class World:
 
     # -- the stages of a run ---------------------------------------------------------------------
 
-    def construct(self, entry: Entry) -> bool:
-        """Construct one entry of the job as one event; return False if that ended the run."""
+    def construct(self, entry: Entry, cause: tuple[int, int] = (NO_EVENT, 0)) -> bool:
+        """Construct one entry of the job as one event; return False if that ended the run.
+
+        ``cause`` is the event and output that it follows from.
+        """
         stacks = self.stacks
+        self.constructed.append(entry)
         if entry.argv is not None:
-            begin_program(stacks, stacks.programs.all[self._begun])
-            self._begun += 1
+            program = next(one for one in stacks.programs.all if one.entry is entry)
+            begin_program(stacks, program, cause)
             return stacks.loop.stopped is None
 
         def build() -> None:
             made = entry.make()
             for node in made if isinstance(made, (list, tuple)) else [made]:
                 self._adopt(node, entry.name)
+            stacks.programs.tell("started", entry.key)
 
         def construct() -> None:
             event = Construction(lambda: f"constructing {entry.name}", entry)
-            stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build)
+            stacks.dispatcher.run_outside(event, EventKind.CONSTRUCT, 0, None, build, cause)
             # Whoever switched here goes on: this function, or the loop's runner after a wait.
             stacks.runners.step_aside()
 

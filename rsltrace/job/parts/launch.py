@@ -45,7 +45,7 @@ class LaunchSpec(Part):
     )
     skip_unsupported: Annotated[bool, check(flag)] = Field(
         default=False,
-        description="Leave out what cannot be simulated (compiled executables, processes, timers) "
+        description="Leave out what cannot be simulated (compiled executables, other processes) "
         "instead of refusing the launch file.",
         examples=[True],
     )

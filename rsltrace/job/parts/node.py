@@ -11,7 +11,8 @@ from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, items, one_of, text
+from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.values.checks import attach, check, items, one_of, part, text
 from rsltrace.job.values.names import (
     check_executable,
     check_module,
@@ -24,7 +25,7 @@ from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
 from rsltrace.job.values.paths import FileText, check_path
 from rsltrace.job.values.problem import Collected, Problem, Problems, describe
 from rsltrace.job.values.target import Target, check_callable_target, target_text
-from rsltrace.job.values.times import ExactFloat
+from rsltrace.job.values.times import ExactFloat, TimeLike
 
 
 def names_to_names(
@@ -224,6 +225,13 @@ class NodeSpec(Part):
         "from the job's `guard`.",
         examples=[{"random": "allow"}],
     )
+    start_after: Annotated[StartAfterSpec | None, part("delay")] = Field(
+        default=None,
+        description="When it starts, if not with the run: after a time (which may stand for "
+        "`{delay: ...}`), after a topic, service or node is there, or after another entry has "
+        "started or ended.",
+        examples=["2s", {"service": "/set_mode"}, {"ended": "my_robot/calibrate", "delay": "1s"}],
+    )
     # Not a key of a job file: where the entry came from, if not from the job itself.
     origin: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None, exclude=True, repr=False
@@ -246,6 +254,7 @@ class NodeSpec(Part):
             remappings: dict[str, str] = ...,
             arguments: dict[str, Any] | Sequence[str] = ...,
             on_exception: Literal["stop", "log"] = "stop",
+            start_after: StartAfterSpec | dict[str, Any] | TimeLike | None = None,
             origin: str | None = None,
             guard: GuardSpec | dict[str, Any] | bool | None = None,
         ) -> None: ...
@@ -286,8 +295,9 @@ class NodeSpec(Part):
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """The keys that stand for other kinds of entries."""
-        return tuple(name for name in _KINDS if name != self.kind)
+        """The keys that stand for other kinds of entries, and those that only some entries have."""
+        later = () if self.start_after is not None else ("start_after",)
+        return (*(name for name in _KINDS if name != self.kind), *later)
 
     @property
     def target(self) -> str:

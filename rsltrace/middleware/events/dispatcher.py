@@ -111,10 +111,16 @@ class Dispatcher:
         event.quiet = False
 
     def run_outside(
-        self, handle: OutsideEvent, kind: EventKind, entity: int, node: Any, body: Callable[[], Any]
+        self,
+        handle: OutsideEvent,
+        kind: EventKind,
+        entity: int,
+        node: Any,
+        body: Callable[[], Any],
+        cause: tuple[int, int] = (NO_EVENT, 0),
     ) -> None:
-        """Run an event that is no entity's callback and that nothing in the run has caused."""
-        self.execute(handle, entity, node, kind, body, (), NO_EVENT, 0, 0)
+        """Run an event that is no entity's callback; most of them nothing in the run has caused."""
+        self.execute(handle, entity, node, kind, body, (), *cause, 0)
 
     def in_callback(self) -> bool:
         """Return whether the event under way is a callback's, not a main's or a thread's."""

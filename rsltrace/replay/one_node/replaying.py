@@ -83,7 +83,7 @@ def replay_node(
 
 def entries_of(trace: Trace, columns: Columns) -> list[int]:
     """Return, for each construction in a trace, which entry of the job it was that of."""
-    told = trace.metadata(METADATA_FED).get("entries", "")
+    told = trace.metadata(METADATA_FED).get("entries") or trace.result.get("entries", "")
     some = [int(one) for one in told.split(",") if one.isdecimal()]
     return some or list(range(len(columns.constructions)))
 

@@ -145,21 +145,35 @@ class FedSession(Session):
 
     def begin(self) -> None:
         """Construct the unit among the others, and jump to the start."""
-        world = self.world
-        constructions = self._columns.constructions
-        own = [one for one in constructions if self._unit.own_events[one]]
+        world, unit = self.world, self._unit
+        entries = dict(zip(unit.entries, self._entries, strict=True))
+        last = 0
         with self._failures(), self._engaged():
             world.plan(self._entries)
             world.stacks.programs.fed = True
-            for event, entry in zip(own, self._entries, strict=False):
+            for place, event in enumerate(self._columns.constructions):
+                entry = entries.get(unit.entry_of(place))
+                if self._starts_later(unit.entry_of(place)):
+                    if entry is not None:
+                        world.starts.add_at(entry, int(self._columns.events["stamp"][event]))
+                    continue
+                last = event + 1
+                if entry is None:
+                    continue
                 self.script.perform_until(event)
                 if not world.construct(entry):
                     say_where(self.job, entry, world.error)
                     break
             if not self.ended:
-                self.script.perform_until(constructions[-1] + 1)
+                self.script.perform_until(last)
                 world.jump(self.start_ns)
                 self._has_begun = not self.ended
+
+    def _starts_later(self, place: int) -> bool:
+        """Whether an entry (its place among hooks and nodes) has started after the run had."""
+        index = place - int(self.job.hooks.before is not None)
+        nodes = self.job.nodes
+        return 0 <= index < len(nodes) and nodes[index].start_after is not None
 
     # -- what others did --------------------------------------------------------------------------
 

@@ -85,6 +85,10 @@ class Unit:
         sent = np.isin(outputs["entity"], ids) & np.isin(outputs["kind"], SENT)
         return int((~self.own_events[outputs["event"][sent]]).sum())
 
+    def entry_of(self, place: int) -> int:
+        """Return which entry the construction at ``place`` among those of the trace was that of."""
+        return self._ordinals[place] if place < len(self._ordinals) else place
+
     # -- who made what ---------------------------------------------------------------------------
 
     def _entry_of_entity(self, entity_id: int) -> int:
@@ -107,8 +111,7 @@ class Unit:
             row = self.columns.events[index]
             kind, entity, cause = int(row["kind"]), int(row["entity"]), int(row["cause_event"])
             if kind == EventKind.CONSTRUCT:
-                place = self.columns.constructions.index(index)
-                found = self._ordinals[place] if place < len(self._ordinals) else place
+                found = self.entry_of(self.columns.constructions.index(index))
                 break
             if entity:
                 owner = self.columns.trace.entity(entity).node or entity
@@ -138,8 +141,7 @@ class Unit:
         ]
         if len(waiting) != 1:
             return -1
-        place = waiting[0]
-        return self._ordinals[place] if place < len(self._ordinals) else place
+        return self.entry_of(waiting[0])
 
 
 def find_node(columns: Columns, name: str) -> Entity:

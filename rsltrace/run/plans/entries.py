@@ -10,10 +10,11 @@ from inspect import Parameter
 from typing import Any
 
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
-from rsltrace.doors.rclpy.entry import Entry, ros_arguments
+from rsltrace.doors.rclpy.entry import Entry, StartRule, ros_arguments
 from rsltrace.doors.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
+from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.run.plans.executables import Mains
@@ -30,7 +31,8 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
     entries = []
     mains = Mains(job)
     for_all = _arguments_for_all(job)
-    for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
+    keys = entry_keys(job.nodes)
+    for index, (spec, key) in enumerate(zip(job.nodes, keys, strict=True)):
         if only is not None and index not in only:
             continue
         loc = ("nodes", index, spec.kind)
@@ -65,9 +67,23 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
                 log_exceptions=spec.on_exception == "log",
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
+                start_after=_start_rule(job, spec, keys),
             )
         )
     return entries
+
+
+def _start_rule(job: Job, spec: NodeSpec, keys: Sequence[str]) -> StartRule | None:
+    after = spec.start_after
+    if after is None:
+        return None
+
+    def key(reference: str | int | None) -> str | None:
+        return None if reference is None else keys[entry_meant(job.nodes, reference)]
+
+    return StartRule(
+        after.delay_ns, after.topic, after.service, after.node, key(after.started), key(after.ended)
+    )
 
 
 def _check_parameter_files(job: Job, index: int) -> None:

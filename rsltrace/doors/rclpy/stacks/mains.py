@@ -21,14 +21,15 @@ from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.threads import SimThread
 from rsltrace.loop.stop import Stop
 from rsltrace.middleware.events.failure import text_of
-from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 
 _EVERY_MAIN_ENDED = "every main has ended"
 
 
-def begin_program(stacks: Stacks, program: Program) -> None:
-    """Run a main until it ends or blocks for the first time, as one event."""
+def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO_EVENT, 0)) -> None:
+    """Run a main until it ends or blocks for the first time, as one event; ``cause`` is the event
+    and output that it follows from."""
     entities = stacks.domain.entities
     program.begun_ns = stacks.loop.now_ns
     program.entity_id = entities.new_id()
@@ -38,7 +39,12 @@ def begin_program(stacks: Stacks, program: Program) -> None:
         program.enter()
         event = Construction(program.describe, program.entry)
         stacks.dispatcher.run_outside(
-            event, EventKind.CONSTRUCT, program.entity_id, None, lambda: _run(stacks, program)
+            event,
+            EventKind.CONSTRUCT,
+            program.entity_id,
+            None,
+            lambda: _run(stacks, program),
+            cause,
         )
         stacks.programs.host.enter()
         stacks.runners.step_aside()
@@ -51,6 +57,7 @@ def begin_program(stacks: Stacks, program: Program) -> None:
 def _run(stacks: Stacks, program: Program) -> None:
     assert program.entry is not None
     error: BaseException | None = None
+    stacks.programs.tell("started", program.entry.key)
     try:
         status = program.entry.make()
         if status is not None:  # a console script is sys.exit(main())
@@ -86,8 +93,11 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
     if failed:
         assert error is not None
         raise error
-    mains = stacks.programs.all
-    alone = not stacks.programs.fed and all(
+    programs = stacks.programs
+    assert program.entry is not None
+    programs.tell("ended", program.entry.key)
+    mains = programs.all
+    alone = not (programs.fed or programs.to_come) and all(
         node.process in mains for node in stacks.domain.graph.nodes
     )
     if alone and stacks.loop.stopped is None and all(other.ended for other in mains):

@@ -42,7 +42,8 @@ class Programs:
 
     ``constructing`` is the entry under construction; while modules are ``importing``, what they
     make belongs to the run, too. The shutdown of ``main_context`` ends the run. ``fed`` says that
-    messages come from outside (bags).
+    messages come from outside (bags). ``to_come`` are the keys of entries that will start while the
+    run goes on; ``listeners`` are called with "started" or "ended" and an entry's key.
     """
 
     def __init__(self) -> None:
@@ -53,6 +54,13 @@ class Programs:
         self.importing = False
         self.main_context: Context | None = None
         self.fed = False
+        self.to_come: list[str] = []
+        self.listeners: list[Callable[[str, str], None]] = []
+
+    def tell(self, what: str, key: str) -> None:
+        """Say in the event under way that an entry has "started" or "ended"."""
+        for listener in self.listeners:
+            listener(what, key)
 
     def on_stack(self, stack: greenlet) -> Program | None:
         """Return the program whose main runs on a stack, if it is one's."""
