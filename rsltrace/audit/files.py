@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import io
 import os
 import re
 import sys
@@ -14,6 +15,7 @@ from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
 from rsltrace.audit.scopes import Module, parse_scopes
+from rsltrace.model.regular_file import read_regular
 
 _INSTALLED = {"site-packages", "dist-packages"}
 _NOT_SOURCES = {"build", "install", "log", "node_modules", "__pycache__"}
@@ -36,8 +38,10 @@ def read_source(path: Path, name: str, *, as_script: bool = False) -> SourceFile
 
     :raises OSError, SyntaxError, ValueError: if it is no Python source.
     """
-    with tokenize.open(path) as file:
-        text = file.read()
+    data = io.BytesIO(read_regular(path))
+    encoding, _ = tokenize.detect_encoding(data.readline)
+    data.seek(0)
+    text = io.TextIOWrapper(data, encoding).read()
     tree = ast.parse(text, str(path))
     module = parse_scopes(tree, name, is_package=path.name == "__init__.py")
     return SourceFile(path, module, as_script, _allowed(text))

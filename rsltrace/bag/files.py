@@ -17,7 +17,7 @@ from rsltrace.bag.topic import BagQos
 from rsltrace.errors import BagError
 from rsltrace.mcap.limits import FILE_BYTES_MIN, FILE_GROWTH_MAX
 from rsltrace.mcap.records import MAGIC as MCAP_MAGIC
-from rsltrace.mcap.source import not_regular
+from rsltrace.model.regular_file import not_regular
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

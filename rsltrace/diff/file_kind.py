@@ -11,9 +11,9 @@ from pathlib import Path
 
 from mcap.opcode import Opcode
 
-from rsltrace.mcap.records import MAGIC, Damaged, Fields
-from rsltrace.mcap.source import not_regular
-from rsltrace.trace.format import METADATA_FORMAT
+from rsltrace.mcap.records import MAGIC, Damaged, Fields, parse_header
+from rsltrace.model.regular_file import not_regular
+from rsltrace.trace.format import METADATA_FORMAT, begins_a_trace
 
 _HEAD_BYTES = 4096
 _SQLITE_MAGIC = b"SQLite format 3\0"
@@ -30,9 +30,14 @@ def is_trace(path: str | os.PathLike[str]) -> bool:
     with suppress(Damaged):
         fields = Fields(head[len(MAGIC) :])
         fields.take(1)
-        fields.take(fields.u64())
-        opcode, _ = fields.take(1)[0], fields.u64()
-        return opcode == Opcode.METADATA and fields.text() == METADATA_FORMAT
+        header = parse_header(fields.take(fields.u64()))
+        if not any(head[len(MAGIC) + fields.position :]):  # zeros are what a crash leaves
+            return begins_a_trace(header)
+        try:
+            opcode, _ = fields.take(1)[0], fields.u64()
+            return opcode == Opcode.METADATA and fields.text() == METADATA_FORMAT
+        except Damaged:
+            return begins_a_trace(header)
     return False
 
 

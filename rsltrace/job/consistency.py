@@ -130,10 +130,11 @@ def _paths_exist(job: JobFields) -> Iterator[Problem]:
             what = "is not a file" if path.exists() else "there is no such file"
             yield Problem(f"{file!r}: {what}{_near(job, file)}", place)
     for index, launch in enumerate(job.launch):
-        if not job.resolve(launch.file).is_file():
-            near = _near(job, launch.file)
+        path = job.resolve(launch.file)
+        if not path.is_file():
+            what = "is not a file" if path.exists() else "there is no such launch file"
             place = ("launch", index, "file")
-            yield Problem(f"{launch.file!r}: there is no such launch file{near}", place)
+            yield Problem(f"{launch.file!r}: {what}{_near(job, launch.file)}", place)
     for index, bag in enumerate(job.bags):
         if not job.resolve(bag.path).exists():
             message = f"{bag.path!r}: there is no such bag{_near(job, bag.path)}"

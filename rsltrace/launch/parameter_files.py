@@ -9,6 +9,7 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.launch.values import yaml_value
+from rsltrace.model.regular_file import read_regular
 
 _KEY = "ros__parameters"
 
@@ -27,7 +28,7 @@ def parameters_for(path: str, full_name: str | None) -> dict[str, Any]:
 
 def _read(path: str) -> str:
     try:
-        return Path(path).read_text(encoding="utf-8")
+        return read_regular(Path(path)).decode()
     except OSError as error:
         raise JobError(f"cannot read the parameter file: {error.strerror}", where=path) from None
     except UnicodeDecodeError:

@@ -19,6 +19,7 @@ from rsltrace.launch.nodes import Nodes
 from rsltrace.launch.scope import ParameterFile, Scope, joined_namespace
 from rsltrace.launch.xml_file import parse_xml
 from rsltrace.launch.yaml_file import parse_launch_yaml
+from rsltrace.model.regular_file import read_regular
 
 SIZE_MAX = 16 << 20
 _INCLUDES_MAX = 50
@@ -258,7 +259,7 @@ class ActionReader(Evaluation):
 def _parse(path: Path, place: Place | None) -> Element:
     name = os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
     try:
-        data = path.read_bytes()
+        data = read_regular(path, SIZE_MAX + 1)
     except FileNotFoundError:
         raise _at(place, path, f"there is no launch file {name}") from None
     except OSError as error:

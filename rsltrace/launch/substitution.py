@@ -12,6 +12,7 @@ from rsltrace.job.reading.substitute import package_prefix
 from rsltrace.launch.expression import evaluate
 from rsltrace.launch.scope import Scope
 from rsltrace.launch.template import Call, Template, parse_template
+from rsltrace.model.regular_file import read_regular
 
 _TRUE, _FALSE = ("true", "1"), ("false", "0")
 
@@ -162,4 +163,4 @@ def _find_executable(name: str) -> str:
 
 
 def _file_content(path: str) -> str:
-    return Path(path).read_text(encoding="utf-8")
+    return read_regular(Path(path)).decode()

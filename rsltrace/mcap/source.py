@@ -7,13 +7,13 @@ the file's place.
 from __future__ import annotations
 
 import os
-import stat
 import sys
 import threading
 from pathlib import Path
 from typing import Protocol
 
 from rsltrace.errors import RsltraceError, TraceError
+from rsltrace.model.regular_file import not_regular
 
 
 class ByteSource(Protocol):
@@ -56,19 +56,6 @@ def beyond_end(source: ByteSource, offset: int, length: int) -> str:
         f"{source.name}: {length} bytes at offset {offset} reach beyond the end of the file "
         f"({source.size} bytes); the file is damaged"
     )
-
-
-def not_regular(path: Path) -> str:
-    """Return what ``path`` is if it is no file, "" if it is one. Raises OSError if it is nothing.
-
-    To be asked before it is opened: opening a named pipe waits for a writer.
-    """
-    mode = path.stat().st_mode
-    if stat.S_ISREG(mode):
-        return ""
-    if stat.S_ISDIR(mode):
-        return "a folder"
-    return "a named pipe, not a regular file" if stat.S_ISFIFO(mode) else "not a regular file"
 
 
 class FileSource:

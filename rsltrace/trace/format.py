@@ -11,10 +11,13 @@ import struct
 import numpy as np
 
 from rsltrace.mcap.layout import MESSAGE_HEADER_DTYPE
+from rsltrace.mcap.records import Header
 from rsltrace.model.event import SEGMENT_EVENTS
 
 FORMAT_VERSION = 1
 PROFILE = "ros2"
+LIBRARY = "rsltrace"
+"""What the header names as the writer, before the version."""
 
 TOPIC_EVENTS = "/rsltrace/events"
 TOPIC_OUTPUTS = "/rsltrace/outputs"
@@ -171,3 +174,8 @@ SEGMENT_DTYPE = np.dtype(
 """One row per segment of the attachment ``rsltrace/segments``. ``first_output`` counts outputs from
 the start of the run; ``chain_hash`` is that of the segment's last event; offsets and lengths are
 those of the Chunk records in the file (0 and 0: no outputs in this segment)."""
+
+
+def begins_a_trace(header: Header) -> bool:
+    """Whether a file with nothing whole after this header is a trace: its run was killed then."""
+    return header.profile == PROFILE and header.library.split(" ")[0] == LIBRARY

@@ -13,13 +13,19 @@ from collections.abc import Mapping
 import numpy as np
 from mcap.opcode import Opcode
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.mcap.chunk import read_chunk
 from rsltrace.mcap.records import Damaged, Fields, Span
 from rsltrace.mcap.source import ByteSource
 from rsltrace.mcap.summary import Summary
 from rsltrace.mcap.walk import length_by_fields, read_body, whole_records
-from rsltrace.trace.format import METADATA_FORMAT, SEGMENT_DTYPE, TOPIC_EVENTS, TOPIC_OUTPUTS
+from rsltrace.trace.format import (
+    METADATA_FORMAT,
+    SEGMENT_DTYPE,
+    TOPIC_EVENTS,
+    TOPIC_OUTPUTS,
+    begins_a_trace,
+)
 from rsltrace.trace.index import ChunkEntry, TraceIndex, check_version, not_a_trace, read_header
 from rsltrace.trace.pieces import messages_in
 from rsltrace.trace.segments import check_numbered, events_in, outputs_in
@@ -46,6 +52,7 @@ class _Scanner:
     def run(self) -> TraceIndex:
         """Walk the file."""
         index, summary = self._index, self._summary
+        number = 0
         try:
             for number, (opcode, span) in enumerate(whole_records(self._source)):
                 if number == 0:  # the header
@@ -63,6 +70,12 @@ class _Scanner:
         except Damaged as error:
             raise self._damaged(error) from error
         if METADATA_FORMAT not in summary.metadata:
+            if number == 0 and begins_a_trace(index.header):
+                raise TraceFormatError(
+                    f"{self._source.name} is a trace of {index.header.library} that was cut behind "
+                    "its header, before anything of the run was in it (its run was killed, or has "
+                    "just begun): nothing can be read of it; record it again"
+                )
             raise not_a_trace(self._source, index)
         index.take(summary)
         if self._rows:

@@ -34,6 +34,7 @@ from rsltrace.trace.format import (
     CHECKSUMS_KEY,
     EVENTS_PER_SEGMENT,
     FORMAT_VERSION,
+    LIBRARY,
     METADATA_ENVIRONMENT,
     METADATA_FORMAT,
     METADATA_RESULT,
@@ -113,7 +114,7 @@ class TraceWriter:
             force=force,
             compression=compression,
             profile=PROFILE,
-            library=f"rsltrace {__version__}",
+            library=f"{LIBRARY} {__version__}",
             progress=lambda: f"{self._events_written} events",
         )
         try:

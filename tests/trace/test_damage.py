@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from trace_maker import Feeder, boundaries, opcodes, write_run
 
+from rsltrace.diff.file_kind import is_trace
 from rsltrace.errors import TraceError, TraceFormatError
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.format import METADATA_RESULT
@@ -114,14 +115,24 @@ def test_cut_at_every_byte_of_the_beginning_and_the_end(
         assert open_and_check(path, data[:cut], feeder) == len(feeder.events)
 
 
-def test_a_file_too_short_to_be_known_says_what_it_is_not(
+def test_a_trace_cut_behind_its_header_is_called_one(
     tmp_path: Path, small: tuple[bytes, Feeder]
 ) -> None:
+    """A run may be killed between its first two records; a disk may leave zeros there."""
     data, _ = small
     path = tmp_path / "cut.mcap"
-    path.write_bytes(data[: boundaries(data)[1]])  # the header alone
-    with pytest.raises(TraceFormatError, match="not a trace of rsltrace"):
-        Trace.open(path)
+    _, header_end, format_end = boundaries(data)[:3]
+    header = data[:header_end]
+    for kept in (*(data[:end] for end in range(header_end, format_end)), header + bytes(5000)):
+        path.write_bytes(kept)
+        assert is_trace(path)
+        with pytest.raises(TraceFormatError, match=r"a trace of rsltrace .* cut behind its header"):
+            Trace.open(path)
+    for other in (header.replace(b"rsltrace 0", b"rsltracer0"), header + data[format_end:-100]):
+        path.write_bytes(other)
+        assert not is_trace(path)
+        with pytest.raises(TraceFormatError, match="not a trace of rsltrace"):
+            Trace.open(path)
 
 
 def test_zeros_where_a_crash_came_before_the_data_end_the_trace(

@@ -18,6 +18,7 @@ from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec, check_serie
 from rsltrace.job.reading.yaml_source import Mark, YamlSource
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_measured
+from rsltrace.model.regular_file import read_regular
 
 _MEASURED = (
     "MEASURED takes the delay from how long the callback ran on the wall clock, which is different "
@@ -161,7 +162,7 @@ def _rows(
 
 def _text(path: Path, name: str) -> str:
     try:
-        data = path.read_bytes()
+        data = read_regular(path)
     except OSError as error:
         raise JobError(f"cannot be read: {error.strerror or error}", where=name) from None
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):

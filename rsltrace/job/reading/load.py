@@ -20,6 +20,7 @@ from rsltrace.job.reading.tree import place_at, plain
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, YamlSource, parse_yaml
 from rsltrace.job.values.checks import FROM_FILE
 from rsltrace.job.values.problem import Problem, format_loc, unknown_key
+from rsltrace.model.regular_file import read_regular
 
 Overrides = Sequence["str | tuple[str, str]"]
 
@@ -115,8 +116,7 @@ def _is_job(file: Path) -> bool:
 def _read(path: Path) -> str:
     name = str(path)
     try:
-        with path.open("rb") as file:
-            data = file.read(SIZE_MAX + 1)
+        data = read_regular(path, SIZE_MAX + 1)
     except FileNotFoundError:
         raise JobError(f"there is no such job file{_beside(path)}", where=name) from None
     except IsADirectoryError:

@@ -17,6 +17,7 @@ from rsltrace.job import Job, NodeSpec, locate, policy_of, showing_line
 from rsltrace.job.start_order import entry_meant
 from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
+from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.executables import Mains
 from rsltrace.run.plans.target import load_target
 
@@ -180,7 +181,11 @@ def _arguments_for_all(job: Job) -> list[str]:
     words = list(job.ros_arguments)
     for index, word in enumerate(words[:-1]):
         if word == "--params-file":
-            words[index + 1] = str(job.resolve(words[index + 1]))
+            path = job.resolve(words[index + 1])
+            words[index + 1] = str(path)
+            if path.exists() and (kind := not_regular(path)):  # rcl would wait for its writer
+                where = locate(job, ("ros_arguments",))
+                raise JobError(f"the parameter file {path} is {kind}", where=where)
     if words:
         try:
             RosArguments(["--ros-args", *words])

@@ -16,6 +16,7 @@ from rsltrace.doors.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError
 from rsltrace.guard.virtual.set_order import code_of_script
 from rsltrace.middleware.events.failure import text_of
+from rsltrace.model.regular_file import read_regular
 from rsltrace.run.process import run_as_main
 
 
@@ -53,7 +54,7 @@ def script_program(path: Path, *, what: str = "", where: str) -> MainProgram:
     """
     what = what or str(path)
     try:
-        code = code_of_script(path.read_bytes(), str(path))
+        code = code_of_script(read_regular(path), str(path))
     except OSError as error:
         raise JobError(f"{what} cannot be read: {error.strerror}", where=where) from None
     except (SyntaxError, ValueError) as error:

@@ -292,8 +292,8 @@ def _files(rng: Random, case: Case, corpus: Corpus) -> None:
     folder = case.folder
     os.mkfifo(folder / "pipe")
     (folder / "dir.yaml").mkdir()
-    (folder / "circle.yaml").write_text("extends: circle2.yaml\n")
-    (folder / "circle2.yaml").write_text("extends: circle.yaml\n")
+    (folder / "circle.yaml").write_text("base: circle2.yaml\n")
+    (folder / "circle2.yaml").write_text("base: circle.yaml\n")
     (folder / "link.yaml").symlink_to("link.yaml")
     (folder / "sparse.yaml").write_bytes(b"nodes: []\n")
     os.truncate(folder / "sparse.yaml", 300 << 20)
@@ -303,12 +303,12 @@ def _files(rng: Random, case: Case, corpus: Corpus) -> None:
         "nowhere.yaml /proc/self/environ . /etc/shadow ~ *.yaml job.yaml".split()
     )
     key = rng.choice(
-        ("extends", "include", "params", "delay", "launch", "bags", "main", "self", "ros", "policy")
+        ("base", "include", "params", "delay", "launch", "bags", "main", "self", "ros", "policy")
     )
     job: dict[str, Any] = copy.deepcopy(GOOD)
     case.names = (name,)
-    if key == "extends":
-        job["extends"] = name
+    if key == "base":
+        job["base"] = name
     elif key == "include":
         job["include"] = [name]
     elif key == "params":
@@ -316,7 +316,11 @@ def _files(rng: Random, case: Case, corpus: Corpus) -> None:
     elif key == "ros":
         job["ros_arguments"] = ["--params-file", name]
     elif key == "delay":
-        job["delay"] = {"topics": {"/ticks": {"file": name}}}
+        job["delay"] = {
+            "topics": {
+                "/ticks": rng.choice(({"samples": {"file": name}}, {"series": {"file": name}}))
+            }
+        }
     elif key == "launch":
         job["launch"] = [name]
     elif key == "bags":
