@@ -134,7 +134,7 @@ def record(
     status = result.exit_code
     reopen_standard_streams()
     try:
-        _report(result, path, told, as_json=as_json)
+        _report(result, told, as_json=as_json)
         if bag is not None:
             count = export_bag(result.path or path, bag, force=force)
             tell(f"wrote {bag}: {count} messages")
@@ -185,7 +185,7 @@ def _note(text: str) -> None:
     tell(f"rsltrace: note: {text}")
 
 
-def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) -> None:
+def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
     error = result.error
     for note in result.notes:
         if note not in told:  # when the run began
@@ -208,12 +208,12 @@ def _report(result: RunResult, path: Path, told: list[str], *, as_json: bool) ->
                     "stop_reason": result.stop_reason,
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
-                    "notes": list(result.notes),
+                    "notes": [*result.notes, *([result.kept] if result.kept else [])],
                 }
             )
         )
         return
-    kept = f" ({path} is as it was)" if result.path != path else ""
+    kept = result.kept and f" ({result.kept})"
     tell(f"wrote {result.path}{kept}: {result.stop_reason}")
     say(f"digest {result.digest}  events {result.events}  sim {result.sim_seconds}")
 

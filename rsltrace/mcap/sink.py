@@ -59,7 +59,7 @@ class Sink:
         self._process = os.getpid()
         self._written_ns = -1
         self._touched = False
-        replaced = _to_be_replaced(path) if force else None
+        replaced = self._replaced = _to_be_replaced(path) if force else None
         flags = _OPEN | os.O_CREAT
         if replaced is None:
             flags |= os.O_EXCL
@@ -85,6 +85,16 @@ class Sink:
     def closed(self) -> bool:
         """Whether the file was closed."""
         return self._descriptor.number < 0
+
+    @property
+    def kept(self) -> str:
+        """What to say of the file that was to be replaced, as long as it is not; else ""."""
+        if self._replaced is None or self.place == self.path:
+            return ""
+        with suppress(OSError):
+            if _version(os.stat(self._final)) == _version(self._replaced):
+                return f"{self.path} is as it was"
+        return f"{self.path} was changed or deleted while the run went on, but not by rsltrace"
 
     def write(self, *parts: bytes, crc: int | None = None) -> None:
         """Append ``parts``, which need not be joined before: they may be large.
@@ -179,10 +189,10 @@ class Sink:
         return (at, crc) == (self.offset, self.crc)
 
     def _spoilt(self, what: str) -> OutputError:
-        kept = f"; {self.path} is as it was" if self.place != self.path else ""
         return OutputError(
             f"the trace {self.place} was changed while the run went on: {what}; look for what "
-            f"does so in the nodes or beside them, or choose another place with -o{kept}"
+            "does so in the nodes or beside them, or choose another place with -o"
+            f"{self.kept and f'; {self.kept}'}"
         )
 
     def _lock(self) -> None:
@@ -195,6 +205,11 @@ class Sink:
                 return
         self._descriptor.close()  # renamed by who had the lock before us, or deleted
         raise _busy(self.place)
+
+
+def _version(status: os.stat_result) -> tuple[int, ...]:
+    """Return what tells a file from another one, or from itself with other bytes."""
+    return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 def _locked(fd: int) -> bool:

@@ -78,6 +78,11 @@ class McapWriter:
         return self._sink.place
 
     @property
+    def kept(self) -> str:
+        """What to say of the file that it should have replaced and has not; else ""."""
+        return self._sink.kept
+
+    @property
     def bytes_written(self) -> int:
         """Size of the file so far."""
         return self._sink.offset
@@ -248,10 +253,9 @@ class McapWriter:
         code = errno.errorcode.get(error.errno or 0, "unknown")
         reason = os.strerror(error.errno) if error.errno else str(error)
         hint = _HINTS.get(error.errno or 0, "check the disk, or choose another place with -o")
-        path, place = self._sink.path, self._sink.place
-        kept = f"; {path} is as it was" if place != path else ""
+        kept = self.kept and f"; {self.kept}"
         self._failure = OutputError(
-            f"cannot go on writing the trace {place}: {reason} ({code}) after "
+            f"cannot go on writing the trace {self.place}: {reason} ({code}) after "
             f"{self._sink.offset} bytes, {self._progress()}; what was written is readable up to "
             f"its last whole segment{kept}; {hint}"
         )

@@ -91,6 +91,8 @@ class RunResult:
     how mains ended."""
     guarded: tuple[GuardCount, ...] = ()
     """How often the guard met each call, and what was done about it."""
+    kept: str = field(default="", compare=False)
+    """What to say of a trace that should have been replaced and was not."""
 
     @property
     def sim_seconds(self) -> str:
@@ -446,6 +448,7 @@ class Session:
             error=error,
             notes=(*self._notes, *outcome.notes, *unused),
             guarded=self._guarded.counts,
+            kept="" if self._writer is None else self._writer.kept,
         )
 
     def _order_of_starts(self) -> dict[str, str]:

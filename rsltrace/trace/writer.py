@@ -146,6 +146,11 @@ class TraceWriter:
         return self._stream.place
 
     @property
+    def kept(self) -> str:
+        """What to say of the trace that it should have replaced and has not; else ""."""
+        return self._stream.kept
+
+    @property
     def event_count(self) -> int:
         """How many events were added."""
         return self._events_written + len(self._rests)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -192,6 +193,24 @@ def test_what_was_given_up_is_beside_what_was_there(path: Path) -> None:
     assert sink.place == unfinished(path)
     assert sink.place.read_bytes() == MAGIC + b"firstmore"
     assert path.read_bytes() == MAGIC + b"old"
+
+
+@pytest.mark.parametrize("how", ["deleted", "cut", "replaced", "written over"])
+def test_what_was_there_is_not_said_to_be_as_it_was_if_it_is_not(path: Path, how: str) -> None:
+    path.write_bytes(MAGIC + b"old")
+    sink = begun(path, force=True)
+    assert sink.kept == f"{path} is as it was"
+    if how in ("deleted", "replaced"):
+        path.unlink()
+    if how == "cut":
+        os.truncate(path, 3)
+    elif how != "deleted":
+        path.write_bytes(MAGIC + b"new")
+    said = f"{path} was changed or deleted while the run went on, but not by rsltrace"
+    assert sink.kept == said
+    os.truncate(sink.place, 2)
+    with pytest.raises(OutputError, match=re.escape(said)):
+        sink.write(b"more")
 
 
 def test_a_link_leads_to_what_is_replaced(path: Path) -> None:
