@@ -21,6 +21,7 @@ from rsltrace.terminal import say, tell
 )
 @click.option("--spawn", is_flag=True, help="Open it in Rerun's viewer (default with a display).")
 @click.option("--web", is_flag=True, help="Open it in a browser; served to this machine only.")
+@click.option("--by-event", is_flag=True, help="Begin on the timeline of events, not of time.")
 @click.option("--force", is_flag=True, help="Replace the output file if it exists.")
 @click.option("-q", "--quiet", is_flag=True, help="Do not say what was written.")
 def rerun(
@@ -29,6 +30,7 @@ def rerun(
     output: Path | None,
     spawn: bool,
     web: bool,
+    by_event: bool,
     force: bool,
     quiet: bool,
 ) -> None:
@@ -47,12 +49,14 @@ def rerun(
 
     sdk.require()
     import rsltrace_viewer.rerun_export.show as show
+    from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
     from rsltrace_viewer.rerun_export.export import export
 
+    timeline = EVENT if by_event else SIM_TIME
     how = show.choose(spawn=spawn, web=web, output=output)
     traces = [trace] if other is None else [trace, other]
     if output is not None:
-        done = export(traces, output, force=force)
+        done = export(traces, output, force=force, timeline=timeline)
         _tell_what_is_left_out(done.left_out)
         if not quiet:
             say(
@@ -63,7 +67,7 @@ def rerun(
             show.open_viewer(output, how)
     elif how is not None:
         with show.temporary_recording() as target:
-            _tell_what_is_left_out(export(traces, target).left_out)
+            _tell_what_is_left_out(export(traces, target, timeline=timeline).left_out)
             show.open_viewer(target, how)
 
 

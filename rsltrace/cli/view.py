@@ -22,6 +22,7 @@ from rsltrace.terminal import tell
 if TYPE_CHECKING:
     from rsltrace_viewer.session import Session
     from rsltrace_viewer.terminal.app import ViewerApp
+    from rsltrace_viewer.terminal.rerun_follower import RerunFollower
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
@@ -43,6 +44,7 @@ _PORT = 8321
     help="With --live: the folder of the job file (default: that of the trace, or this one).",
 )
 @click.option("--trust", is_flag=True, help="With --live: run the code that TRACE names unasked.")
+@click.option("--rerun", is_flag=True, help="Open Rerun's viewer, too: it follows the selection.")
 @click.option(
     "--export",
     type=click.Path(path_type=Path, dir_okay=False),
@@ -61,6 +63,7 @@ def view(
     live: bool,
     job_folder: Path | None,
     trust: bool,
+    rerun: bool,
     export: Path | None,
     size: str,
     keys: str,
@@ -84,6 +87,8 @@ def view(
         raise click.UsageError("--live works with one trace, whole or cut, and without --follow")
     if not live and (trust or job_folder is not None):
         raise click.UsageError("--trust and --job-folder are for --live")
+    if rerun:
+        _check_rerun(follow=follow, exporting=export is not None)
     if serve:
         _serve(port)
         return
@@ -97,6 +102,7 @@ def view(
             light=light,
             follow=follow,
             filter_text=_checked_filter(session, filter_text),
+            rerun=_follower(stack, chosen) if rerun else None,
         )
         if export is not None:
             _export(app, export, _parse_size(size), keys.split())
@@ -131,6 +137,26 @@ def _opened(
     debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=trust))
     shown = LiveSession(run)
     return shown, partial(LiveApp, shown, Execution(debugged, run))
+
+
+def _check_rerun(*, follow: bool, exporting: bool) -> None:
+    """Refuse what no viewer of Rerun's can follow, before anything is opened."""
+    if follow or exporting:
+        raise click.UsageError(
+            "--rerun shows whole traces beside the terminal: not with --follow or --export"
+        )
+    from rsltrace_viewer.rerun_export import sdk, show
+
+    sdk.require_control()
+    show.check_display("leave --rerun out, or set DISPLAY")
+
+
+def _follower(stack: ExitStack, traces: tuple[Path, ...]) -> RerunFollower:
+    from rsltrace_viewer.terminal.rerun_follower import RerunFollower
+
+    follower = RerunFollower(traces)
+    stack.callback(follower.close)
+    return follower
 
 
 def _check_installed(package: str) -> None:

@@ -38,7 +38,7 @@ _QUESTIONS = {
 
 
 class LiveApp(ViewerApp):
-    """One run, executed again as one looks at it. ``selected`` is told of each event."""
+    """One run, executed again as one looks at it."""
 
     live = True
     session: LiveSession
@@ -62,18 +62,10 @@ class LiveApp(ViewerApp):
         Binding(key.keys, key.action, key.help, show=False, priority=key.first) for key in LIVE_KEYS
     ]
 
-    def __init__(
-        self,
-        session: LiveSession,
-        execution: Execution,
-        *,
-        selected: Callable[[int], object] | None = None,
-        **options: Any,
-    ) -> None:
+    def __init__(self, session: LiveSession, execution: Execution, **options: Any) -> None:
         """Show ``session``; ``options`` are those of ``ViewerApp``."""
         super().__init__(session, **options)
         self._execution = execution
-        self._selected = selected
         self._hit: int | None = None
         self._breakpoints: Sequence[Breakpoint] = ()
 
@@ -125,12 +117,6 @@ class LiveApp(ViewerApp):
             self._say("diverged")
         self.inspector.show(session.lines(), top=False)
         self.source.show(executed.source, light=self.theme == "textual-light")
-        if self._selected is not None:
-            try:
-                self._selected(executed.index)
-            except RsltraceError as error:
-                self._selected = None
-                self.notify(str(error), severity="error")
 
     def _drive(
         self,

@@ -14,7 +14,7 @@ from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.columns import clock_for
+from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for
 from rsltrace_viewer.rerun_export.divergence import Marks, divergence_chunks, marks_of
 from rsltrace_viewer.rerun_export.frames import joining_chunks
 from rsltrace_viewer.rerun_export.layout import blueprint
@@ -36,12 +36,15 @@ class Exported:
     left_out: tuple[str, ...]
 
 
-def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Exported:
+def export(
+    traces: Sequence[Path], output: Path, *, force: bool = False, timeline: str = SIM_TIME
+) -> Exported:
     """Write one or two traces to the Rerun recording ``output``, with a layout made for them.
 
-    Two traces are compared, and where they diverge is explained and marked. The recording appears
-    when it is complete, or not at all: then what was there before stays. Raises TraceError for
-    damaged traces, and OutputError if ``output`` exists (without ``force``) or cannot be written.
+    It opens on ``timeline``. Two traces are compared, and where they diverge is explained and
+    marked. The recording appears when it is complete, or not at all: then what was there before
+    stays. Raises TraceError for damaged traces, and OutputError if ``output`` exists (without
+    ``force``) or cannot be written.
     """
     assert len(traces) in (1, 2)
     _check_output(output, traces, force=force)
@@ -61,7 +64,7 @@ def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Expo
         except RuntimeError as error:
             raise OutputError(f"{output} cannot be written: {error}") from error
         try:
-            left_out = _send(opened, recording, diff)
+            left_out = _send(opened, recording, diff, timeline)
             recording.flush()
             recording.disconnect()  # this writes the index at the end of the file
             size = work.stat().st_size
@@ -82,7 +85,9 @@ def export(traces: Sequence[Path], output: Path, *, force: bool = False) -> Expo
         )
 
 
-def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None) -> list[str]:
+def _send(
+    opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | None, timeline: str
+) -> list[str]:
     """Send it all; return what is left out."""
     clock = clock_for([trace.start_ns for trace in opened])
     labels = ("",) if len(opened) == 1 else ("a", "b")
@@ -100,7 +105,8 @@ def _send(opened: Sequence[Trace], recording: rr.RecordingStream, diff: Diff | N
         marks = marks_of(diff)
         start_ns = min(trace.start_ns for trace in opened)
         recording.send_chunks(divergence_chunks(diff, start_ns, clock))
-    recording.send_blueprint(blueprint(shown, marks), make_active=True, make_default=True)
+    layout = blueprint(shown, marks, timeline)
+    recording.send_blueprint(layout, make_active=True, make_default=True)
     return [
         f"{trace.name}: no messages on {topic}: {why}"
         for trace, run in zip(opened, shown, strict=True)

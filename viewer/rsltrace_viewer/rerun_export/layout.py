@@ -38,15 +38,18 @@ _TABLE = ("node", "callback", "kind", "outputs", "cause", "flags", "input_hash",
 Part: TypeAlias = Container | View
 
 
-def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Blueprint:
-    """Return the layout for one run, or for two with what was found to differ."""
+def blueprint(
+    shown: Sequence[Shown], marks: Marks | None = None, timeline: str = SIM_TIME
+) -> rrb.Blueprint:
+    """Return the layout for one run, or for two with what was found to differ; it opens on
+    ``timeline``."""
     world = _world(shown)
     plots = _plots(shown, marks)
     above: list[Part] = []
     if marks is not None:
         above.append(rrb.TextDocumentView(origin=marks.document, name="What differs"))
     above += [part for part in (world, plots) if part is not None]
-    below = rrb.Tabs(*_below(shown, marks), name="Run")
+    below = rrb.Tabs(*_below(shown, marks, timeline), name="Run")
     if not above:
         root: Part = below
     else:
@@ -55,17 +58,17 @@ def blueprint(shown: Sequence[Shown], marks: Marks | None = None) -> rrb.Bluepri
         root,
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
-        _time_panel(shown, marks),
+        _time_panel(shown, marks, timeline),
         auto_views=False,
         auto_layout=False,
     )
 
 
-def _time_panel(shown: Sequence[Shown], marks: Marks | None) -> rrb.TimePanel:
+def _time_panel(shown: Sequence[Shown], marks: Marks | None, timeline: str) -> rrb.TimePanel:
     """Of two runs, the viewer opens on the divergence and plays what is around it, slowly enough
     to be watched, over and over."""
-    if marks is None or marks.stamp_ns is None:
-        return rrb.TimePanel(state="collapsed", timeline=SIM_TIME)
+    if marks is None or marks.stamp_ns is None or timeline != SIM_TIME:
+        return rrb.TimePanel(state="collapsed", timeline=timeline)
     around_ns = _in_sight_ns(shown)
     start_ns = max(marks.stamp_ns - around_ns, 0)
     return rrb.TimePanel(
@@ -186,7 +189,7 @@ def _rank(topic: str, names: str) -> tuple[bool, bool, int]:
     )
 
 
-def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
+def _below(shown: Sequence[Shown], marks: Marks | None, timeline: str) -> list[Part]:
     lanes = list(marks.lanes) if marks is not None else []
     logs: list[str] = []
     rates: list[str] = []
@@ -199,6 +202,8 @@ def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
         _lanes(lanes, "Callbacks by time", _in_sight_ns(shown)),
         _lanes(lanes, "Callbacks by event", _EVENTS_IN_SIGHT // 2),
     ]
+    if timeline == EVENT:
+        parts.reverse()  # the first is in front, and the other one empty
     if any(run.log_records for run in shown):
         parts.append(
             rrb.TextLogView(

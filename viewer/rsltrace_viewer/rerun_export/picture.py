@@ -9,26 +9,19 @@ Rerun's headless viewer needs a Vulkan driver; Mesa's software rasterizer (Debia
 from __future__ import annotations
 
 import os
-import socket
-import subprocess
 import sys
 import time
 from pathlib import Path
 
-import numpy as np
-
-from rsltrace.errors import SetupError
 from rsltrace_viewer.rerun_export.columns import EVENT
-from rsltrace_viewer.rerun_export.sdk import require, viewer
+from rsltrace_viewer.rerun_export.control import LOADED_S_MAX, controlled
 
 _SOFTWARE_DRIVER = Path("/usr/share/vulkan/icd.d/lvp_icd.x86_64.json")
-LOOPBACK = "127.0.0.1"
 WINDOW = "1600x1000"
 _SETTLE_S = 1.0
 _GREETING_S = 6.0
 """How long the viewer shows that it runs headless."""
 _COLOURS = 256
-_LOADED_S_MAX = 20.0
 
 
 def software_driver() -> Path | None:
@@ -43,69 +36,22 @@ def take(
 
     Returns what views report as wrong, which is nothing for a good recording.
     """
-    require()
-    from rerun.experimental import ViewerClient
-
-    if not hasattr(ViewerClient, "open"):
-        raise SetupError("pictures need Rerun 0.41, and that needs Python 3.11")
-    port = _free_port()
-    environment = dict(os.environ, RERUN_APP_ONLY="true")
     driver = software_driver()
     if driver is not None:
-        environment.setdefault("VK_ICD_FILENAMES", str(driver))
-    # Started here and not by ViewerClient.spawn, which would listen on every network interface.
-    process = subprocess.Popen(
-        [
-            *(str(viewer()), "--headless", "--hide-welcome-screen"),
-            *("--bind", LOOPBACK, "--port", str(port), "--window-size", WINDOW),
-        ],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    try:
-        _wait_for(port, process)
-        client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-        client.open(str(recording.absolute()))
-        until = time.monotonic() + _LOADED_S_MAX
-        while client.get_state().loading and time.monotonic() < until:
+        os.environ.setdefault("VK_ICD_FILENAMES", str(driver))
+    with controlled("--headless", "--window-size", WINDOW) as viewer:
+        viewer.open(recording)
+        until = time.monotonic() + LOADED_S_MAX
+        while viewer.client.get_state().loading and time.monotonic() < until:
             time.sleep(0.1)
-        if timeline == EVENT:
-            client.set_time(timeline, sequence=int(value), play_state="paused")
-        else:
-            stamp = np.timedelta64(int(value * 1e9), "ns")
-            client.set_time(timeline, duration=stamp, play_state="paused")
+        viewer.seek(timeline, int(value if timeline == EVENT else value * 1e9))
         time.sleep(settle_s)
-        client.save_screenshot(str(picture.absolute()))
+        viewer.client.save_screenshot(str(picture.absolute()))
         return [
             f"{view.name}: {report.summary} {report.details or ''}".rstrip()
-            for view in client.get_state().views
+            for view in viewer.client.get_state().views
             for report in view.reports
         ]
-    finally:
-        process.terminate()
-        process.wait()
-
-
-def _wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
-    """Wait until the viewer listens. Raises SetupError if it ends or does not come up."""
-    until = time.monotonic() + _LOADED_S_MAX
-    while time.monotonic() < until and process.poll() is None:
-        try:
-            socket.create_connection((LOOPBACK, port), timeout=1).close()
-            return
-        except OSError:
-            time.sleep(0.05)
-    raise SetupError(
-        "Rerun's headless viewer does not start; without a graphics driver it needs a software "
-        "one (Debian: apt install mesa-vulkan-drivers)"
-    )
-
-
-def _free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
 
 
 def shrink(picture: Path) -> None:

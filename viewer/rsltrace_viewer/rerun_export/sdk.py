@@ -18,14 +18,14 @@ VERSION = "0.41" if sys.version_info >= (3, 11) else "0.39"
 """The last one for Python 3.10 is 0.39; what is used here is the same in both."""
 INSTALL = "pip install 'rsltrace[rerun]'"
 APPLICATION_ID = "rsltrace"
+LOOPBACK = "127.0.0.1"
+"""What a viewer listens at: whoever is on the network gets to see nothing of a trace."""
 
 
-def require() -> None:
-    """Raise SetupError unless Rerun's SDK is installed in the version this was written for.
+def installed() -> str:
+    """Return the version of Rerun's SDK, without loading it.
 
-    Also turns off Rerun's usage statistics, unless ``RERUN_ANALYTICS_ENABLED`` says otherwise:
-    looking at a trace should not open a connection to anybody. And its log, unless ``RUST_LOG``
-    says otherwise: names from the trace would reach the terminal as they are.
+    :raises SetupError: it is not the one that this was written for, or not there.
     """
     try:
         found = importlib.metadata.version("rerun-sdk")
@@ -36,6 +36,25 @@ def require() -> None:
             f"rerun-sdk {found} is installed, this rsltrace works with {VERSION}; "
             f"install that with: {INSTALL}"
         )
+    return found
+
+
+def require_control() -> None:
+    """Raise SetupError unless Rerun's viewer can be told what to show."""
+    if installed().startswith("0.39."):
+        raise SetupError(
+            "Rerun's viewer can be told what to show from Rerun 0.41 on, which needs Python 3.11"
+        )
+
+
+def require() -> None:
+    """Raise SetupError unless Rerun's SDK is installed in the version this was written for.
+
+    Also turns off Rerun's usage statistics, unless ``RERUN_ANALYTICS_ENABLED`` says otherwise:
+    looking at a trace should not open a connection to anybody. And its log, unless ``RUST_LOG``
+    says otherwise: names from the trace would reach the terminal as they are.
+    """
+    found = installed()
     os.environ.setdefault("RERUN_ANALYTICS_ENABLED", "0")
     os.environ.setdefault("RUST_LOG", "off")
     try:

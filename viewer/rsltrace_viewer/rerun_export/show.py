@@ -12,10 +12,7 @@ from enum import Enum
 from pathlib import Path
 
 from rsltrace.errors import SetupError
-from rsltrace_viewer.rerun_export.sdk import viewer
-
-LOOPBACK = "127.0.0.1"
-"""What a web viewer is served to: whoever is on the network gets to see nothing of a trace."""
+from rsltrace_viewer.rerun_export.sdk import LOOPBACK, viewer
 
 
 class How(Enum):
@@ -33,13 +30,18 @@ def choose(*, spawn: bool, web: bool, output: Path | None) -> How | None:
     if web:
         return How.BROWSER
     if spawn or output is None:
-        if not has_display(os.environ, sys.platform):
-            raise SetupError(
-                "there is no display here to open Rerun's viewer on; write a file with "
-                "-o run.rrd and open it with `rerun run.rrd` where there is one, or use --web"
-            )
+        check_display(
+            "write a file with -o run.rrd and open it with `rerun run.rrd` where there is one, or "
+            "use --web"
+        )
         return How.WINDOW
     return None
+
+
+def check_display(instead: str) -> None:
+    """Raise SetupError, which says what to do ``instead``, if no window can be opened."""
+    if not has_display(os.environ, sys.platform):
+        raise SetupError(f"there is no display here to open Rerun's viewer on; {instead}")
 
 
 def has_display(environ: Mapping[str, str], platform: str) -> bool:

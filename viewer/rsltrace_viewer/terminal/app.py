@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,6 +21,7 @@ from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.follow import Follow
 from rsltrace_viewer.terminal.keys import KEYS, keys_of
 from rsltrace_viewer.terminal.questions import parse_index, question_of
+from rsltrace_viewer.terminal.rerun_follower import RerunFollower
 from rsltrace_viewer.terminal.screens.help import HelpScreen
 from rsltrace_viewer.terminal.stepping import Stepping
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
@@ -45,9 +47,11 @@ class ViewerApp(Stepping):
         light: bool = False,
         follow: bool = False,
         filter_text: str = "",
+        rerun: RerunFollower | None = None,
     ) -> None:
         """Show ``session``, at place ``start`` (None: where it is)."""
         super().__init__(session, start=start, light=light)
+        self._rerun = rerun
         self._first_filter = filter_text
         self._follow: Follow | None = None
         self._follow_at_once = follow
@@ -58,6 +62,20 @@ class ViewerApp(Stepping):
             self._filter(self._first_filter)
         if self._follow_at_once:
             self.action_follow()
+        if self._rerun is not None:
+            self._rerun.start(partial(self.call_from_thread, self._rerun_said))
+            self.rested()
+
+    def rested(self) -> None:
+        """Have Rerun follow."""
+        here = self.session.current()
+        if self._rerun is not None and here is not None:
+            self._rerun.select(here[1], here[0].stamp(here[1]))
+
+    def _rerun_said(self, text: str, is_over: bool) -> None:
+        if is_over:
+            self.notify(text, severity="error")
+        self._say(text)
 
     # Asking.
 

@@ -288,6 +288,10 @@ class Shell(App[None]):
         if self.screen_stack:
             self._show_inspector()
             self.busy = False
+            self.rested()
+
+    def rested(self) -> None:
+        """Tell others where one has stopped for a moment."""
 
     def on_resize(self, event: events.Resize) -> None:
         """Use the new size, which the app and its parts will have a moment later."""
