@@ -23,7 +23,7 @@ from rsltrace.errors import RsltraceError, SetupError
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
 from rsltrace_viewer.rerun_export.control import Viewer, controlled
 
-_STDIN = 0
+_STDIN, _STDOUT = 0, 1
 _LOOK_S = 0.2
 _PIECE_BYTES = 1 << 16
 
@@ -126,7 +126,7 @@ def _move(viewer: Viewer, selection: Selection, first: str) -> None:
 
 def _say(**what: str) -> None:
     try:
-        print(json.dumps(what), flush=True)
+        os.write(_STDOUT, json.dumps(what).encode() + b"\n")
     except BrokenPipeError:
         raise Gone from None
 
