@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from typing import NoReturn
-
-from rsltrace.guard.pin import pin_recording
 
 
 def main() -> NoReturn:
     """Run the command line and exit."""
+    # Until there is something to close, Ctrl-C ends Python where it is, without a traceback.
+    is_pythons = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if is_pythons:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from rsltrace.guard.pin import pin_recording
+
     pin_recording(sys.argv[1:])
     from rsltrace.cli.main import main as run_command
 
+    if is_pythons:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
     run_command()
     raise AssertionError("it exits")

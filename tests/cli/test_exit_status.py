@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -49,6 +50,36 @@ def test_the_status_is_that_of_the_command_or_says_that_it_could_not_print(
     done = run(words, CLOSED_PIPE)
     assert done.returncode == (2 if status == 2 else 141), "never 1: that says that runs differ"
     assert "Traceback" not in done.stderr
+
+
+_INTERRUPTED = """
+import importlib.abc, os, signal, sys
+
+class Interrupts(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == {module!r}:
+            os.kill(os.getpid(), signal.SIGINT)
+
+from rsltrace.cli.start import main
+sys.meta_path.insert(0, Interrupts())
+sys.argv = ["rsltrace", "info", {trace!r}]
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "status"),
+    [("rsltrace.guard.pin", -signal.SIGINT), ("click", -signal.SIGINT), ("rsltrace.cli.info", 130)],
+)
+def test_ctrl_c_while_the_command_is_loaded_is_no_traceback(module: str, status: int) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _INTERRUPTED.format(module=module, trace=str(A))],
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr.strip()) == (status, "", "")
 
 
 @pytest.mark.ros

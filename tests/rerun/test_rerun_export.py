@@ -10,7 +10,7 @@ import pytest
 import rerun_gallery as gallery
 import trace_maker
 from mcap.opcode import Opcode
-from mcap.records import Schema
+from mcap.records import Chunk, Schema
 
 from rsltrace.errors import OutputError, TraceError
 from rsltrace.model.event import NO_EVENT, OutputKind
@@ -21,6 +21,7 @@ pytest.importorskip("rerun")
 import pyarrow as pa
 from rerun.chunk import RrdReader
 from rsltrace_viewer.rerun_export.export import export
+from rsltrace_viewer.rerun_export.messages import chunks as chunks_module
 
 STEPS = 30
 
@@ -349,6 +350,24 @@ def test_topics_whose_types_ask_for_everything_are_left_out(
     assert done.left_out
     assert all(why in line for line in done.left_out)
     assert len(Recording(tmp_path / "run.rrd").rows["/events"]) == done.events
+
+
+def test_a_damaged_chunk_is_found_before_the_loader_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a chunk that unpacks to less than it says, it waits for the rest."""
+    trace_maker.write_run(tmp_path / "run.mcap", 300)
+    parts = mcap_parts.take_apart((tmp_path / "run.mcap").read_bytes())
+    chunk = next(part for part in parts if part.opcode == Opcode.CHUNK)
+    record = chunk.record
+    assert isinstance(record, Chunk)
+    record.uncompressed_size += 1000
+    chunk.record = record
+    (tmp_path / "hostile.mcap").write_bytes(mcap_parts.put_together(parts))
+    monkeypatch.setattr(chunks_module, "McapReader", lambda *_, **__: pytest.fail("it is read"))
+    with pytest.raises(TraceError, match=r"hostile\.mcap: the chunk at offset \d+ is damaged"):
+        export([tmp_path / "hostile.mcap"], tmp_path / "run.rrd")
+    assert not (tmp_path / "run.rrd").exists()
 
 
 def fails_as_folder(folder: Path) -> None:

@@ -115,6 +115,8 @@ def attack_with(
         words.append("--no-pin")
     case.user_code = True
     case.names = ("mischief", "job.yaml", recordings.OUTPUT)
+    if "no_descriptors" in done:  # whatever is opened next is named
+        case.names += ("Too many open files",)
     quiet_streams = done & set(_GROUPS["streams"].split())
     case.commands.append(
         Command(

@@ -110,6 +110,8 @@ class MessageRows:
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield all chunks, the tracks last. Raises TraceError if the loader cannot read it."""
+        for _ in self._trace.messages_of(frozenset(self._trace.channels)):
+            pass  # the loader takes chunks as they are, and reads some damaged ones for ever
         not_read = [f"^{re.escape(topic)}$" for topic in (*_OWN, *self.left_out)]
         try:
             reader = McapReader(
