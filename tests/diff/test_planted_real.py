@@ -228,6 +228,15 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert first.a.entity.name == "/sensor"
     assert [str(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
+    assert diff.sentence == (
+        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published another data on "
+        "/reading at 0.1 s (data 1.0 → 1.5)"
+    )
+    assert diff.shown is diff.effect
+    assert diff.effect is not None
+    assert diff.effect.a is not None
+    assert diff.effect.a.entity.name == "Sensor.tick"
+    assert diff.effect.root_sentence == first.root_sentence
 
 
 def test_another_seed(diffed: Callable[..., Diff]) -> None:

@@ -38,7 +38,8 @@ from rsltrace.diff.result.divergence import (
 )
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.fields import FieldDifference
-from rsltrace.diff.result.traces import Diff, EntityCount, Setting, Side
+from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.result.traces import Diff, EntityCount, Side
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind

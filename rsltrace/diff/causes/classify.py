@@ -1,13 +1,14 @@
 """From two differing events to a verdict, and to the sentences that say it.
 
-The rules stand in the order in which they are asked: what is seen first in ``judge`` wins.
+The rules stand in the order in which they are asked: what is seen first in ``_judge`` wins.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
+from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import CLOCK_OF, drawn_for, node_of, phrase, raised
 from rsltrace.diff.causes.lost_messages import GONE
 from rsltrace.diff.causes.output_notes import durations
@@ -22,7 +23,7 @@ from rsltrace.diff.causes.wording import (
 )
 from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
@@ -65,6 +66,9 @@ class Case:
     swapped_with_ns: int | None = None
     """When the bag of b plays what the bag of a plays here, and the other way round."""
 
+    blamed: list[Setting] = field(default_factory=list)
+    """The settings that ``because`` named."""
+
     @property
     def one(self) -> EventView:
         """The event, of whichever run has it."""
@@ -80,18 +84,19 @@ class Case:
             nodes = set()  # whose QoS has changed is not known
         nodes |= {m.topic.rpartition(" of ")[2] for m in self.messages if _is_draw(m)}
         constructing = self.one.kind is EventKind.CONSTRUCT or any(
-            m.kind is OutputKind.ENTITY or m.topic == "/parameter_events" for m in self.messages
+            m.kind is OutputKind.ENTITY or m.topic == PARAMETER_EVENTS for m in self.messages
         )
         settings = self.settings
         if self.one.kind is EventKind.BAG and not drawn:
             settings = [s for s in settings if s.key.partition(".")[0] in _OF_BAGS]
         place = Place(frozenset(nodes - {""}), constructing, inside, drawn)
-        return because_of(self.relevance.of(settings, place))
+        self.blamed[:] = self.relevance.of(settings, place)
+        return because_of(self.blamed)
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """A verdict in words. ``a`` and ``b`` are the events to show."""
+    """A verdict in words. ``a`` and ``b`` are the events to show, ``settings`` what it blames."""
 
     verdict: Verdict
     root: Root
@@ -99,6 +104,7 @@ class Judgement:
     root_sentence: str
     a: EventView | None
     b: EventView | None
+    settings: tuple[Setting, ...] = ()
 
 
 ROOT_OF = {
@@ -118,6 +124,11 @@ _DRIVEN_DIFFERENTLY = "whoever drove the simulations did not do the same"
 
 def judge(case: Case) -> Judgement:
     """Return the verdict on a place where the runs differ."""
+    judgement = _judge(case)
+    return replace(judgement, settings=tuple(case.blamed))
+
+
+def _judge(case: Case) -> Judgement:
     a, b, one = case.a, case.b, case.one
     if one.kind is EventKind.CONSTRUCT and not (a and b and raised(a) != raised(b)):
         return _construction(case)

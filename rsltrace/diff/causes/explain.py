@@ -6,9 +6,11 @@ import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+from rsltrace.diff.alignment.blocks import EventPair
 from rsltrace.diff.alignment.rows import Run, outputs_of
 from rsltrace.diff.causes.call_differences import call_differences
 from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
+from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.lost_messages import lost_message
 from rsltrace.diff.causes.message_differences import message_differences
@@ -26,7 +28,7 @@ from rsltrace.diff.result.divergence import (
     Reach,
 )
 from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.printable import printable, shortened
@@ -65,6 +67,27 @@ class Explainer:
             judgement = self._following(judgement, found.origin)
         return self._divergence(found, judgement, messages)
 
+    def explain_effect(self, found: FoundDivergence, first: Divergence) -> Divergence:
+        """Return everything about the first effect of a node that was set up otherwise."""
+        effect = self.explain(found)
+        root = self._root_judgement(found.origin.root)
+        return replace(
+            effect,
+            root=ROOT_OF.get(root.verdict, root.root),
+            root_sentence=first.root_sentence,
+            settings=root.settings,
+            reaches=tuple(r for r in effect.reaches if r.topic != PARAMETER_EVENTS),
+            next_step=first.next_step,
+        )
+
+    def is_covered(self, item: EventPair) -> bool:
+        """Whether all that differs in an item is ignored or within tolerance."""
+        a, b = self.view(item.a, of_b=False), self.view(item.b, of_b=True)
+        if a is None or b is None or (a.stamp_ns, a.flags) != (b.stamp_ns, b.flags):
+            return False
+        found = message_differences(self.run_a, self.run_b, a, b, self.options)
+        return bool(found) and all(message.is_covered for message in found)
+
     def ended(self, index: int, judgement: Judgement) -> Divergence:
         """Return a divergence at ``index`` where one run has nothing more to compare."""
         bare = Divergence(
@@ -76,6 +99,7 @@ class Explainer:
             root_sentence=judgement.root_sentence,
             chain=(CauseStep(judgement.a, judgement.b),),
             next_step=self._next_step(judgement),
+            settings=judgement.settings,
         )
         return self._with_context(bare, index, index)
 
@@ -246,6 +270,7 @@ class Explainer:
             state=state_differences(self.run_a, self.run_b, judgement.a, judgement.b),
             reaches=self._reaches(found),
             next_step=self._next_step(judgement),
+            settings=judgement.settings,
         )
         return self._with_context(bare, place_a, place_b)
 

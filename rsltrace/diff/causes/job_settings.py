@@ -17,7 +17,7 @@ from typing import Any
 
 from rsltrace.diff.causes.record_command import is_effective, is_of_file
 from rsltrace.diff.causes.relevance import resolved_job
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.model.nesting import nested_too_deep
 from rsltrace.model.stamp import format_duration
 from rsltrace.trace.reader import Trace

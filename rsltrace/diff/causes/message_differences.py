@@ -7,10 +7,11 @@ from dataclasses import replace
 
 from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow, Run, counts, outputs_of
+from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
 from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER, OutputNotes, parameters_text
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.divergence import MessageDifference
+from rsltrace.diff.result.divergence import ALL_IGNORED, MessageDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.fields import FieldDifference
 from rsltrace.diff.values.fields import diff_messages, preview
@@ -27,7 +28,6 @@ MESSAGES_MAX = 50
 """Differing messages of one event that are decoded; one callback can publish thousands."""
 
 _EXCEPTION_MAX = 200
-_PARAMETER_EVENTS = "/parameter_events"
 _INPUT = -1
 _IN_BOTH, _ONLY_A, _ONLY_B = "both", "only a", "only b"
 _WITH_PAYLOAD = frozenset(
@@ -145,12 +145,12 @@ class _Evidence:
             lines = str(values[0]).strip().splitlines() or [""]
             return replace(base, preview=shortened(printable(lines[-1]), _EXCEPTION_MAX))
         if len(values) == 1:
-            note = parameters_text(values[0]) if topic == _PARAMETER_EVENTS else ""
+            note = parameters_text(values[0]) if topic == PARAMETER_EVENTS else ""
             return replace(base, preview=preview(values[0]), note=note)
         fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
         reason = ""
         if not fields and self._options.ignore:
-            reason = "all fields that differ are ignored"
+            reason = ALL_IGNORED
         elif not fields:
             reason = "its fields are equal, but what the recorder hashed of it is not"
         return replace(base, fields=fields, more_fields=more, reason=reason)

@@ -100,6 +100,11 @@ class Propagation:
         """Return why an item differs, if it does."""
         return self._origins_a.get(item.a) or self._origins_b.get(item.b)
 
+    def found_at(self, item: EventPair, origin: Origin) -> FoundDivergence:
+        """Return an item of the last block as what to put in words."""
+        reached = self.found[origin.root].reached
+        return FoundDivergence(origin, self._first_stamp(item), *self._places(item), reached)
+
     def take(self, block: AlignedBlock, first: EventPair | None = None) -> None:
         """Go through a block. ``first``, if given, is the divergence the search has found: it
         is a root whatever else there is, and comes before everything."""
@@ -384,18 +389,22 @@ class Propagation:
             self._owners.setdefault(owner, origin)
 
     def _different_outputs(self, item: EventPair) -> list[OutputRow]:
-        """Return the outputs that only one run has; for a change, the one of a."""
-        a, b = self._block.rows_a, self._block.rows_b
-        mine = a.outputs(item.a) if item.a >= 0 else []
-        theirs = b.outputs(item.b) if item.b >= 0 else []
-        if a.run.without_zero_delays:
-            mine = [output for output in mine if counts(a.run, output)]
-            theirs = [output for output in theirs if counts(b.run, output)]
-        return different_outputs(mine, theirs)
+        return outputs_of_one(self._block, item)
 
 
 def _failed(trace: Trace) -> bool:
     return trace.complete and trace.result.get("exit_code", "0") != "0"
+
+
+def outputs_of_one(block: AlignedBlock, item: EventPair) -> list[OutputRow]:
+    """Return the outputs of an item that only one run has; for a change, the one of a."""
+    a, b = block.rows_a, block.rows_b
+    mine = a.outputs(item.a) if item.a >= 0 else []
+    theirs = b.outputs(item.b) if item.b >= 0 else []
+    if a.run.without_zero_delays:
+        mine = [output for output in mine if counts(a.run, output)]
+        theirs = [output for output in theirs if counts(b.run, output)]
+    return different_outputs(mine, theirs)
 
 
 def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:

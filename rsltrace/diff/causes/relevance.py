@@ -14,7 +14,7 @@ from functools import cached_property
 from typing import Any
 
 from rsltrace.diff.alignment.rows import Run
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.finding import Source
 from rsltrace.trace.reader import Trace

@@ -6,7 +6,7 @@ None of it is a divergence by itself, and any of it may be why there is one.
 from __future__ import annotations
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.trace.format import METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.reader import Trace
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER
 from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import shortened
 

@@ -64,7 +64,7 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
 def _place(diff: Diff | BagDiff) -> str:
     """Return what an annotation points to: the code that ran where two runs diverge, if it is
     here, or else the file that was compared."""
-    found = diff.divergences[0] if isinstance(diff, Diff) and diff.divergences else None
+    found = diff.shown if isinstance(diff, Diff) else None
     views = () if found is None else (found.b, found.a)
     for code in (view.code for view in views if view is not None):
         name, _, number = code.rpartition(":")

@@ -76,8 +76,8 @@ def _fields(diff: Diff | BagDiff) -> list[str]:
     if isinstance(diff, BagDiff):
         if diff.first is not None:
             found.append((diff.first.topic, diff.first.fields, diff.first.more_fields))
-    elif diff.divergences:
-        for message in diff.divergences[0].messages:
+    elif diff.shown is not None:
+        for message in diff.shown.messages:
             found.append((message_title(message), message.fields, message.more_fields))
     lines = []
     for title, fields, more in found:

@@ -28,9 +28,9 @@ def several_cells(diff: Diff | BagDiff) -> tuple[str, str, str, str, str]:
         index = "" if shown is None else str(shown.index)
         time = format_seconds(diff.first.after_ns)
         return path, diff.verdict.value, index, time, printable(diff.first.topic)
-    if not diff.divergences:
+    found = diff.shown
+    if found is None:
         return path, diff.verdict.value, "", "", ""
-    found = diff.divergences[0]
     event = found.b or found.a
     verdict = f"{diff.verdict.value}{' (within tolerance)' if diff.within_tolerance else ''}"
     if event is None:

@@ -21,7 +21,8 @@ from rsltrace.diff.report.line import (
     line,
     wrapped,
 )
-from rsltrace.diff.result.traces import Diff, Setting, Side
+from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.result.traces import Diff, Side
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import as_sentence
@@ -47,17 +48,18 @@ def trace_report(
     from rsltrace.diff.report.divergence import CONTEXT, divergence_sections
 
     first, *others = diff.divergences
+    shown = diff.shown or first
     sections = [
         before,
-        *divergence_sections(first, width, options),
+        *divergence_sections(shown, width, options),
         _afterwards(diff, width),
         _settings(diff, width),
     ]
     if not options.everything:
         # Whoever asks for a longer context wants to see it.
         height += 2 * max(options.context - CONTEXT, 0)
-        return fitted(head, [*sections, _next(first, len(others), hidden=hidden)], height)
-    lines = fitted(head, [*sections, _next(first, 0)], None)
+        return fitted(head, [*sections, _next(shown, len(others), hidden=hidden)], height)
+    lines = fitted(head, [*sections, _next(shown, 0)], None)
     for number, other in enumerate(others, start=2):
         lines += [
             BLANK,
@@ -73,6 +75,7 @@ def _head(diff: Diff, width: int) -> list[Line]:
     if diff.agreeing < 2:
         agree = "the first event agrees" if diff.agreeing else "no event before agrees"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
+    verdict += "; shown is the first effect" if diff.effect is not None else ""
     sides = [_facts(side) for side in (diff.a, diff.b)]
     good = diff.identical or (diff.agrees_until_cut and not diff.failed)
     lines = head_lines(diff.sentence, sides, verdict, width, good=good)

@@ -6,8 +6,12 @@ from dataclasses import dataclass
 
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import OutputKind
+
+ALL_IGNORED = "all fields that differ are ignored"
+"""The reason of a difference without fields that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,6 +38,13 @@ class MessageDifference:
     preview: str = ""
     reason: str = ""
     note: str = ""
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether all that differs in it is ignored or within tolerance."""
+        if self.fields:  # what nothing covers comes first
+            return self.fields[0].within_tolerance
+        return self.reason == ALL_IGNORED
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,6 +110,7 @@ class Divergence:
     did first: two events, not one. ``root`` and ``root_sentence`` say where it comes from; for most
     verdicts that is the diverging event itself. ``before_a``/``before_b``
     are the last events before it in each run, ``same_node_*`` the last ones in the same node.
+    ``settings`` are those of the settings that differ which can be the cause.
     """
 
     verdict: Verdict
@@ -117,3 +129,4 @@ class Divergence:
     next_step: str = ""
     calls: tuple[CallDifference, ...] = ()
     state: tuple[StateDifference, ...] = ()
+    settings: tuple[Setting, ...] = ()

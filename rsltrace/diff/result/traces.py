@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from rsltrace.diff.result.exit_codes import EXIT_DIVERGED, EXIT_WITHIN_TOLERANCE
+from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Verdict
 
 if TYPE_CHECKING:  # most runs are identical: their diff loads no more than it needs
@@ -30,24 +31,6 @@ class EntityCount:
 
 
 @dataclass(frozen=True, slots=True)
-class Setting:
-    """A difference outside of the events: keys of the job, versions, entities of the graph.
-
-    ``place`` is ``job.yaml:12``, ``job`` (of no line), ``environment: numpy``, ``entity``; ``key``
-    is that of a job as ``--set`` takes it, or empty. ``a``/``b`` are None where a side has nothing
-    there.
-    """
-
-    place: str
-    a: str | None
-    b: str | None
-    key: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.place}: {self.key}" if self.key else self.place
-
-
-@dataclass(frozen=True, slots=True)
 class Side:
     """One of the two files."""
 
@@ -63,10 +46,13 @@ class Side:
 class Diff:
     """The answer. ``exit_code``: 0 identical, 1 not, 3 equal within tolerance.
 
-    ``verdict`` and ``sentence`` are those of the first divergence. ``agreeing`` is how many events
-    are the same before it. ``settings`` lists what differs in job and environment. ``counts`` and
-    ``resync_index`` (indexes in a and b from which on the runs agree again, if they do) cover the
-    events from the divergence to ``aligned_to`` (indexes in a and b; all of both with ``--all``).
+    ``verdict`` is that of the first divergence, ``sentence`` what a person wants to know of it: the
+    settings that are to blame, and what they did. ``effect`` is the first difference that is more
+    than a node set up otherwise (other parameters), if the first divergence is no more than that.
+    ``agreeing`` is how many events are the same before the first divergence. ``settings`` lists
+    what differs in job and environment. ``counts`` and ``resync_index`` (indexes in a and b from
+    which on the runs agree again, if they do) cover the events from the divergence to
+    ``aligned_to`` (indexes in a and b; all of both with ``--all``).
     ``tolerance`` compares all messages of both runs, if tolerances were given and no event is
     missing, extra or at another time; else it is None.
     """
@@ -86,6 +72,13 @@ class Diff:
     tolerance: BagDiff | None = None
     as_far_as_they_go: bool = False
     """Whether it is enough that they agree as far as they go."""
+
+    effect: Divergence | None = None
+
+    @property
+    def shown(self) -> Divergence | None:
+        """What a report shows first: the first effect, or else the first divergence."""
+        return self.effect or (self.divergences[0] if self.divergences else None)
 
     @property
     def identical(self) -> bool:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from fnmatch import fnmatchcase
-from itertools import islice
+from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import (
     AlignedBlock,
@@ -14,7 +15,9 @@ from rsltrace.diff.alignment.blocks import (
 )
 from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entities
 from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.effects import EffectSearch
 from rsltrace.diff.causes.explain import Explainer
+from rsltrace.diff.causes.headline import headline
 from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.causes.propagation import (
     FoundDivergence,
@@ -24,7 +27,8 @@ from rsltrace.diff.causes.propagation import (
 from rsltrace.diff.causes.settings import entity_settings, environment_settings
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import Divergence
-from rsltrace.diff.result.traces import Diff, Setting
+from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.counts import EventCounts
 from rsltrace.diff.traces.ended_runs import failure_text, failures, judge_end, who_ended
@@ -40,6 +44,9 @@ DIVERGENCES_MAX = 10
 
 EVERY_DIVERGENCE_MAX = 1000
 """Told even then; each takes some milliseconds and some lines."""
+
+EFFECT_WITHIN = 100_000
+"""Events after the first divergence among which its first effect is looked for."""
 
 _EVENTS_PER_BLOCK = 4096
 _TELL_THE_END = (Verdict.EXCEPTION, Verdict.ENDED_EARLY, Verdict.RAN_LONGER)
@@ -86,6 +93,9 @@ class _Comparison:
         self._notes = list(interruptions(a, b))
         self._counts = EventCounts()
         self._aligned_to = (start, start)
+        self._effect: Divergence | None = None
+        self._in_vain: str | None = None
+        """Up to where no effect was found, if there was one to look for."""
 
     def run(self) -> Diff:
         """Return the answer."""
@@ -99,6 +109,7 @@ class _Comparison:
             b=side(self._b),
             verdict=first.verdict,
             sentence=self._sentence(first),
+            effect=self._effect,
             agreeing=self._start,
             divergences=tuple(divergences),
             settings=(*self._job, *self._environment, *entity_settings(self._matching)),
@@ -119,7 +130,7 @@ class _Comparison:
 
     def _sentence(self, first: Divergence) -> str:
         if not self._matching.different_jobs:
-            return first.sentence
+            return headline(first, self._effect, in_vain=self._in_vain)
         jobs = [f'"{trace.job["name"]}"' for trace in (self._a, self._b) if trace.job.get("name")]
         which = f" ({jobs[0]}, {jobs[1]})" if len(set(jobs)) == 2 else ""
         return f"these are runs of different jobs{which} without a common node: {first.sentence}"
@@ -145,7 +156,8 @@ class _Comparison:
             self._run_a, self._run_b, self._start, per_block, skip_equal=options.everything
         )
         wanted: list[FoundDivergence] = []
-        for block in islice(blocks, None if options.everything else 1):
+        search = None if watch is not None else EffectSearch(self._covered)
+        for block in blocks:
             self._aligned_to = (block.end_a, block.end_b)
             if isinstance(block, EqualBlock):
                 self._counts.take_equal(block)
@@ -156,7 +168,21 @@ class _Comparison:
             self._counts.take(block)
             new = propagation.found[known:]
             wanted += [f for f in new if watch is None or watch(f.origin.item, block)]
-        return self._divergences(propagation, wanted)
+            if search is not None:
+                search.take(block, propagation)
+            far = block.end_a - self._start >= EFFECT_WITHIN
+            if not options.everything and (search is None or not search.going_on or far):
+                break
+            blocks.skip_equal = True
+        return self._divergences(propagation, wanted, search)
+
+    @cached_property
+    def _covered(self) -> Callable[[EventPair], bool] | None:
+        """Say of a pair whether all that differs in it is ignored or within tolerance."""
+        if not self._options.tolerant and not self._options.ignore:
+            return None
+        explainer = self._explainer([])
+        return explainer.is_covered
 
     def _first(self, block: AlignedBlock) -> EventPair:
         """Return the pair at which the runs diverge; a delay of 0 ns alone is no divergence."""
@@ -166,9 +192,14 @@ class _Comparison:
         return first
 
     def _divergences(
-        self, propagation: Propagation, wanted: list[FoundDivergence]
+        self,
+        propagation: Propagation,
+        wanted: list[FoundDivergence],
+        search: EffectSearch | None,
     ) -> list[Divergence]:
         chosen = list(wanted)
+        if search is not None and search.past_covered:
+            chosen = self._past_covered(chosen, search)
         if propagation.watched is not None:
             chosen.append(propagation.watched)
             chosen.sort(key=lambda found: (found.place_a, found.place_b))
@@ -188,8 +219,28 @@ class _Comparison:
             self._notes.append(f"{len(chosen) - most} more independent divergences{hint}")
         explainer = self._explainer(propagation.found)
         divergences = [explainer.explain(found) for found in chosen[:most]]
+        if search is not None and not search.past_covered and search.found is not None:
+            self._effect = explainer.explain_effect(search.found, divergences[0])
+        if search is not None and search.in_vain:
+            ends = (self._a.event_count, self._b.event_count)
+            whole = self._aligned_to == ends
+            self._in_vain = "" if whole else f" up to event {self._aligned_to[0]}"
         self._notes += explainer.warnings
         return divergences
+
+    def _past_covered(
+        self, chosen: list[FoundDivergence], search: EffectSearch
+    ) -> list[FoundDivergence]:
+        """Return what to show if the first divergence is ignored or within tolerance."""
+        covered = "only in what is ignored or within tolerance"
+        if search.found is None:
+            return chosen  # what all messages say of that is told beside it
+        self._notes.append(
+            f"the runs diverge at event {self._start}, but there {covered}; shown is the first "
+            "difference that is not"
+        )
+        place = search.found.place_a
+        return [search.found, *(found for found in chosen if found.place_a > place)]
 
     def _asked(self) -> str:
         return ", ".join((*self._options.nodes, *self._options.topics))

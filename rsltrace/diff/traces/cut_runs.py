@@ -6,7 +6,8 @@ from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.causes.settings import entity_settings, environment_settings
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.traces import Diff, Setting
+from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.trace.reader import Trace

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from rsltrace.diff.causes.classify import Judgement
 from rsltrace.diff.causes.wording import because_of
 from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.traces import Setting
+from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION, Root, Verdict
 from rsltrace.diff.traces.sides import stop_reason
 from rsltrace.model.event import Event, EventFlag, EventKind
@@ -131,7 +131,7 @@ def judge_end(
         f"went on {'to' if other.end_ns != over.end_ns else 'until'} "
         f"{seconds_text(other.end_ns)} s ({stop_reason(other)})"
     )
-    root = Root.UNKNOWN
+    root, told = Root.UNKNOWN, []
     if not over.complete:
         why = (
             f"the recording of {name} was cut off: its run was killed, is still going on, or the "
@@ -144,4 +144,4 @@ def judge_end(
     else:
         why = _why_ended(over, name, job)
     a_view, b_view = (view_a, None) if over is b else (None, view_a)
-    return Judgement(verdict, root, sentence, why, a_view, b_view)
+    return Judgement(verdict, root, sentence, why, a_view, b_view, tuple(told))

@@ -15,6 +15,7 @@ from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EventPai
 from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.diff.alignment.rows import Run as DiffRun
+from rsltrace.diff.causes.effects import first_effect
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
@@ -60,8 +61,14 @@ class Comparison:
         if first is not None:
             blocks = AlignedBlocks(self.diff_run_a, self.diff_run_b, first, _EVENTS_PER_BLOCK)
             self._aligned_blocks = (part for part in blocks if isinstance(part, AlignedBlock))
-            self.advance()
+            block = self.fetch()
+            self.take(block)
             self._first_place = self._divergences[0] if self._divergences else first
+            # Where nodes were set up otherwise, what they then do is what one wants to see.
+            effect = first_effect(block) if block is not None else None
+            if effect is not None:
+                index = effect.a if effect.a >= 0 else effect.b
+                self._first_place = self.place_of(index, other=effect.a < 0)
 
     # The view.
 
@@ -157,7 +164,7 @@ class Comparison:
 
     @property
     def first_place(self) -> int | None:
-        """The place of the first difference; None if there is none."""
+        """The place of the first difference that is an effect; None if nothing differs."""
         return self._first_place
 
     def verdict(self) -> str:

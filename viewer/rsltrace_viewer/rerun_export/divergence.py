@@ -57,7 +57,7 @@ class Marks:
 
 def marks_of(diff: Diff) -> Marks:
     """Return what the layout needs to know."""
-    first = diff.divergences[0] if diff.divergences else None
+    first = diff.shown
     here = _either(first.a, first.b) if first is not None else None
     fields: dict[tuple[str, str], None] = {}
     for divergence in diff.divergences:
@@ -82,7 +82,7 @@ def divergence_chunks(diff: Diff, start_ns: int, clock: Clock) -> Iterator[Chunk
             (rr.TextDocument.descriptor_media_type(), pa.array(["text/markdown"])),
         ),
     )
-    first = diff.divergences[0] if diff.divergences else None
+    first = diff.shown
     yield from _agreement(diff, first, start_ns, clock)
     if first is not None:
         yield from _chain(first, clock)

@@ -52,8 +52,8 @@ def pair_lines(
             lines += _why(comparison)
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _difference_lines(comparison, a, b, openness, first=first)
-        if first and comparison.diff is not None and comparison.diff.divergences:
-            lines += chain_lines(comparison, comparison.diff.divergences[0])
+        if first and comparison.diff is not None and comparison.diff.shown is not None:
+            lines += chain_lines(comparison, comparison.diff.shown)
         if sign not in (Sign.MATCH, Sign.UNKNOWN):
             lines += _cause_lines(comparison, a, b)
     except TraceError as error:
@@ -123,8 +123,7 @@ def _why(comparison: Comparison) -> Iterator[Line]:
     """Yield the reason of the first divergence, as the diff has it."""
     if comparison.diff is None:
         yield Line(1, "why", "looking for the cause …", Role.NOTE, "why")
-    elif comparison.diff.divergences:
-        divergence = comparison.diff.divergences[0]
+    elif (divergence := comparison.diff.shown) is not None:
         sentence = divergence.root_sentence or divergence.sentence
         yield Line(1, "why", printable(sentence), Role.NOTE, "why")
         failed = [note for note in comparison.diff.notes if ENDED_BY_EXCEPTION in note]
@@ -167,8 +166,7 @@ def _difference_lines(
     view_a = EventViews(runs[0]).view(a) if a is not None else None
     view_b = EventViews(runs[1]).view(b) if b is not None else None
     found = message_differences(*runs, view_a, view_b, DiffOptions())
-    divergences = comparison.diff.divergences if first and comparison.diff is not None else ()
-    known = divergences[0] if divergences else None
+    known = comparison.diff.shown if first and comparison.diff is not None else None
     beside = list(differing_state_lines(runs, (view_a, view_b), known, openness))
     if known is not None:
         beside += differing_call_lines(known.calls)

@@ -1,0 +1,166 @@
+"""Of settings that differ, what they did is told first, not that a node was set up otherwise."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import rsltrace
+from rsltrace.diff.report import render
+from rsltrace.diff.result.verdicts import Verdict
+
+pytestmark = [pytest.mark.ros]
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+NODES = """
+from geometry_msgs.msg import Twist
+from rclpy.node import Node
+from std_msgs.msg import Float64
+
+
+class Lidar(Node):
+    def __init__(self):
+        super().__init__("lidar")
+        self.publisher = self.create_publisher(Float64, "range", 10)
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.publisher.publish(Float64(data=2.0))
+
+
+class Follower(Node):
+    def __init__(self):
+        super().__init__("follower")
+        self.speed = self.declare_parameter("speed", 1.0).value
+        self.from_ = self.declare_parameter("from", 1).value
+        self.declare_parameter("unused", 1)
+        self.get_logger().info(f"speed {self.speed}")
+        self.publisher = self.create_publisher(Twist, "cmd_vel", 10)
+        self.create_subscription(Float64, "range", self.got, 10)
+        self.heard = 0
+
+    def got(self, message):
+        self.heard += 1
+        command = Twist()
+        command.angular.z = 1e-9 * self.speed
+        if self.heard >= self.from_:
+            command.linear.x = self.speed * message.data
+        self.publisher.publish(command)
+"""
+JOB = """\
+nodes:
+  - node: following:Lidar
+  - node: following:Follower
+    name: follower
+    parameters:
+      speed: SPEED
+      from: FROM
+      unused: UNUSED
+stop: {duration: 3s}
+"""
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+    """Record with some values of the parameters, each once."""
+    from rsltrace.run import run
+
+    folder = tmp_path_factory.mktemp("following")
+    (folder / "following.py").write_text(NODES)
+
+    def go(speed: str = "1.0", from_: str = "1", unused: str = "1") -> Path:
+        path = folder / f"{speed}-{from_}-{unused}.mcap"
+        if not path.exists():
+            text = JOB.replace("SPEED", speed).replace("FROM", from_).replace("UNUSED", unused)
+            (folder / "job.yaml").write_text(text)
+            run(rsltrace.load_job(folder / "job.yaml"), path)
+        return path
+
+    return go
+
+
+def test_a_parameter_and_what_it_did(recorded: Callable[..., Path]) -> None:
+    a, b = recorded(), recorded(speed="1.5")
+    diff = rsltrace.diff(a, b)
+    assert diff.verdict is Verdict.ENVIRONMENT
+    assert diff.agreeing == diff.divergences[0].a.index == 1  # type: ignore[union-attr]
+    assert diff.sentence == (
+        "parameter speed 1.0 → 1.5 (job.yaml:6); first effect: /follower published another "
+        "linear.x and 1 more field on /cmd_vel at 0.1 s (linear.x 2.0 → 3.0 and 1 more field)"
+    )
+    other = rsltrace.diff(b, a).sentence
+    assert other.startswith("parameter speed 1.5 → 1.0 (job.yaml:6); first effect: /follower pub")
+    assert "(linear.x 3.0 → 2.0 and 1 more field)" in other
+
+
+def test_all_reports_lead_with_the_effect(recorded: Callable[..., Path]) -> None:
+    diff = rsltrace.diff(recorded(), recorded(speed="1.5"))
+    text = render(diff, "text")
+    assert text.startswith("Parameter speed 1.0 → 1.5 (job.yaml:6); first effect: /follower ")
+    assert "subscription /range, its event 1 (" in text
+    assert "parameter_events" not in text.split("before it")[0]
+    for form in ("junit", "github", "markdown"):
+        assert "first effect: /follower published" in render(diff, form).replace("\\", ""), form
+    assert "following.py,line=" in render(diff, "github") or "file=" in render(diff, "github")
+    found: dict[str, Any] = json.loads(render(diff, "json"))
+    assert found["effect"]["a"]["entity"]["name"] == "/range"
+    assert found["effect"]["settings"] == found["divergences"][0]["settings"]
+    assert found["effect"]["settings"][0]["key"] == "nodes.follower.parameters.speed"
+
+
+def test_an_effect_that_comes_late_is_found(recorded: Callable[..., Path]) -> None:
+    options = {"ignore": "/cmd_vel:angular"}
+    a, b = recorded(from_="20"), recorded(speed="1.5", from_="20")
+    diff = rsltrace.diff(a, b, window=5, ignore=options["ignore"])
+    assert (
+        "first effect: /follower published another linear.x on /cmd_vel at 2.0 s" in diff.sentence
+    )
+
+
+def test_a_parameter_without_effect(recorded: Callable[..., Path]) -> None:
+    diff = rsltrace.diff(recorded(), recorded(unused="2"))
+    assert diff.effect is None
+    assert diff.sentence == (
+        "parameter unused 1 → 2 (job.yaml:8); no effect but on /parameter_events, by the "
+        "constructor of /follower"
+    )
+    assert diff.shown is diff.divergences[0]
+
+
+def test_what_is_ignored_or_tolerated_does_not_lead(recorded: Callable[..., Path]) -> None:
+    a, b = recorded(from_="20"), recorded(speed="1.5", from_="20")
+    plain = rsltrace.diff(a, b)
+    assert "angular.z" in plain.sentence
+    near = rsltrace.diff(a, b, absolute={"angular.z": 1e-6})
+    assert "another linear.x" in near.sentence
+    assert "at 2.0 s" in near.sentence
+    ignored = ["/parameter_events:*", "/rosout:*", "angular.z"]
+    diff = rsltrace.diff(a, b, ignore=ignored)
+    assert "/cmd_vel: linear.x 2.0 → 3.0" in diff.sentence
+    assert any("only in what is ignored or within tolerance" in note for note in diff.notes)
+    assert diff.agreeing == 1
+
+
+def test_view_and_rerun_open_at_the_effect(recorded: Callable[..., Path]) -> None:
+    from rsltrace_viewer.model.run import Run
+    from rsltrace_viewer.session import Session
+
+    session = Session(Run.open(recorded()), Run.open(recorded(speed="1.5")))
+    try:
+        comparison = session.comparison
+        assert comparison is not None
+        assert session.place == comparison.first_place == 3
+        comparison.finish_diff()
+        assert comparison.diff is not None
+        assert comparison.diff.shown is not None
+        assert comparison.diff.shown.a is not None
+        assert comparison.diff.shown.a.index == comparison.a(session.place)
+    finally:
+        session.close()
+    marks = pytest.importorskip("rsltrace_viewer.rerun_export.divergence")
+    diff = rsltrace.diff(recorded(), recorded(speed="1.5"))
+    assert marks.marks_of(diff).stamp_ns == 100_000_000
