@@ -43,6 +43,14 @@ def is_effect(block: AlignedBlock, item: EventPair) -> bool:
     )
 
 
+def is_setup(block: AlignedBlock, item: EventPair) -> bool:
+    """Whether an item is a node that was set up otherwise, and no effect yet."""
+    if item.plain or item.beyond or is_effect(block, item):
+        return False
+    rows, index = (block.rows_a, item.a) if item.a >= 0 else (block.rows_b, item.b)
+    return rows.kind[index - rows.first] == CONSTRUCT or bool(outputs_of_one(block, item))
+
+
 class EffectSearch:
     """Looks through blocks, after ``Propagation`` took each, for what is to be shown first.
 
@@ -75,7 +83,7 @@ class EffectSearch:
         first = not self._roots
         for number in range(self._roots, len(propagation.found)):
             item = propagation.found[number].origin.item
-            if not item.plain and not is_effect(block, item):
+            if is_setup(block, item):
                 self._setups.add(number)
         self._roots = len(propagation.found)
         if first and self._covered is not None:

@@ -15,9 +15,10 @@ from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EventPai
 from rsltrace.diff.alignment.entity_matching import match_entities
 from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.diff.alignment.rows import Run as DiffRun
-from rsltrace.diff.causes.effects import first_effect
+from rsltrace.diff.causes.effects import first_effect, is_setup
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.traces.comparison import first_item
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.view import Sign
@@ -65,10 +66,11 @@ class Comparison:
             self.take(block)
             self._first_place = self._divergences[0] if self._divergences else first
             # Where nodes were set up otherwise, what they then do is what one wants to see.
-            effect = first_effect(block) if block is not None else None
-            if effect is not None:
-                index = effect.a if effect.a >= 0 else effect.b
-                self._first_place = self.place_of(index, other=effect.a < 0)
+            if block is not None and is_setup(block, first_item(block, first)):
+                effect = first_effect(block)
+                if effect is not None:
+                    index = effect.a if effect.a >= 0 else effect.b
+                    self._first_place = self.place_of(index, other=effect.a < 0)
 
     # The view.
 
