@@ -76,6 +76,7 @@ class Engine:
         self._checkpoint_s = 0.0
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
+        self._copied_at = -1
         self._apart_calls: Callable[..., None] | None = None
         """What calls callbacks in a copy made for a debugger."""
         dispatcher = session.world.domain.dispatcher
@@ -357,9 +358,10 @@ class Engine:
         if not self._forks:
             raise DebugError("checkpoints are off")
         pairs = self.session.inner_pairs()
-        reason = why_not(self._own_descriptors(), self._idle, pairs)
-        if reason:
-            raise DebugError(f"this process cannot be copied: {reason}")
+        if self._copied_at != self.ledger.events:  # else nothing has run since the last copy
+            reason = why_not(self._own_descriptors(), self._idle, pairs)
+            if reason:
+                raise DebugError(f"this process cannot be copied: {reason}")
         ours, theirs = socket.socketpair()
         try:
             pid = fork_beside(self._supervisor, pairs)
@@ -367,6 +369,7 @@ class Engine:
             ours.close()
             theirs.close()
             raise
+        self._copied_at = self.ledger.events
         if pid:
             theirs.close()
             return Copy(pid, ours)
@@ -390,6 +393,7 @@ class Engine:
         try:
             ours = self._forked()
         except DebugError:
+            self._copied_at = -1
             self._answer(ok=work())  # then here: better than not at all
             return
         if ours is None:

@@ -1,8 +1,8 @@
 """Copies of the process of a simulation: exact ones, and why there can be none.
 
-The C library's ``fork`` is called, not Python's: that one makes the copy a process of its own in
-many ways (locks, threads, random generators, event loops), and a checkpoint is to be the same
-process once more. That takes a process with a single thread, which a simulation is, unless a
+The kernel's (or C library's) ``fork`` is called, not Python's: that one makes the copy a process of
+its own in many ways (locks, threads, random generators, event loops), and a checkpoint is to be the
+same process once more. That takes a process with a single thread, which a simulation is, unless a
 library has started real ones.
 """
 
@@ -19,7 +19,11 @@ from contextlib import suppress
 
 from rsltrace.errors import DebugError
 
-_PR_SET_PDEATHSIG = 1
+_PR_SET_PDEATHSIG, _PR_GET_TID_ADDRESS = 1, 40
+_CLONE, _SET_ROBUST_LIST, _GET_ROBUST_LIST = 56, 273, 274  # of x86_64
+_CLONE_PARENT, _CLONE_CHILD_CLEARTID, _CLONE_CHILD_SETTID = 0x8000, 0x200000, 0x1000000
+_SIGCHLD = 17
+_NULL = ctypes.c_void_p()
 _PID = struct.Struct("<q")
 _SIGKILL = 9
 _LOOK_US = 200
@@ -33,11 +37,8 @@ def end_process(status: int) -> None:
     _c._exit(status)
 
 
-def die_with_parent(parent: int, between: int = 0) -> None:
-    """Have the kernel kill this process when ``parent`` ends, whose child it is, or will be as soon
-    as the process ``between`` them has ended."""
-    while between and os.getppid() == between:
-        _c.usleep(_LOOK_US)
+def die_with_parent(parent: int) -> None:
+    """Have the kernel kill this process when ``parent`` ends, whose child it is."""
     _c.prctl(_PR_SET_PDEATHSIG, _SIGKILL, 0, 0, 0)
     if os.getppid() != parent:
         end_process(0)
@@ -83,7 +84,7 @@ def why_not(kept: Iterable[int], idle: frozenset[int], pairs: Pairs) -> str:
 
 
 def fork_beside(parent: int, pairs: Pairs) -> int:
-    """Fork a process that is a child of ``parent`` (a subreaper); return its id, 0 in itself.
+    """Fork a process that is a child of ``parent``, as this one is; return its id, 0 in itself.
 
     Both go on from here with files of their own (what one reads moves no position of the other's)
     and with ``pairs`` of their own, which are empty.
@@ -92,22 +93,15 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
     """
     told, tell = os.pipe()
     try:
-        pid = _fork()
-        if pid == 0:
-            # Between the two: with its end ``parent`` becomes the new process's parent.
-            second, between = -1, os.getpid()
+        is_copy = _is_copy_of_many() if other_threads() else _is_copy_of_one()
+        if is_copy:
             with suppress(BaseException):
+                die_with_parent(parent)
                 _reopen_files()
                 _renew(pairs)
-                second = int(_c.fork())
-                if second > 0:
-                    os.write(tell, _PID.pack(second))
-            if second:
-                end_process(int(second < 0))
-            die_with_parent(parent, between)
-            return 0
-        with suppress(ChildProcessError):  # a node ignores the ends of its children
-            os.waitpid(pid, 0)
+                os.write(tell, _PID.pack(_c.getpid()))  # for which the other one waits
+                return 0
+            end_process(1)
         os.close(tell)
         tell = -1
         data = os.read(told, _PID.size)
@@ -120,12 +114,46 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
     return int(_PID.unpack(data)[0])
 
 
-def _fork() -> int:
-    pid: int = _c.fork()
+def _is_copy_of_one() -> bool:
+    """Fork a process with the same parent; say whether this is the new one.
+
+    The kernel is called as the C library's ``fork`` calls it. In a process with one thread, that
+    does nothing else but call handlers (``pthread_atfork``), which see to locks and threads of
+    others, and to generators of random numbers: a checkpoint is to have the same ones.
+    """
+    tid, robust, size = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_size_t()
+    _c.prctl(_PR_GET_TID_ADDRESS, ctypes.byref(tid), _NULL, _NULL, _NULL)
+    _c.syscall(_GET_ROBUST_LIST, _NULL, ctypes.byref(robust), ctypes.byref(size))
+    flags = _CLONE_PARENT | _SIGCHLD
+    if tid:
+        flags |= _CLONE_CHILD_SETTID | _CLONE_CHILD_CLEARTID
+    pid = _c.syscall(_CLONE, ctypes.c_long(flags), _NULL, _NULL, tid, _NULL)
+    if pid == 0 and robust:
+        _c.syscall(_SET_ROBUST_LIST, robust, size)
+    return _is_copy(pid)
+
+
+def _is_copy_of_many() -> bool:
+    """The same, where others may hold locks that ``fork`` knows of: its child's child."""
+    pid = _c.fork()
+    if not _is_copy(pid):
+        with suppress(ChildProcessError):  # a node ignores the ends of its children
+            os.waitpid(pid, 0)
+        return False
+    # Between the two: with its end ``parent`` becomes the new process's parent.
+    between = _c.getpid()
+    if _c.fork():
+        end_process(0)
+    while _c.getppid() == between:
+        _c.usleep(_LOOK_US)
+    return True
+
+
+def _is_copy(pid: int) -> bool:
     if pid < 0:
         code = ctypes.get_errno()
         raise DebugError(f"no process can be made for a checkpoint: {os.strerror(code)}")
-    return pid
+    return pid == 0
 
 
 # -- what there is ---------------------------------------------------------------------------------

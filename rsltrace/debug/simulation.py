@@ -102,7 +102,8 @@ def _serve(
             observer=Observer(note=notes.append),
         )
     )
-    Editing(edits, known=len(edits)).attach(session)  # those that a branch was made with
+    if edits:  # those that a branch was made with
+        Editing(edits, known=len(edits)).attach(session)
     engine = Engine(
         session,
         ledger,

@@ -65,6 +65,7 @@ class Supervisor:
                 if request is None or request.get("do") == "quit":
                     break
                 self.client.send({"id": request.get("id"), **self._answer(request)})
+                self.tree.thin()
         except RsltraceError as error:
             if not isinstance(error, ClientGone):
                 self.client.send({"notice": "failed", "error": _said(error)})

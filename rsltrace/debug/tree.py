@@ -44,6 +44,7 @@ class Tree:
         self._checkpoints = Checkpoints(min(int(spec["checkpoints"]), COUNT_MAX))
         self._memory_max = int(spec["memory_mib"]) << 20
         self._weighed = 0
+        self._thinned_at = 0
         self._cursor: SimProcess
         self._is_quiet = False
         self._paused_s: float | None = None
@@ -116,7 +117,6 @@ class Tree:
         except Lost as error:
             raise self._come_back(before, error) from None
         self.position = answer["position"]
-        self._thin()
         return answer
 
     def _come_back(self, before: Message, error: Lost) -> DebugError:
@@ -147,7 +147,6 @@ class Tree:
         cursor, answer = self._at(goal)
         self._leave_cursor()
         self._cursor, self.position = cursor, answer["position"]
-        self._thin()
         return answer
 
     def _jumps_ahead(self, goal: Message) -> bool:
@@ -276,9 +275,12 @@ class Tree:
         self._checkpoints.remove(one)
         self.family.kill(one.process)
 
-    def _thin(self) -> None:
-        """Keep number and memory of checkpoints within their bounds."""
+    def thin(self) -> None:
+        """Keep number and memory of checkpoints within their bounds, after a move."""
         cursor = int(self.position["index"])
+        if cursor == self._thinned_at:
+            return
+        self._thinned_at = cursor
         while len(self._checkpoints) > self._checkpoints.count_max:
             if not self._drop_one(cursor):
                 return

@@ -104,7 +104,8 @@ def _run(
         ) as session,
     ):
         verification.attach(session)
-        editing.attach(session)
+        if editing.all:  # else they would cost time at every event
+            editing.attach(session)
         if editing.branches and (end := verification.end_of_branch()) is not None:
             session.loop.stop_conditions += (end,)
         session.begin()

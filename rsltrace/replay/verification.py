@@ -7,7 +7,7 @@ that differs ends the run there: what the event has sent waits in queues that no
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from rsltrace.replay.edits import edits_of
 if TYPE_CHECKING:
     from rsltrace.run.session import RunResult, Session
     from rsltrace.trace.reader import Trace
+    from rsltrace.trace.recorder import Recorder
 
+AddEvent = Callable[[bytes, int], None]
 DIVERGED = Stop("the replay stopped at the first event that differs", 1)
 _INTERRUPTIONS = {129: "hung up", 130: "interrupted", 143: "terminated"}
 BRANCH_END = "as far as the run that it branches off"
@@ -42,8 +44,6 @@ class Verification:
         on_first: Callable[[Session], None] | None = None,
     ) -> None:
         self.verified = 0
-        self.chain_hash = 0
-        self.end_ns = trace.start_ns
         self.diverged = False
         self.stop: Stop | None = None
         self.is_last = False
@@ -54,23 +54,33 @@ class Verification:
         self._on_first = on_first
         self._first = first if on_first is not None else -1
         self._next_mark = self._limit if self._first < 1 else self._first
-        self._expected = self._hashes()
         self._session: Session
-        self._end_event: Any
+        self._recorder: Recorder
 
     def attach(self, session: Session) -> None:
         """Compare the events of an open session from now on."""
         recorder = session.world.domain.dispatcher.recorder
         assert recorder is not None, "a replay is recorded"
-        self._session, self._recorder, self._end_event = session, recorder, recorder.end_event
-        recorder.end_event = self._compared  # type: ignore[method-assign, assignment]
+        self._session, self._recorder = session, recorder
+        recorder.add_event = self._compared(recorder.writer.add_event)  # type: ignore[assignment]
         if self._first == 0 and self._on_first is not None:
             self._on_first(self._session)
+
+    @property
+    def chain_hash(self) -> int:
+        """The chain hash of the last event that was as recorded, 0 of none."""
+        return self._trace.event(self.verified - 1).chain_hash if self.verified else 0
+
+    @property
+    def end_ns(self) -> int:
+        """When that event was, the start of the trace without one."""
+        trace = self._trace
+        return trace.event(self.verified - 1).stamp_ns if self.verified else trace.start_ns
 
     def branch_off(self) -> None:
         """Compare nothing from now on: what follows is to be something else."""
         self.has_branched_off = True
-        self._recorder.end_event = self._end_event  # type: ignore[method-assign]
+        self._recorder.add_event = self._recorder.writer.add_event
 
     def end_of_branch(self) -> StopCondition | None:
         """Return what ends a branch where the run would not end by itself, or is not to go on."""
@@ -78,19 +88,21 @@ class Verification:
             return None
         return stop_at(self._trace.event(self._limit - 1).stamp_ns, BRANCH_END)
 
-    def _compared(self, stamp_ns: int, *event: int) -> None:
-        """Stand in for ``Recorder.end_event``: end the event, then see whether it was right."""
-        self._end_event(stamp_ns, *event)
-        chain_hash = self._recorder.chain_hash
-        if chain_hash == next(self._expected, None):
-            self.chain_hash = chain_hash
-            self.end_ns = stamp_ns
-            self.verified = verified = self.verified + 1
-            if verified == self._next_mark:
-                self._at_mark()
-        else:
-            self.diverged = not (self.is_last or self.interrupted)
-            self._end(DIVERGED)
+    def _compared(self, add_event: AddEvent) -> AddEvent:
+        """Return what stands in for the writer's ``add_event`` and sees whether it was right."""
+        expected = self._hashes()
+
+        def compared(rest: bytes, chain_hash: int) -> None:
+            add_event(rest, chain_hash)
+            if chain_hash == next(expected, None):
+                self.verified = verified = self.verified + 1
+                if verified == self._next_mark:
+                    self._at_mark()
+            else:
+                self.diverged = not (self.is_last or self.interrupted)
+                self._end(DIVERGED)
+
+        return compared
 
     def _at_mark(self) -> None:
         if self.verified == self._first and self._on_first is not None:

@@ -24,7 +24,7 @@ class Recorder:
     """The event under way, and the hash chain so far.
 
     ``outputs`` and ``output_hash`` belong to the event under way; ``end_event`` closes it.
-    ``add_output`` is the writer's.
+    ``add_event`` and ``add_output`` are the writer's.
     """
 
     def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
@@ -34,7 +34,7 @@ class Recorder:
         self.chain_hash = 0
         self.outputs = 0
         self.output_hash = 0
-        self._add_event = writer.add_event
+        self.add_event = writer.add_event
         self.add_output = writer.add_output
         self._add_sequence = writer.add_sequence
         self._add_payload = writer.add_payload
@@ -123,7 +123,7 @@ class Recorder:
             flags,
         )
         self.chain_hash = chain_hash = hash64(rest, self.chain_hash)
-        self._add_event(rest, chain_hash)
+        self.add_event(rest, chain_hash)
         self.index += 1
         self.outputs = 0
         self.output_hash = 0
