@@ -22,6 +22,8 @@ from rsltrace.mcap.walk import length_by_fields, read_body, whole_records
 from rsltrace.trace.format import (
     METADATA_FORMAT,
     SEGMENT_DTYPE,
+    TOPIC_DETAILS,
+    TOPIC_ENTITIES,
     TOPIC_EVENTS,
     TOPIC_OUTPUTS,
     begins_a_trace,
@@ -121,6 +123,7 @@ class _Scanner:
 
     def _chunk(self, span: Span) -> None:
         records = read_chunk(self._source, span)
+        self._check_channels()
         counts: Mapping[int, int]
         channel_id, _ = next(messages_in(records), (-1, 0))
         if channel_id == self._event_channel:
@@ -130,7 +133,15 @@ class _Scanner:
             self._pending_outputs = (span, counts[channel_id])
         else:
             counts = Counter(channel_id for channel_id, _ in messages_in(records))
+            for channel_id in counts.keys() - self._summary.channels.keys():
+                raise Damaged(f"it has messages of channel {channel_id}, which is not there")
         self._chunks.append(ChunkEntry(span, counts, {}))
+
+    def _check_channels(self) -> None:
+        """Before the first chunk there are our channels: MCAP has no checksum for their names."""
+        topics = {channel.topic for channel in self._summary.channels.values()}
+        for topic in _OWN - topics:
+            raise Damaged(f"there is no channel {topic} before it")
 
     def _events(self, span: Span, records: bytes) -> int:
         events = events_in(records, self._event_channel)
@@ -162,6 +173,8 @@ class _Scanner:
             f"(head -c {whole} keeps what is whole)"
         )
 
+
+_OWN = frozenset((TOPIC_EVENTS, TOPIC_OUTPUTS, TOPIC_ENTITIES, TOPIC_DETAILS))
 
 _NAMED_AFTER = {int(Opcode.METADATA): 0, int(Opcode.ATTACHMENT): 16}
 """How many bytes stand before the name in the records that have one."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import struct
@@ -252,6 +253,29 @@ def test_damage_in_the_middle_of_a_cut_trace_does_not_pass_for_an_earlier_cut(
         path.write_bytes(data[:found])  # what the message says helps
         with Trace.open(path) as trace:
             assert trace.event_count <= whole
+
+
+def test_a_cut_trace_whose_channels_are_damaged_has_all_events_or_is_refused(
+    tmp_path: Path, cut: tuple[bytes, list[int]]
+) -> None:
+    """MCAP has no checksum for them, and chunks of an unknown channel are no events."""
+    data, offsets = cut
+    path = tmp_path / "run.mcap"
+    path.write_bytes(data)
+    with Trace.open(path) as trace:
+        whole = trace.event_count, len(trace.entities)
+    refused = 0
+    for at, end in itertools.pairwise(offsets):
+        for byte in range(at + 9, end) if data[at] == Opcode.CHANNEL else ():
+            damaged = bytearray(data)
+            damaged[byte] ^= 0x04
+            path.write_bytes(damaged)
+            try:
+                with Trace.open(path) as trace:
+                    assert (trace.event_count, len(trace.entities)) == whole, byte
+            except TraceError:
+                refused += 1
+    assert refused > 4 * len("/rsltrace/events")
 
 
 def test_an_opcode_that_no_record_has_is_damage(tmp_path: Path) -> None:
