@@ -51,7 +51,7 @@ def _kind_of(file: str) -> int:
 
 
 @cache
-def _is_installed(file: str) -> bool:
+def is_installed(file: str) -> bool:
     """Whether a file lies among what is installed, be it a library's or the user's."""
     return any(part in file for part in _INSTALLED)
 
@@ -92,7 +92,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
         if packages and is_in(frame, packages):
             return installed or frame
         if kind == _USER:
-            if not _is_installed(file):
+            if not is_installed(file):
                 return installed or frame
             installed = installed or frame  # unless it is being imported
         elif kind == _LIBRARY:
@@ -114,7 +114,7 @@ def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
     while frame is not None:
         file = frame.f_code.co_filename
         kind = _kind_of(file)
-        if kind == _OURS or (kind == _USER and not _is_installed(file)):
+        if kind == _OURS or (kind == _USER and not is_installed(file)):
             return False
         if packages and is_in(frame, packages):
             return False

@@ -18,6 +18,7 @@ from typing import Any, Protocol
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
 from rsltrace.guard.descriptor_table import DescriptorTable
+from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.object_numbers import ObjectNumbers
 from rsltrace.guard.random_streams import RandomStreams
 from rsltrace.guard.real_time import RealTimePace
@@ -199,8 +200,11 @@ class Guard:
         Real clocks never show the same twice, and code that measures durations (to divide by them,
         say) relies on it. So whoever looks again at one instant sees a little more each time;
         not so Python's own modules, which wait by what they see. Whoever looks until time has
-        passed makes it pass.
+        passed makes it pass. A library that is being imported has a clock of its own.
         """
+        library = present_import()
+        if library is not None:
+            return self.context.now_ns() + library.look()
         event = self.context.place()[0]
         if event != self._reads_event:
             self._reads_event, self._reads, self._passes = event, 0, 0

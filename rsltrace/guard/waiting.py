@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard.guard import Context, Guard, engage, engaged
+from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.real_time import STEP_NS
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
@@ -121,7 +122,7 @@ def waiting_guard(frame: FrameType) -> Guard | None:
     Threads are, and multiprocessing anywhere: it has threads of its own that must go on.
     """
     guard = engaged()
-    if guard is None or not guard.context.can_step():
+    if guard is None or present_import() is not None or not guard.context.can_step():
         return None
     module = str(frame.f_globals.get("__name__", ""))
     if guard.context.is_aside() or module.startswith(("multiprocessing.", "torch.multiprocessing")):

@@ -19,8 +19,10 @@ from types import CodeType, ModuleType
 from typing import Any
 
 from rsltrace.guard.addresses import is_by_address
-from rsltrace.guard.callers import is_own, is_user_file
+from rsltrace.guard.callers import is_installed, is_own, is_user_file
 from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.libraries import is_library
+from rsltrace.guard.library_imports import importing
 from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.model.finding import Mode, Source
 
@@ -225,13 +227,26 @@ def code_of_script(source: bytes, path: str) -> CodeType:
 
 
 class _Loader(importlib.machinery.SourceFileLoader):
+    """Loads a module of user code (``ordered``: with its sets in order) or of what is installed."""
+
+    def __init__(self, instead_of: Any, *, ordered: bool, library: bool) -> None:
+        super().__init__(instead_of.name, instead_of.path)
+        self._ordered = ordered
+        self._library = library
+
     def get_code(self, fullname: str) -> CodeType | None:
+        if not self._ordered:
+            return super().get_code(fullname)
         path = self.get_filename(fullname)
         return rewritten(self.get_data(path), path)
 
+    def exec_module(self, module: ModuleType) -> None:
+        with importing(library=self._library):
+            super().exec_module(module)
+
 
 class _Finder:
-    """Finds the modules of user code: wherever they are, unless they are a library's."""
+    """Finds modules of user code, and those of libraries, which have their own import time."""
 
     def __init__(
         self, packages: frozenset[str], on_loaded: Mapping[str, Callable[[], None]]
@@ -242,17 +257,21 @@ class _Finder:
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        """Return the spec of a user module with our loader, or None for any other module."""
+        """Return a module's spec, with a loader of ours if it is not one of Python's or ROS's."""
         if name in sys.builtin_module_names or is_own(name):
             return None
         spec = self._found_otherwise(name, path, target)
         if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
             return None
+        file = spec.origin or ""
+        of_node = name.partition(".")[0] in self._packages
+        if of_node or is_user_file(file):
+            library = is_installed(file) and not of_node
+            spec.loader = _Loader(spec.loader, ordered=True, library=library)
+        elif is_library(file):
+            spec.loader = _Loader(spec.loader, ordered=False, library=True)
         if name in self._on_loaded:
             _tell(spec.loader, self._on_loaded[name])
-            return spec
-        if is_user_file(spec.origin or "") or name.partition(".")[0] in self._packages:
-            spec.loader = _Loader(spec.loader.name, spec.loader.path)
         return spec
 
     def _found_otherwise(

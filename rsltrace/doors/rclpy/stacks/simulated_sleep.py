@@ -16,6 +16,7 @@ from types import SimpleNamespace
 from rsltrace.doors.rclpy.stacks.blocking_calls import getpid, wait
 from rsltrace.doors.rclpy.stacks.sim_event import SimEvent
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.middleware.events.event import Event
@@ -41,8 +42,11 @@ def world_exists() -> bool:
 
 def _sleep(seconds: float) -> None:
     """Stand in for ``time.sleep`` while a run lasts."""
+    library = present_import()
+    if library is not None:
+        library.passed_ns += int(seconds * 1_000_000_000)
     stacks = simulated_stacks()
-    if stacks is None or stacks.event.handle is None:
+    if stacks is None or stacks.event.handle is None or library is not None:
         _real_sleep(seconds)
         return
     if seconds < 0:

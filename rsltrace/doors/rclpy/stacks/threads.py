@@ -22,7 +22,8 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from types import SimpleNamespace
+from functools import partial
+from types import FrameType, SimpleNamespace
 from typing import Any
 
 from greenlet import getcurrent, greenlet
@@ -33,14 +34,18 @@ from rsltrace.doors.rclpy.stacks.locks import SimLock, SimRLock
 from rsltrace.doors.rclpy.stacks.runners import RunEnded, Wait
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
-from rsltrace.guard.callers import is_user_file
+from rsltrace.guard.callers import is_user_file, module_of
+from rsltrace.guard.guard import engaged
+from rsltrace.guard.library_imports import present_import
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.model.finding import Mode, Source
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001
+_FIRST_OF_IMPORTS = 10_001
 _real_get_ident = _thread.get_ident
 _real_start_new_thread = _thread.start_new_thread
 _Thread = threading.Thread
@@ -221,7 +226,40 @@ def _start(self: Any) -> None:
         return
     if self._started.is_set() or "_rsltrace" in self.__dict__:
         raise RuntimeError("threads can only be started once")
+    library = present_import()
+    if library is not None and isinstance(self, threading.Timer):
+        # Most warn of an import that takes long (to build a cache, the first time).
+        self.__dict__["_rsltrace_late"] = partial(_begin, stacks, self)
+        library.at_end.append(partial(_start_late, self, sys._getframe(1)))
+        return
+    if library is not None:
+        _tell_of_import(self, sys._getframe(1))
+    _begin(stacks, self)
 
+
+def _tell_of_import(thread: Any, frame: FrameType) -> None:
+    """Report a thread that a library starts while it is imported: another time it may not."""
+    guard = engaged()
+    if guard is not None and guard.mode(Source.THREAD, frame) is not Mode.ALLOW:
+        call = f"threading.Thread.start() while {module_of(frame)} is imported"
+        guard.found(Source.THREAD, Mode.WARN, call, thread.name, frame)
+
+
+def _start_late(timer: Any, frame: FrameType | None = None) -> None:
+    """Start a timer of an import that is over, unless somebody has cancelled it by now."""
+    begin = timer.__dict__.pop("_rsltrace_late", None)
+    if begin is None:
+        return
+    if timer.finished.is_set():
+        timer._started.set()
+        timer._ident = timer._native_id = 0
+        _mark_stopped(timer)
+    else:
+        _tell_of_import(timer, frame or sys._getframe(1))
+        begin()
+
+
+def _begin(stacks: Stacks, self: Any) -> None:
     def body() -> None:
         try:
             self.run()
@@ -262,6 +300,7 @@ def _mark_stopped(thread: Any) -> None:
 
 
 def _join(self: Any, timeout: float | None = None) -> None:
+    _start_late(self)
     thread: SimThread | None = self.__dict__.get("_rsltrace")
     if thread is None or simulated_stacks() is not thread.stacks:
         if thread is None:
@@ -273,6 +312,8 @@ def _join(self: Any, timeout: float | None = None) -> None:
 
 
 def _is_alive(self: Any) -> bool:
+    if "_rsltrace_late" in self.__dict__:
+        return not self.finished.is_set()
     thread: SimThread | None = self.__dict__.get("_rsltrace")
     return bool(_real["is_alive"](self)) if thread is None else not thread.ended
 
@@ -314,13 +355,13 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (threading, "get_ident", _get_ident),
         (threading, "local", _threading_local.local),
         (threading, "_time", now),
-        (threading, "_counter", itertools.count(1).__next__),
+        (threading, "_counter", _numbers()),
         (_thread, "start_new_thread", _start_new_thread),
         (_thread, "start_new", _start_new_thread),
         (queue, "SimpleQueue", queue._PySimpleQueue),  # type: ignore[attr-defined]
         (queue, "time", now),
         (futures_base, "time", SimpleNamespace(monotonic=now)),
-        (concurrent.futures.ThreadPoolExecutor, "_counter", itertools.count().__next__),
+        (concurrent.futures.ThreadPoolExecutor, "_counter", _numbers(0)),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
@@ -345,6 +386,12 @@ def _count() -> int:
     return _WORKERS
 
 
+def _numbers(first: int = 1) -> Callable[[], int]:
+    """Return what numbers threads: those of a library's import apart from the run's."""
+    own, of_imports = itertools.count(first), itertools.count(_FIRST_OF_IMPORTS)
+    return lambda: next(own if present_import() is None else of_imports)
+
+
 def _is_news(record: logging.LogRecord) -> bool:
     """Say whether a log record of a thread pool is more than the end of a run in its workers."""
     return not (record.exc_info and record.exc_info[0] is RunEnded)
@@ -352,12 +399,12 @@ def _is_news(record: logging.LogRecord) -> bool:
 
 def _number(stack: ExitStack, cls: Any) -> None:
     """Hash the objects of a class by the order of creation: the library keeps them in sets."""
-    numbers = itertools.count(1)
+    number = _numbers()
     real_init = cls.__init__
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         if simulated_stacks() is not None:
-            self._rsltrace_number = next(numbers)
+            self._rsltrace_number = number()
         real_init(self, *args, **kwargs)
 
     def __hash__(self: Any) -> int:  # noqa: N807
