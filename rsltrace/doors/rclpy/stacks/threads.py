@@ -361,7 +361,7 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (queue, "SimpleQueue", queue._PySimpleQueue),  # type: ignore[attr-defined]
         (queue, "time", now),
         (futures_base, "time", SimpleNamespace(monotonic=now)),
-        (concurrent.futures.ThreadPoolExecutor, "_counter", _numbers(0)),
+        (concurrent.futures.ThreadPoolExecutor, "_counter", staticmethod(_numbers(0))),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
