@@ -16,9 +16,17 @@ from rsltrace._version import __version__
 from rsltrace.guard.pin import HASH_SEED
 from rsltrace.job import Job
 from rsltrace.job.values.target import Target
+from rsltrace.run.module_code import module_code
 from rsltrace.run.numerical_libraries import numerical_libraries
 from rsltrace.run.process import is_below, is_of_pytest, run_as_main, user_modules
-from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_JOB, PREFIX_REQUEST, PREFIX_RESPONSE
+from rsltrace.trace.format import (
+    ATTACHMENT_JOB,
+    METADATA_CODE,
+    METADATA_JOB,
+    METADATA_SOURCES,
+    PREFIX_REQUEST,
+    PREFIX_RESPONSE,
+)
 from rsltrace.trace.writer import TraceWriter
 
 _PACKAGES = ("rclpy", "numpy", "scipy", "rosbags", "mcap", "xxhash")
@@ -49,9 +57,9 @@ def write_job(writer: TraceWriter, job: Job) -> None:
     writer.add_attachment(ATTACHMENT_JOB, "application/yaml", job.source_text.encode())
 
 
-def sources(job: Job) -> dict[str, str]:
-    """Return a hash of the code of every module loaded from the job's search path, by name; and of
-    its scripts and the files that its models come from (``file:`` and the path in the job).
+def source_files(job: Job) -> dict[str, Path]:
+    """Return the file of every module loaded from the job's search path, by name; and of its
+    scripts and the files that its models come from (``file:`` and the path in the job).
 
     Which tests run beside it says nothing of a job, unless its nodes are theirs.
     """
@@ -64,9 +72,16 @@ def sources(job: Job) -> dict[str, str]:
     }
     modules.update(_run_as_main(job, folders))
     modules.update({f"file:{path}": job.resolve(path) for _, path in job.model_files()})
-    return {
-        name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in modules.items()
-    }
+    return modules
+
+
+def write_sources(writer: TraceWriter, job: Job) -> None:
+    """Put hashes of the code into the trace: of its files as they are, and of what they mean."""
+    files = source_files(job)
+    hashes = {n: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for n, path in files.items()}
+    writer.add_metadata(METADATA_SOURCES, hashes)
+    if code := module_code(files):
+        writer.add_metadata(METADATA_CODE, code)
 
 
 def _run_as_main(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path]]:

@@ -45,7 +45,7 @@ from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
 from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
-from rsltrace.run.provenance import environment, payload_filter, sources, write_job
+from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
 from rsltrace.run.unused_rules import (
     has_rules,
     unused_parameters,
@@ -53,7 +53,7 @@ from rsltrace.run.unused_rules import (
     unused_rules,
 )
 from rsltrace.run.watchdog import Watchdog
-from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_SOURCES
+from rsltrace.trace.format import METADATA_ENVIRONMENT
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
 
@@ -297,7 +297,7 @@ class Session:
         self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)
         writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
-        writer.add_metadata(METADATA_SOURCES, sources(job))
+        write_sources(writer, job)
         for name, values in self._metadata.items():
             writer.add_metadata(name, values)
         self._guarded.trace_begins(recorder, self.loop.now_ns)

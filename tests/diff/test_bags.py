@@ -193,16 +193,76 @@ def test_topics_of_one_side_are_a_difference(compare: Any) -> None:
 
 def test_ignored_fields(compare: Any) -> None:
     a, b = points(10), points(10, x3=0.0, x4=1.0)
-    assert compare(a, b, DiffOptions(ignore=("point.x",))).verdict is BagVerdict.EQUAL
-    assert compare(a, b, DiffOptions(ignore=("/p:point",))).verdict is BagVerdict.EQUAL
+    for glob in ("point.x", "/p:point"):
+        diff = compare(a, b, DiffOptions(ignore=(glob,)))
+        assert (diff.verdict, diff.exit_code) == (BagVerdict.WITHIN_TOLERANCE, 3)
+        assert diff.sentence == (
+            "The recordings are equal but for what is ignored, not identical: 2 of 10 messages on "
+            "1 topic differ in it."
+        )
+        assert counts(diff) == (8, 0, 0, 0, 0)
+        assert diff.topics[0].ignored == 2
+    both = DiffOptions(ignore=("header",), absolute=(("*", 5.0),))
+    near = compare(a, [(t, topic, point(9, i + 0.5)) for i, (t, topic, _) in enumerate(a)], both)
+    assert (near.exit_code, near.topics[0].tolerated) == (3, 10)
+    same = compare(a, a, DiffOptions(ignore=("point.x",)))
+    assert (same.verdict, same.exit_code) == (BagVerdict.EQUAL, 0)
+    padded = compare(a, points(10, padding=7), DiffOptions(ignore=("point.x",)))
+    assert padded.identical, "padding is nothing that is ignored"
     assert compare(a, b, DiffOptions(ignore=("/q:point",))).verdict is BagVerdict.DIFFERENT
     # A message that is missing is found among others of which nothing but the stamp is equal.
     c = points(10, skip=[5], **{f"x{i}": 0.25 for i in range(10)})
     diff = compare(a, c, DiffOptions(ignore=("point",)))
-    assert counts(diff) == (9, 0, 0, 1, 0)
+    assert counts(diff) == (0, 0, 0, 1, 0)
+    assert diff.topics[0].ignored == 9
     assert diff.first is not None
     assert diff.first.a is not None
     assert diff.first.a.index == 5
+
+
+@pytest.mark.parametrize("first", [0, 4, 8])
+@pytest.mark.parametrize("padding", [0, 3])
+@pytest.mark.parametrize("tolerance", [(), (("*", 1e-3),)])
+def test_neighbours_that_changed_places_are_swapped_and_not_missing(
+    compare: Any, first: int, padding: int, tolerance: Any
+) -> None:
+    a = points(10)
+    b = points(10, padding=padding)
+    (early, topic, one), (late, _, other) = b[first : first + 2]
+    b[first : first + 2] = [(early, topic, other), (late, topic, one)]
+    for x, y in ((a, b), (b, a)):
+        diff = compare(x, y, DiffOptions(absolute=tolerance))
+        assert diff.sentence == (
+            f"The recordings first diverge on /p, {first}.000000000 s after the start: messages "
+            f"{first} and {first + 1} are swapped."
+        )
+        assert counts(diff) == (9, 0, 0, 0, 0)
+        assert (diff.topics[0].moved, diff.exit_code) == (1, 1)
+        assert diff.first is not None
+        assert diff.first.presence is Presence.BOTH
+
+
+def test_a_message_that_moved_far_is_in_both(compare: Any) -> None:
+    a = points(10)
+    b = [(stamp, topic, a[other][2]) for (stamp, topic, _), other in zip(a, ORDER, strict=True)]
+    diff = compare(a, b)
+    assert counts(diff) == (9, 0, 0, 0, 0)
+    assert "message 2 of a is message 7 of b, in another order" in diff.sentence
+    c = [*b, (11 * SECOND, "/p", point(99, 1.0))]
+    assert counts(compare(a, c)) == (9, 0, 0, 0, 1)
+
+
+ORDER = [0, 1, 3, 4, 5, 6, 7, 2, 8, 9]
+
+
+def test_messages_that_repeat_are_swapped_too(compare: Any) -> None:
+    """Most of the values are there several times, so that nothing but the place tells."""
+    values = [1, 2, 1, 2, 3, 1, 2, 1, 1]
+    other = [1, 2, 1, 3, 2, 1, 2, 1, 1]
+    a, b = ([(i + 1, "/n", uint64(v)) for i, v in enumerate(side)] for side in (values, other))
+    diff = compare(a, b)
+    assert "messages 3 and 4 are swapped" in diff.sentence
+    assert counts(diff, "/n") == (8, 0, 0, 0, 0)
 
 
 def test_tolerances(compare: Any) -> None:

@@ -86,9 +86,10 @@ class _Comparison:
             keys = (_keys(scans_a[i]), _keys(scans_b[j]))
             stamps = (_times(scans_a[i]), _times(scans_b[j]))
             gaps = self._gaps(keys, stamps)
-            pairs.append(
-                TopicPair(i, j, self._a.topics[i], self._b.topics[j], *keys, *stamps, gaps)
-            )
+            names = (self._a.topics[i], self._b.topics[j])
+            ignores = self._options.for_topic(names[0].name).ignore
+            full = tuple(side.copy() for side in keys) if ignores else keys
+            pairs.append(TopicPair(i, j, *names, *keys, *stamps, gaps, *full))
         self._make_canonical(pairs)
         for pair in pairs:
             keys = (pair.keys_a, pair.keys_b)
@@ -119,12 +120,12 @@ class _Comparison:
     def _make_canonical(self, pairs: list[TopicPair]) -> None:
         """Where bytes differ, replace the keys by keys of what the messages say."""
         for side, source in ((0, self._a), (1, self._b)):
-            wanted: dict[int, tuple[Keys, npt.NDArray[np.bool_], ContentKeys]] = {}
+            wanted: dict[int, tuple[Keys, Keys, npt.NDArray[np.bool_], ContentKeys]] = {}
             for pair in pairs:
-                number, keys, name = (
-                    (pair.number_a, pair.keys_a, pair.a.name)
+                number, keys, full, name = (
+                    (pair.number_a, pair.keys_a, pair.full_a, pair.a.name)
                     if side == 0
-                    else (pair.number_b, pair.keys_b, pair.b.name)
+                    else (pair.number_b, pair.keys_b, pair.full_b, pair.b.name)
                 )
                 in_gap = np.zeros(len(keys), dtype=bool)
                 for gap in pair.gaps:
@@ -132,18 +133,22 @@ class _Comparison:
                     in_gap[start:end] = True
                 if in_gap.any():
                     rules = FieldRules(self._options.for_topic(name))
-                    wanted[number] = (keys, in_gap, ContentKeys(rules))
+                    wanted[number] = (keys, full, in_gap, ContentKeys(rules))
             if not wanted:
                 continue
+            everything = ContentKeys(FieldRules(DiffOptions()))
             seen = dict.fromkeys(wanted, 0)
             for _, number, data in source.read(set(wanted)):
                 place = seen[number]
                 seen[number] = place + 1
-                keys, in_gap, maker = wanted[number]
+                keys, full, in_gap, maker = wanted[number]
                 if not in_gap[place]:
                     continue
                 try:
-                    keys[place] = maker.key(source.decode(number, data))
+                    message = source.decode(number, data)
+                    if full is not keys:
+                        full[place] = everything.key(message)
+                    keys[place] = maker.key(message)
                 except TraceError as error:
                     self._note(f"{error}; compared byte by byte, padding included")
 
@@ -165,7 +170,7 @@ class _Comparison:
     ) -> BagDiff:
         firsts = [topic.first for topic in topics if topic.first is not None]
         first = min(firsts, key=lambda found: found.after_ns, default=None)
-        tolerated = sum(topic.tolerated for topic in topics)
+        tolerated = sum(topic.tolerated + topic.ignored for topic in topics)
         if first is not None or lone_a or lone_b:
             verdict = BagVerdict.DIFFERENT
         else:
@@ -255,18 +260,26 @@ def _sentence(
     lone_a: tuple[LoneTopic, ...],
     lone_b: tuple[LoneTopic, ...],
 ) -> str:
-    messages = sum(topic.equal + topic.tolerated for topic in topics)
+    messages = sum(topic.agreeing for topic in topics)
     counted = f"{_number(messages, 'message')} on {_number(len(topics), 'topic')}"
     if verdict is BagVerdict.EQUAL:
         return f"The recordings are equal: {counted} say the same."
     tolerated = sum(topic.tolerated for topic in topics)
+    ignored = sum(topic.ignored for topic in topics)
     if verdict is BagVerdict.AS_FAR_AS_THEY_GO:
         how = f"say the same{f' within tolerance ({tolerated} differ)' if tolerated else ''}"
+        how += f" but for what is ignored ({ignored} differ in it)" if ignored else ""
         return f"As far as they go, the recordings agree: {counted} {how}; not both are whole."
+    if verdict is BagVerdict.WITHIN_TOLERANCE and not tolerated:
+        return (
+            "The recordings are equal but for what is ignored, not identical: "
+            f"{ignored} of {counted} differ in it."
+        )
     if verdict is BagVerdict.WITHIN_TOLERANCE:
+        also = f", {ignored} more in what is ignored" if ignored else ""
         return (
             f"The recordings are equal within tolerance, not identical: {tolerated} of {counted} "
-            "differ, none by more than is tolerated."
+            f"differ, none by more than is tolerated{also}."
         )
     if first is None:
         lone = [f"{topic.topic} is only in a" for topic in lone_a]
@@ -277,6 +290,8 @@ def _sentence(
         return text[0].upper() + text[1:]
     when = f"{format_seconds(first.after_ns)} s after the start"
     diverge = f"The recordings first diverge on {first.topic}, {when}"
+    if first.note:
+        return f"{diverge}: {first.note}."
     if first.presence is Presence.ONLY_A:
         assert first.a is not None
         return f"{diverge}: message {first.a.index} of a is missing in b."

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-from rsltrace.diff.bags.sequences import Gap, Keys
+from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
 from rsltrace.diff.bags.source import Source, SourceTopic
 from rsltrace.diff.options import BY_STAMP, DiffOptions
 from rsltrace.diff.result.bags import (
@@ -32,7 +32,10 @@ _PREVIEW = 160
 
 @dataclass(frozen=True, slots=True)
 class TopicPair:
-    """A topic in both recordings: its numbers there, keys and log times, and where they diverge."""
+    """A topic in both recordings: its numbers there, keys and log times, and where they diverge.
+
+    ``full_*`` are the keys with all fields, also those that are ignored.
+    """
 
     number_a: int
     number_b: int
@@ -43,6 +46,8 @@ class TopicPair:
     stamps_a: Keys
     stamps_b: Keys
     gaps: list[Gap]
+    full_a: Keys
+    full_b: Keys
 
 
 class _Pair(NamedTuple):
@@ -150,7 +155,10 @@ def compare_topic(
 ) -> TopicDiff:
     """Return how the messages of one topic compare. Raises BagError or TraceError."""
     own = options.for_topic(pair.a.name)
-    counts = _counted(pair)
+    moved = {} if options.by == BY_STAMP else moved_messages(pair.keys_a, pair.keys_b, pair.gaps)
+    came_from = {in_b: in_a for in_a, in_b in moved.items()}
+    ignored = _ignored(pair)
+    counts = _counted(pair, len(moved))
     first = None
     if pair.gaps:
         rules = FieldRules(own)
@@ -159,21 +167,30 @@ def compare_topic(
             counts = _Counts(equal=len(pair.keys_a))
         gaps = pair.gaps if own.tolerant else pair.gaps[:1]
         for one in _pairs(pair, gaps, side_a, side_b, rules, options):
+            whole = _Pair(
+                one.a if one.a >= 0 else came_from.get(one.b, -1),
+                one.b if one.b >= 0 else moved.get(one.a, -1),
+            )
             covered = own.tolerant and _covered(side_a, side_b, one, rules)
             if first is None and not covered:
-                first = _divergence(pair, one, side_a, side_b, starts, own)
+                if whole != one:
+                    first = _moved(pair, one, whole, side_a, side_b, starts, own)
+                else:
+                    first = _divergence(pair, one, side_a, side_b, starts, own)
             if not own.tolerant:
                 break
-            counts.add(one, covered=covered)
+            counts.add(one, covered=covered, moved=whole != one)
     return TopicDiff(
         topic=pair.a.name,
         type_a=pair.a.type,
         type_b=pair.b.type,
-        equal=counts.equal,
+        equal=counts.equal - ignored,
         tolerated=counts.tolerated,
         differing=counts.differing,
         only_a=counts.only_a,
         only_b=counts.only_b,
+        ignored=ignored,
+        moved=counts.moved,
         first=first,
     )
 
@@ -185,11 +202,14 @@ class _Counts:
     differing: int = 0
     only_a: int = 0
     only_b: int = 0
+    moved: int = 0
 
-    def add(self, one: _Pair, *, covered: bool) -> None:
+    def add(self, one: _Pair, *, covered: bool, moved: bool) -> None:
         """Count what is not the same; ``equal`` begins as all of a."""
         self.equal -= one.a >= 0
-        if one.b < 0:
+        if moved:
+            self.moved += one.a >= 0
+        elif one.b < 0:
             self.only_a += 1
         elif one.a < 0:
             self.only_b += 1
@@ -199,9 +219,9 @@ class _Counts:
             self.differing += 1
 
 
-def _counted(pair: TopicPair) -> _Counts:
+def _counted(pair: TopicPair, moved: int) -> _Counts:
     """Count by keys alone, as if what is surplus in a gap stood at its end."""
-    counts = _Counts()
+    counts = _Counts(moved=moved)
     for gap in pair.gaps:
         size = min(gap.a_end - gap.a_start, gap.b_end - gap.b_start)
         left = pair.keys_a[gap.a_start : gap.a_start + size]
@@ -210,7 +230,29 @@ def _counted(pair: TopicPair) -> _Counts:
         counts.only_a += max(gap.surplus, 0)
         counts.only_b += max(-gap.surplus, 0)
     counts.equal = len(pair.keys_a) - counts.differing - counts.only_a
+    counts.only_a -= moved
+    counts.only_b -= moved
     return counts
+
+
+def _ignored(pair: TopicPair) -> int:
+    """Return how many messages belong together and differ in nothing but what is ignored."""
+    if pair.full_a is pair.keys_a:
+        return 0
+    count = i = j = 0
+    for gap in (*pair.gaps, Gap(len(pair.keys_a), 0, len(pair.keys_b), 0)):
+        size = gap.a_start - i
+        count += int((pair.full_a[i : i + size] != pair.full_b[j : j + size]).sum())
+        size = min(gap.a_end - gap.a_start, gap.b_end - gap.b_start)
+        if size > 0:
+            in_a, in_b = (
+                slice(gap.a_start, gap.a_start + size),
+                slice(gap.b_start, gap.b_start + size),
+            )
+            same = pair.keys_a[in_a] == pair.keys_b[in_b]
+            count += int((same & (pair.full_a[in_a] != pair.full_b[in_b])).sum())
+        i, j = gap.a_end, gap.b_end
+    return count
 
 
 def _pairs(
@@ -320,4 +362,33 @@ def _divergence(
         more_fields=more,
         reason=reason,
         before=tuple(side.view(place, stamps) for place in before),
+    )
+
+
+def _moved(
+    pair: TopicPair,
+    one: _Pair,
+    whole: _Pair,
+    a: _Side,
+    b: _Side,
+    starts: tuple[int, int],
+    options: DiffOptions,
+) -> MessageDivergence:
+    """Return the divergence at a message that the other side has, too, but not in this place."""
+    found = _divergence(pair, one, a, b, starts, options)
+    shown = found.a or found.b
+    assert shown is not None
+    views = [
+        BagMessage(index, int(stamps[index]), shown.preview)
+        for index, stamps in ((whole.a, pair.stamps_a), (whole.b, pair.stamps_b))
+    ]
+    gap = next(g for g in pair.gaps if g.a_start <= one.a < g.a_end or g.b_start <= one.b < g.b_end)
+    here, there = (gap.b_start, whole.b) if one.a >= 0 else (gap.a_start, whole.a)
+    after_ns = min(view.stamp_ns - start for view, start in zip(views, starts, strict=True))
+    if there == here + 1 and abs(gap.surplus) == 1:
+        note = f"messages {gap.a_start} and {gap.a_start + 1} are swapped"
+    else:
+        note = f"message {whole.a} of a is message {whole.b} of b, in another order"
+    return replace(
+        found, presence=Presence.BOTH, a=views[0], b=views[1], after_ns=after_ns, note=note
     )

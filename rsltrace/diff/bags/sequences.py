@@ -6,13 +6,14 @@ of both sequences between messages that match.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Iterator
 from difflib import SequenceMatcher
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+
+from rsltrace.diff.alignment.longest_increasing import longest_increasing
 
 Keys = npt.NDArray[np.uint64]
 _SMALL = 250_000
@@ -68,27 +69,51 @@ def gaps_by_stamp(a: Keys, b: Keys, stamps_a: Keys, stamps_b: Keys) -> list[Gap]
     return gaps
 
 
-def _gaps(a: Keys, b: Keys, gap: Gap, *, anchored: bool = False) -> Iterator[Gap]:
-    gap = _trimmed(a, b, gap)
-    a_start, a_end, b_start, b_end = gap
-    size_a, size_b = a_end - a_start, b_end - b_start
-    if not (size_a and size_b):
-        if size_a or size_b:
-            yield gap
-        return
-    if not anchored:
-        at_a, at_b = _anchors(a[a_start:a_end], b[b_start:b_end])
-        if at_a:
-            for x, y in zip(at_a, at_b, strict=True):
-                yield from _gaps(
-                    a, b, Gap(a_start, gap.a_start + x, b_start, gap.b_start + y), anchored=True
-                )
+def moved_messages(a: Keys, b: Keys, gaps: list[Gap]) -> dict[int, int]:
+    """Return the messages that only changed places: index in a, index in b.
+
+    In one place only a has it, in another only b.
+    """
+    there: dict[int, list[int]] = {}
+    for gap in gaps:
+        if gap.a_start == gap.a_end:
+            for place in range(gap.b_start, gap.b_end):
+                there.setdefault(int(b[place]), []).append(place)
+    moved = {}
+    for gap in gaps if there else ():
+        if gap.b_start == gap.b_end:
+            for place in range(gap.a_start, gap.a_end):
+                if places := there.get(int(a[place])):
+                    moved[place] = places.pop(0)
+    return moved
+
+
+def _gaps(a: Keys, b: Keys, gap: Gap) -> Iterator[Gap]:
+    """Yield the gaps within a gap, in order."""
+    waiting = [gap]
+    while waiting:
+        gap = _trimmed(a, b, waiting.pop())
+        a_start, a_end, b_start, b_end = gap
+        size_a, size_b = a_end - a_start, b_end - b_start
+        if not (size_a and size_b):
+            if size_a or size_b:
+                yield gap
+            continue
+        anchors = _anchors(a[a_start:a_end], b[b_start:b_end]) if size_a * size_b > 1 else []
+        if anchors:
+            between = []
+            for x, y in anchors:
+                between.append(Gap(a_start, gap.a_start + x, b_start, gap.b_start + y))
                 a_start, b_start = gap.a_start + x + 1, gap.b_start + y + 1
-            yield from _gaps(a, b, Gap(a_start, a_end, b_start, b_end), anchored=True)
-            return
-    if size_a == size_b or size_a * size_b > _SMALL:
-        yield gap
-        return
+            waiting += [Gap(a_start, a_end, b_start, b_end), *reversed(between)]
+        elif size_a == size_b or size_a * size_b > _SMALL:
+            yield gap
+        else:
+            yield from _matched_gaps(a, b, gap)
+
+
+def _matched_gaps(a: Keys, b: Keys, gap: Gap) -> Iterator[Gap]:
+    a_start, a_end, b_start, b_end = gap
     matcher = SequenceMatcher(
         None, a[a_start:a_end].tolist(), b[b_start:b_end].tolist(), autojunk=False
     )
@@ -109,8 +134,8 @@ def _trimmed(a: Keys, b: Keys, gap: Gap) -> Gap:
     return Gap(a_start, a_end - tail, b_start, b_end - tail)
 
 
-def _anchors(a: Keys, b: Keys) -> tuple[list[int], list[int]]:
-    """Return the places of keys that are unique in both, as long as possible in one order."""
+def _anchors(a: Keys, b: Keys) -> list[tuple[int, int]]:
+    """Return the places of keys that are unique in both, as many as possible in one order."""
     unique_a, first_a, count_a = np.unique(a, return_index=True, return_counts=True)
     unique_b, first_b, count_b = np.unique(b, return_index=True, return_counts=True)
     single_a, single_b = count_a == 1, count_b == 1
@@ -120,29 +145,7 @@ def _anchors(a: Keys, b: Keys) -> tuple[list[int], list[int]]:
     at_a, at_b = first_a[single_a][in_a], first_b[single_b][in_b]
     order = np.argsort(at_a)
     at_a, at_b = at_a[order], at_b[order]
-    if not len(at_b) or bool((np.diff(at_b) > 0).all()):
-        return at_a.tolist(), at_b.tolist()
-    chosen = _longest_increasing(at_b.tolist())
-    return at_a[chosen].tolist(), at_b[chosen].tolist()
-
-
-def _longest_increasing(values: list[int]) -> list[int]:
-    """Return the places of a longest increasing subsequence."""
-    ends: list[int] = []
-    end_places: list[int] = []
-    before: list[int] = []
-    for place, value in enumerate(values):
-        length = bisect_left(ends, value)
-        before.append(end_places[length - 1] if length else -1)
-        if length == len(ends):
-            ends.append(value)
-            end_places.append(place)
-        else:
-            ends[length] = value
-            end_places[length] = place
-    chosen = []
-    place = end_places[-1]
-    while place >= 0:
-        chosen.append(place)
-        place = before[place]
-    return chosen[::-1]
+    if len(at_b) and not bool((np.diff(at_b) > 0).all()):
+        chosen = sorted(longest_increasing(at_b.tolist()))
+        at_a, at_b = at_a[chosen], at_b[chosen]
+    return list(zip(at_a.tolist(), at_b.tolist(), strict=True))

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from functools import cached_property
 from typing import Any
 
 from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.settings import Setting
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.finding import Source
@@ -52,6 +53,7 @@ class Relevance:
 
     run_a: Run
     run_b: Run
+    _used: dict[str, set[str]] = field(default_factory=dict)
 
     def of(self, settings: Sequence[Setting], place: Place) -> tuple[Setting, ...]:
         """Return the settings that can be why the runs diverge there."""
@@ -75,9 +77,14 @@ class Relevance:
         return True
 
     def _is_code_of(self, module: str, place: Place) -> bool:
-        """Whether a module is one that the nodes may use: not that of another node alone."""
-        owners = {name for name, of in self._modules.items() if of == module}
+        """Whether a module is one that the nodes may use: not that of other nodes alone."""
+        owners = {name for name, of in self._modules.items() if module in self._used_by(of)}
         return not owners or not place.nodes or bool(owners & place.nodes)
+
+    def _used_by(self, module: str) -> set[str]:
+        if module not in self._used:
+            self._used[module] = used_by(self._traces, module)
+        return self._used[module]
 
     def _draws(self, place: Place) -> bool:
         """Whether a node draws random numbers; what the guard does not see is taken for drawn."""

@@ -6,6 +6,7 @@ None of it is a divergence by itself, and any of it may be why there is one.
 from __future__ import annotations
 
 from rsltrace.diff.alignment.entity_matching import EntityMatching
+from rsltrace.diff.causes.module_code import same_code
 from rsltrace.diff.result.settings import Setting
 from rsltrace.trace.format import METADATA_EDITS, METADATA_SOURCES
 from rsltrace.trace.reader import Trace
@@ -14,7 +15,8 @@ _ENTITIES_MAX = 50
 
 
 def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
-    """Return edits that differ, modules of the nodes whose code differs, versions that differ."""
+    """Return edits that differ, modules of the nodes whose code differs (comments and layout are
+    no code), versions that differ."""
     found = []
     if (edits_a := _edits(a)) != (edits_b := _edits(b)):
         found.append(Setting("edits", edits_a, edits_b))
@@ -22,7 +24,7 @@ def environment_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         of_a = a.environment if record is None else a.metadata(record)
         of_b = b.environment if record is None else b.metadata(record)
         for name in sorted({*of_a, *of_b}):
-            if of_a.get(name) != of_b.get(name):
+            if of_a.get(name) != of_b.get(name) and not (record and same_code(a, b, name)):
                 place = name.replace("file:", "file ") if name[:5] == "file:" else f"{label} {name}"
                 found.append(Setting(place, of_a.get(name), of_b.get(name)))
     return tuple(found)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import payload_lines
 from rsltrace.diff.report.frame import head_lines, next_section, notes_section
@@ -28,6 +30,18 @@ from rsltrace.diff.result.bags import (
 )
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
+
+_COLUMNS = (
+    ("equal", "equal"),
+    ("tolerated", "tolerated"),
+    ("ignored", "ignored"),
+    ("differ", "differing"),
+    ("moved", "moved"),
+    ("only a", "only_a"),
+    ("only b", "only_b"),
+)
+_RARE = ("ignored", "moved")
+"""Shown only where some topic has any."""
 
 
 def bag_report(
@@ -73,6 +87,9 @@ def _message(found: MessageDivergence, width: int) -> Section:
             cells.append([(name, style), (f"message {message.index}", ""), (time, "")])
     rows += in_columns(cells)
     only = None if found.presence is Presence.BOTH else found.a or found.b
+    if found.note:
+        only = found.a
+        rows.append(line(f"    {found.note}: the same message"))
     preview = only.preview if only is not None else ""
     rows += payload_lines(found.fields, found.more_fields, preview, found.reason, width)
     return Section(line((title, Style.TITLE)), rows, 14, "lines", least=6)
@@ -95,12 +112,18 @@ def _brief(message: BagMessage) -> Line:
 
 
 def _topics(diff: BagDiff, width: int) -> Section:
-    names = ("equal", "tolerated", "differ", "only a", "only b", "first at")
-    header: list[Piece] = [("topic", Style.FAINT), *((name, Style.FAINT) for name in names)]
+    columns = [
+        (name, attribute)
+        for name, attribute in _COLUMNS
+        if attribute not in _RARE or any(getattr(topic, attribute) for topic in diff.topics)
+    ]
+    names = ("topic", *(name for name, _ in columns), "first at")
+    header: list[Piece] = [(name, Style.FAINT) for name in names]
+    attributes = [attribute for _, attribute in columns]
     shared = sorted(diff.topics, key=_first_place)
-    cells = [header, *(_topic_cells(topic) for topic in shared)]
-    for lone, at in ((diff.topics_only_a, 4), (diff.topics_only_b, 5)):
-        cells += [_lone_cells(topic, at) for topic in lone]
+    cells = [header, *(_topic_cells(topic, attributes) for topic in shared)]
+    for lone, side in ((diff.topics_only_a, "a"), (diff.topics_only_b, "b")):
+        cells += [_lone_cells(topic, attributes, side) for topic in lone]
     rows = [cut(row, width) for row in in_columns(cells)]
     return Section(rows[0], rows[1:], 4, "topics")
 
@@ -109,8 +132,8 @@ def _first_place(topic: TopicDiff) -> tuple[bool, int]:
     return (topic.first is None, topic.first.after_ns if topic.first else 0)
 
 
-def _topic_cells(topic: TopicDiff) -> list[Piece]:
-    counts = (topic.equal, topic.tolerated, topic.differing, topic.only_a, topic.only_b)
+def _topic_cells(topic: TopicDiff, attributes: Sequence[str]) -> list[Piece]:
+    counts = [getattr(topic, attribute) for attribute in attributes]
     when = f"{format_seconds(topic.first.after_ns)} s" if topic.first is not None else ""
     style = Style.BAD if topic.diverged else ""
     return [
@@ -120,12 +143,10 @@ def _topic_cells(topic: TopicDiff) -> list[Piece]:
     ]
 
 
-def _lone_cells(topic: LoneTopic, at: int) -> list[Piece]:
-    cells: list[Piece] = [
+def _lone_cells(topic: LoneTopic, attributes: Sequence[str], side: str) -> list[Piece]:
+    counts = [topic.messages if name == f"only_{side}" else 0 for name in attributes]
+    return [
         (printable(topic.topic), Style.BAD),
-        *[("0", Style.FAINT)] * 5,
-        ("no such topic", ""),
+        *((str(count), "" if count else Style.FAINT) for count in counts),
+        (f"only in {side}", ""),
     ]
-    cells[at] = (str(topic.messages), "")
-    cells[-1] = (f"only in {'a' if at == 4 else 'b'}", "")
-    return cells

@@ -86,7 +86,8 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     if diff.tolerance is None:
         return []
     if diff.within_tolerance:
-        how = "but for what is ignored" if diff.tolerance.identical else "within tolerance"
+        tolerated = any(topic.tolerated for topic in diff.tolerance.topics)
+        how = "within tolerance" if tolerated else "but for what is ignored"
         text = f"equal {how}, not identical: the digests differ"
     else:
         said = printable(diff.tolerance.sentence).replace("The recordings", "the messages", 1)

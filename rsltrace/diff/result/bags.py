@@ -62,7 +62,8 @@ class MessageDivergence:
     ``a`` or ``b`` is None where that side has no counterpart. ``after_ns`` is how long after the
     start of its recording the message was logged. ``before`` are the last messages of the topic
     before it (in a, or in b where a has none). ``fields`` and ``more_fields`` say what differs;
-    ``reason`` why nothing can be said.
+    ``reason`` why nothing can be said. ``note``: both have the message, but in another place of the
+    topic: ``messages 4 and 5 are swapped``.
     """
 
     topic: str
@@ -74,6 +75,7 @@ class MessageDivergence:
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
     reason: str = ""
+    note: str = ""
     before: tuple[BagMessage, ...] = ()
 
 
@@ -82,7 +84,8 @@ class TopicDiff:
     """How the messages of one topic compare; ``first`` is None if nothing but tolerance is between.
 
     ``equal`` messages are the same bit for bit in every field that is compared, ``tolerated`` ones
-    within tolerance. The four other counts never include these. ``type_b`` differs from ``type_a``
+    within tolerance, ``ignored`` ones but for fields that are not compared, ``moved`` ones the same
+    but in another order. The other counts never include these. ``type_b`` differs from ``type_a``
     only where the recordings disagree about the topic's type.
     """
 
@@ -94,12 +97,19 @@ class TopicDiff:
     differing: int
     only_a: int
     only_b: int
+    ignored: int = 0
+    moved: int = 0
     first: MessageDivergence | None = None
 
     @property
     def diverged(self) -> bool:
-        """Whether some message differs, is missing or is extra."""
-        return bool(self.differing or self.only_a or self.only_b)
+        """Whether some message differs, is missing, is extra or changed its place."""
+        return bool(self.differing or self.only_a or self.only_b or self.moved)
+
+    @property
+    def agreeing(self) -> int:
+        """How many messages are equal, or are so within tolerance and but for what is ignored."""
+        return self.equal + self.tolerated + self.ignored
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +151,7 @@ class BagDiff:
 
     @property
     def within_tolerance(self) -> bool:
-        """Whether messages differ, but none by more than is tolerated."""
+        """Whether messages differ, but none by more than is tolerated or ignored."""
         return self.verdict is BagVerdict.WITHIN_TOLERANCE
 
     @property
@@ -164,10 +174,10 @@ class BagDiff:
         """0 equal, 1 different or cut, 3 equal within tolerance; trouble is raised instead."""
         if self.diverged or (self.agrees_until_cut and not self._is_enough):
             return EXIT_DIVERGED
-        tolerated = any(topic.tolerated for topic in self.topics)
+        tolerated = any(topic.tolerated or topic.ignored for topic in self.topics)
         return EXIT_WITHIN_TOLERANCE if tolerated else 0
 
     @property
     def _is_enough(self) -> bool:
         """Whether agreeing as far as they go was asked for, and something agrees."""
-        return self.as_far_as_they_go and any(t.equal or t.tolerated for t in self.topics)
+        return self.as_far_as_they_go and any(t.agreeing for t in self.topics)

@@ -1,0 +1,80 @@
+"""What is kept of the code of modules: comments and layout do not count, imports are followed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rsltrace.run.module_code import module_code
+
+CODE = 'import pkg.gains\n\n\ndef go(x):\n    """Go."""\n    return [x, 1.5]\n'
+
+
+def code_hash(folder: Path, text: str | bytes) -> str:
+    path = folder / "node.py"
+    path.write_bytes(text.encode() if isinstance(text, str) else text)
+    return str(json.loads(module_code({"node": path})["node"])["hash"])
+
+
+@pytest.mark.parametrize(
+    "same",
+    [
+        CODE.replace("\n\n\n", "\n# what this does\n\n"),
+        CODE.replace("[x, 1.5]", "[\n        x,  # the first\n        1.50,\n    ]"),
+        CODE.replace("return [x, 1.5]", "return ([x, 1.5])"),
+        CODE.replace("\n", "\r\n"),
+    ],
+)
+def test_comments_and_layout_are_no_change(tmp_path: Path, same: str) -> None:
+    assert code_hash(tmp_path, same) == code_hash(tmp_path, CODE)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        CODE.replace("1.5", "1.6"),
+        CODE.replace("Go.", "Stop."),
+        CODE.replace("[x, 1.5]", "(x, 1.5)"),
+        CODE.replace("def go(x)", "async def go(x)"),
+    ],
+)
+def test_anything_else_is_a_change(tmp_path: Path, other: str) -> None:
+    assert code_hash(tmp_path, other) != code_hash(tmp_path, CODE)
+
+
+def test_imports_are_those_of_the_modules_that_are_known(tmp_path: Path) -> None:
+    texts = {
+        "pkg": "",
+        "pkg.node": "import os, pkg.gains as g\nfrom . import filters\nfrom .deep import a\n",
+        "pkg.gains": "def late():\n    from .filters import low_pass\n",
+        "pkg.filters": "",
+        "pkg.deep.a": "from ..gains import G\nimport numpy\n",
+        "pkg.deep": "from ... import nothing\n",
+    }
+    files = {}
+    for number, (name, text) in enumerate(texts.items()):
+        is_package = name in ("pkg", "pkg.deep")
+        files[name] = tmp_path / str(number) / ("__init__.py" if is_package else "module.py")
+        files[name].parent.mkdir()
+        files[name].write_text(text)
+    found = {name: json.loads(text)["imports"] for name, text in module_code(files).items()}
+    assert found == {
+        "pkg": [],
+        "pkg.node": ["pkg", "pkg.deep", "pkg.deep.a", "pkg.filters", "pkg.gains"],
+        "pkg.gains": ["pkg", "pkg.filters"],
+        "pkg.filters": [],
+        "pkg.deep.a": ["pkg", "pkg.gains"],
+        "pkg.deep": [],
+    }
+
+
+@pytest.mark.filterwarnings("error")
+def test_what_is_not_python_is_left_out(tmp_path: Path) -> None:
+    files = {}
+    for name, text in (("bad.py", "def ("), ("nul.py", "a\0"), ("x.so", "1"), ("odd.py", r"'\d'")):
+        files[name] = tmp_path / name
+        files[name].write_text(text)
+    files["gone"] = tmp_path / "gone.py"
+    assert list(module_code(files)) == ["odd.py"]
