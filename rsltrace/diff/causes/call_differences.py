@@ -6,6 +6,8 @@ import re
 from itertools import zip_longest
 
 from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.event_views import node_of
+from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.divergence import CallDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.finding import Finding
@@ -21,15 +23,15 @@ def call_differences(
 ) -> tuple[CallDifference, ...]:
     """Return the calls made inside two events, those with different answers first.
 
-    If all answers agree, the first calls before them in the same node that gave different ones
-    come first: what a node read earlier may show only now.
+    If all answers agree, the first calls before them in the same node, or when its modules were
+    imported, that gave different ones come first: what was read earlier may show only now.
     """
     inside = _paired(_inside(run_a, a), _inside(run_b, b))
     differing = [call for call in inside if call.a != call.b]
     if differing:
         return (*differing, *(call for call in inside if call.a == call.b))[:CALLS_MAX]
     some = a or b
-    node = some.entity.node if some is not None else ""
+    node = node_of(some) if some is not None else ""
     # Where one run has no such event: up to there the two agree, indexes and all.
     before = _paired(_before(run_a, a or b, node), _before(run_b, b or a, node)) if node else []
     earlier = [call for call in before if call.a != call.b][:EARLIER_MAX]
@@ -43,8 +45,27 @@ def _inside(run: Run, view: EventView | None) -> list[Finding]:
 def _before(run: Run, view: EventView | None, node: str) -> list[Finding]:
     if view is None:
         return []
-    events = run.trace.findings.items()
-    return [f for index, found in events if index < view.index for f in found if f.node == node]
+    files = _files_of(run, node)
+    return [
+        finding
+        for index, found in run.trace.findings.items()
+        for finding in found
+        if (index < view.index and finding.node == node) or _is_of_import(finding, files)
+    ]
+
+
+def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
+    """Whether a call was made while a module was imported, for no node in particular."""
+    place, _, function = finding.stack.partition("\n")[0].partition(" in ")
+    return not finding.node and function == "<module>" and place.rpartition(":")[0] in files
+
+
+def _files_of(run: Run, node: str) -> frozenset[str]:
+    """Return the files of the modules that a node uses, as places in code name them."""
+    found = (e.type for e in run.trace.entities.values() if e.name == node and e.type)
+    module = next(found, "").partition(":")[0]
+    names = [name.replace(".", "/") for name in used_by((run.trace, run.trace), module) if name]
+    return frozenset(f"{name}{end}" for name in names for end in (".py", "/__init__.py"))
 
 
 def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:

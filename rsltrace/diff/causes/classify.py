@@ -63,6 +63,9 @@ class Case:
     periods: tuple[int, int] | None = None
     """Of a timer, its period in both runs (ns), if they differ."""
 
+    slept: str = ""
+    """How long a callback slept, if that differs."""
+
     swapped_with_ns: int | None = None
     """When the bag of b plays what the bag of a plays here, and the other way round."""
 
@@ -279,6 +282,8 @@ def _timing(case: Case, a: EventView, b: EventView) -> Judgement:
         )
         if case.periods is not None:
             sentence += f": timer period {durations(*case.periods)}"
+        elif case.slept:
+            sentence += f": it {case.slept}"
     else:
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} was due at another time in a than in b"
     return Judgement(
@@ -382,6 +387,8 @@ def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
         sentence += " and sent the same, but left its node in another state"
         sentence += state_text(case.state)
+    elif case.slept:
+        sentence = f"{phrase(a)} {at_time(a.stamp_ns)} {case.slept}{what_differs(case.messages)}"
     else:
         sentence += f" and did something else{what_differs(case.messages)}"
     return Judgement(

@@ -12,6 +12,7 @@ from rsltrace.diff.causes.call_differences import call_differences
 from rsltrace.diff.causes.classify import ROOT_OF, Case, Judgement, judge
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
+from rsltrace.diff.causes.likely_cause import with_likely_cause
 from rsltrace.diff.causes.lost_messages import lost_message
 from rsltrace.diff.causes.message_differences import message_differences
 from rsltrace.diff.causes.propagation import BUSY, DRAWN, NODE, STUCK, FoundDivergence, Origin
@@ -19,9 +20,9 @@ from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.causes.swapped import swapped_with
+from rsltrace.diff.causes.waits import slept_text
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import (
-    CallDifference,
     CauseStep,
     Divergence,
     MessageDifference,
@@ -31,7 +32,6 @@ from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
-from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 
 ANCESTORS_MAX = 5
@@ -147,6 +147,7 @@ class Explainer:
                 state=state_differences(self.run_a, self.run_b, a, b),
                 lost=lost_message(self.run_a, self.run_b, a, b),
                 periods=self._periods(a, b),
+                slept=slept_text(self.run_a, self.run_b, a, b),
                 swapped_with_ns=swapped_with(self.run_a, self.run_b, a, b),
             )
         )
@@ -257,13 +258,16 @@ class Explainer:
         place_a = judgement.a.index if judgement.a is not None else found.place_a
         place_b = judgement.b.index if judgement.b is not None else found.place_b
         calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b)
+        if found.origin.previous is None:
+            run = self.run_b if judgement.a is None else self.run_a
+            judgement = with_likely_cause(judgement, run, messages, calls, self._relevance)
         bare = Divergence(
             verdict=judgement.verdict,
             sentence=judgement.sentence,
             a=judgement.a,
             b=judgement.b,
             root=judgement.root,
-            root_sentence=_with_call(judgement, calls),
+            root_sentence=judgement.root_sentence,
             chain=self._chain(found),
             messages=messages,
             calls=calls,
@@ -346,28 +350,6 @@ def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
     matching = explainer.run_a.matching
     alone_a = matching.by_key[a.entity] in matching.only_a
     return bool(a.entity.type) and alone_a and matching.by_key[b.entity] in matching.only_b
-
-
-def _with_call(judgement: Judgement, calls: Sequence[CallDifference]) -> str:
-    """Say which call explains a root, if one that gave different answers does."""
-    if judgement.root not in _BY_CALLS or not calls or not judgement.root_sentence:
-        return judgement.root_sentence
-    call = calls[0]
-    place = f"{call.call} at {call.where.partition(' in ')[0]}"
-    if call.a == call.b:
-        return judgement.root_sentence
-    if call.a is None or call.b is None:
-        name = "b" if call.a is None else "a"
-        return f"{judgement.root_sentence}; {place} was called only in {name}"
-    a, b = (shortened(printable(value), _ANSWER_MAX) for value in (call.a, call.b))
-    return f"{place} gave {a} in a, {b} in b"
-
-
-_ANSWER_MAX = 60
-_BY_CALLS = frozenset(
-    (Root.CALLBACK, Root.TIMING, Root.MISSING, Root.EXTRA, Root.EXCEPTION, Root.SCHEDULE)
-)
-"""Roots that what a node read from outside can be behind."""
 
 
 _SHARED = {DRAWN: "is drawn otherwise again in", BUSY: "keeps waiting", STUCK: "ended before"}

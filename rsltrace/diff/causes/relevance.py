@@ -17,7 +17,7 @@ from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.settings import Setting
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.finding import Source
+from rsltrace.model.finding import Mode, Source
 from rsltrace.trace.reader import Trace
 
 _NEVER = frozenset(("record", "livelock_limit", "stop", "vars"))
@@ -133,6 +133,16 @@ class Relevance:
     def guard_is_off(self) -> bool:
         """Whether one of the runs had ``guard: false``."""
         return not all(map(_is_guarded, self._jobs))
+
+    @cached_property
+    def sets_are_in_order(self) -> bool:
+        """Whether both runs went through sets in an order that does not change."""
+        return all(
+            _is_guarded(job)
+            and _value(job, "guard", "order", "mode") in (None, Mode.VIRTUAL.value)
+            and not any(_value(node, "guard") for node in job.get("nodes") or [])
+            for job in self._jobs
+        )
 
     @cached_property
     def _traces(self) -> tuple[Trace, Trace]:

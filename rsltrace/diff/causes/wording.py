@@ -11,6 +11,9 @@ from rsltrace.diff.result.settings import Setting
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import shortened
 
+MADE_DIFFERENTLY = "the runs were made differently"
+"""How settings that can be the cause are introduced."""
+
 NAMED_MAX = 3
 _VALUE_MAX = 40
 _SETTING_MAX = 60
@@ -58,7 +61,7 @@ def because_of(settings: Sequence[Setting]) -> str:
     """Say that the runs were made differently, and how; "" if they were not."""
     if not settings:
         return ""
-    return f"the runs were made differently: {listed([_setting_text(one) for one in settings])}"
+    return f"{MADE_DIFFERENTLY}: {listed([_setting_text(one) for one in settings])}"
 
 
 def _setting_text(setting: Setting) -> str:

@@ -75,8 +75,8 @@ class MessageDivergence:
     fields: tuple[FieldDifference, ...] = ()
     more_fields: int = 0
     reason: str = ""
-    note: str = ""
     before: tuple[BagMessage, ...] = ()
+    note: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,9 +97,9 @@ class TopicDiff:
     differing: int
     only_a: int
     only_b: int
+    first: MessageDivergence | None = None
     ignored: int = 0
     moved: int = 0
-    first: MessageDivergence | None = None
 
     @property
     def diverged(self) -> bool:

@@ -1,0 +1,98 @@
+"""What came from outside and is likely behind a divergence: who read what, and what it was."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.classify import Judgement
+from rsltrace.diff.causes.event_views import node_of
+from rsltrace.diff.causes.relevance import Relevance
+from rsltrace.diff.causes.set_order import set_behind
+from rsltrace.diff.causes.wording import MADE_DIFFERENTLY
+from rsltrace.diff.result.divergence import CallDifference, MessageDifference
+from rsltrace.diff.result.verdicts import Root
+from rsltrace.model.finding import Source
+from rsltrace.model.printable import printable, shortened
+
+_ANSWER_MAX = 60
+_VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
+_FILE = re.compile(r"\w[\w.]*\((['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
+_CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
+_VERBS = {
+    Source.ENVIRONMENT: "read",
+    Source.FILE: "read",
+    Source.DIRECTORY: "listed",
+    Source.CLOCK: "read",
+    Source.RANDOM: "drew",
+    Source.SOCKET: "called",
+}
+
+
+_OPEN_TO_IT = frozenset(
+    (Root.CALLBACK, Root.TIMING, Root.MISSING, Root.EXTRA, Root.EXCEPTION, Root.SCHEDULE, Root.JOB)
+)
+"""Roots that what a node read from outside can be behind."""
+
+
+def with_likely_cause(
+    judgement: Judgement,
+    run: Run,
+    messages: Sequence[MessageDifference],
+    calls: Sequence[CallDifference],
+    relevance: Relevance,
+) -> Judgement:
+    """Return a verdict on a root that names what explains it: the first of ``calls`` if its answers
+    differ, or a set whose order shows. ``run`` is one that has the event."""
+    view = judgement.a or judgement.b
+    if judgement.root not in _OPEN_TO_IT or not judgement.root_sentence or view is None:
+        return judgement
+    if calls and calls[0].a != calls[0].b:
+        text = call_sentence(calls[0], node_of(view))
+    else:
+        text = set_behind(run, view, messages, calls, relevance)
+    if not text:
+        return judgement
+    _, made_differently, others = judgement.root_sentence.partition(MADE_DIFFERENTLY)
+    why = f"{text}; and {made_differently}{others}" if made_differently else text
+    sentence = f"{judgement.sentence}; likely cause: {text}"
+    return replace(judgement, sentence=sentence, root_sentence=why)
+
+
+def call_sentence(call: CallDifference, node: str) -> str:
+    """Return ``/picker read MOTOR_SEED, 6 in a and 4 in b, at picker.py:24``."""
+    source = Source(call.source)
+    place = call.where.partition(" in ")[0]
+    done = (
+        f"{node or 'the run'} {_VERBS.get(source, 'called')} {printable(_what(source, call.call))}"
+    )
+    if call.a is None or call.b is None:
+        return f"{done} only in {'b' if call.a is None else 'a'}, at {place}"
+    a, b = _answers(source, call.a, call.b)
+    return f"{done}, {a} in a and {b} in b, at {place}"
+
+
+def _what(source: Source, call: str) -> str:
+    if source is Source.ENVIRONMENT and (found := _VARIABLE.fullmatch(call)):
+        return found[2]
+    if source is Source.FILE and (found := _FILE.match(call)):
+        return found[2]
+    return call
+
+
+def _answers(source: Source, a: str, b: str) -> tuple[str, str]:
+    contents = _CONTENT.fullmatch(a), _CONTENT.fullmatch(b)
+    if contents[0] and contents[1] and contents[0][1] == contents[1][1]:
+        a, b = contents[0][2], contents[1][2]
+    if source is Source.ENVIRONMENT:
+        a, b = _unquoted(a), _unquoted(b)
+    a, b = (shortened(printable(value), _ANSWER_MAX) for value in (a, b))
+    return a, b
+
+
+def _unquoted(text: str) -> str:
+    inner = text[1:-1]
+    quoted = len(text) > 2 and text[0] == text[-1] == "'"
+    return inner if quoted and re.fullmatch(r"[\w./:+-]+", inner) else text
