@@ -19,7 +19,7 @@ from rsltrace.errors import GuardError
 from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.library_imports import present_import
-from rsltrace.guard.object_numbers import ObjectNumbers
+from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
 from rsltrace.guard.random_streams import RandomStreams
 from rsltrace.guard.real_time import RealTimePace
 from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_answer, finding_value
@@ -91,6 +91,7 @@ class Guard:
         self.descriptors = DescriptorTable()
         self.pace = RealTimePace()
         self.numbers = ObjectNumbers()
+        self.shown = ShownNumbers()
         self._policy = policy
         self._thread = _thread_id()
         self.process = _process_id()

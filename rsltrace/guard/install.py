@@ -13,6 +13,7 @@ from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.virtual.clocks import virtual_clocks
 from rsltrace.guard.virtual.directory_listings import sorted_listings
 from rsltrace.guard.virtual.module_caches import fresh_module_caches
+from rsltrace.guard.virtual.object_texts import numbered_texts
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.watched.functions import watched_calls
 
@@ -21,6 +22,7 @@ _REPLACEMENTS = (
     virtual_clocks,
     virtual_randomness,
     sorted_listings,
+    numbered_texts,
     watched_calls,
     recorded_files,
     recorded_descriptors,

@@ -11,7 +11,8 @@ import enum
 import itertools
 import types
 import weakref
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -124,8 +125,38 @@ class ObjectNumbers:
             self._describe(value, parts, depth + 1)
 
 
+class ShownNumbers:
+    """Numbers of the objects that were shown in a text, by the node that first did."""
+
+    def __init__(self) -> None:
+        self._kept: dict[int, tuple[Callable[[], Any], int]] = {}
+        self._last: Counter[str] = Counter()
+
+    def number(self, node: str, thing: Any) -> int | None:
+        """Return an object's number, the next of the node if it has none; None for those that
+        cannot be recognised, since they take no weak reference."""
+        key, kept = _address(thing), self._kept
+        found = kept.get(key)
+        if found is not None and found[0]() is thing:
+            return found[1]
+        self._last[node] += 1
+        number = self._last[node]
+
+        def forget(gone: weakref.ref[Any]) -> None:
+            if key in kept and kept[key][1] == number:
+                del kept[key]
+
+        try:
+            kept[key] = weakref.ref(thing, forget), number
+        except TypeError:
+            if type(thing) is not object:  # of these, most are kept anyway, as marks
+                return None
+            kept[key] = (lambda: thing), number
+        return number
+
+
 def _has_plain_data(array: np.ndarray[Any, Any]) -> bool:
     return not array.dtype.hasobject and array.nbytes <= _ARRAY_BYTES_MAX
 
 
-__all__ = ["ObjectNumbers"]
+__all__ = ["ObjectNumbers", "ShownNumbers"]

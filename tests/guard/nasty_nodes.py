@@ -410,9 +410,29 @@ def sorted_by_id(node: Any) -> object:
     return [next(n for n, t in enumerate(things) if t is thing) for thing in in_order]
 
 
-@case(DETECTED, "an address in a log record (the default `repr`)")
+@case(DETERMINISTIC, "an address in a log record (the default `repr`)")
 def default_repr(node: Any) -> object:
     return repr(Thing())
+
+
+@case(DETERMINISTIC, "objects sorted by their `repr`")
+def sorted_by_repr(node: Any) -> object:
+    things = [Thing() for _ in range(200)]
+    in_order = sorted(things, key=repr)
+    return [next(n for n, t in enumerate(things) if t is thing) for thing in in_order]
+
+
+@case(DETERMINISTIC, "the texts of functions, methods and generators")
+def texts_of_functions(node: Any) -> object:
+    return repr([lambda: node, node.create_timer, (n for n in (1, 2))])
+
+
+@case(DETECTED, "an address of an object with `__slots__` in a log record")
+def repr_without_weak_reference(node: Any) -> object:
+    class Slotted:
+        __slots__ = ()
+
+    return repr(Slotted())
 
 
 @case(DETECTED, "`ctypes.addressof`")
@@ -443,7 +463,7 @@ def heap_by_id(node: Any) -> object:
     return [heapq.heappop(heap)[2] for _ in range(200)]
 
 
-@case(DETECTED, "an address in a traceback's text")
+@case(DETERMINISTIC, "an address in a traceback's text")
 def traceback_with_address(node: Any) -> object:
     try:
         raise ValueError(Thing())
@@ -451,7 +471,7 @@ def traceback_with_address(node: Any) -> object:
         return traceback.format_exc()
 
 
-@case(DETECTED, "`json.dumps` with `default=repr`")
+@case(DETERMINISTIC, "`json.dumps` with `default=repr`")
 def json_of_objects(node: Any) -> object:
     return json.dumps({"thing": Thing()}, default=repr)
 

@@ -1,0 +1,96 @@
+"""Texts of objects that have none of their own: a number of the run's in place of the address.
+
+``<Robot object at 0x7f…>`` goes into log records, keys and sorted lists. ``object.__repr__`` and
+those of functions, generators and coroutines are exchanged for the time of a run; every type that
+takes its text from them is told to look for it by name.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from sys import _getframe
+from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
+from typing import Any
+
+from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.model.finding import Mode, Source
+
+_WORDS_BEFORE_REPR = 11
+_REPR_AT = _WORDS_BEFORE_REPR * ctypes.sizeof(ctypes.c_void_p)
+"""Where a type of CPython keeps the function that makes its text, at least since 3.8; checked."""
+_SHOWN_ALIKE = (FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType)
+
+
+class _HasNone:
+    pass
+
+
+class _HasOne:
+    def __repr__(self) -> str:
+        return ""
+
+
+def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
+    def __repr__(self: Any, /) -> str:  # noqa: N807
+        text = real(self)
+        guard = engaged()
+        if guard is None or guard.mode(Source.ADDRESS, _getframe(1)) is Mode.ALLOW:
+            return text
+        with engage(None):
+            address = f"0x{id(self):x}"
+            return text.replace(address, _shown(guard, self) or address)
+
+    return __repr__
+
+
+def _shown(guard: Guard, thing: Any) -> str | None:
+    """Return what stands for the address of an object: the node's number for it, in hexadecimal.
+
+    Addresses do not begin like that. None for an object that cannot be recognised later.
+    """
+    node = guard.context.node()
+    number = guard.shown.number(node, thing)
+    if number is None:
+        return None
+    return f"0x52{zlib.crc32(node.encode('utf-8', 'replace')) & 0xFFFF:04x}{number * 16:06x}"
+
+
+@contextmanager
+def numbered_texts() -> Iterator[None]:
+    """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
+    with ExitStack() as stack:
+        slots = {kind: _slot(kind).value for kind in (object, *_SHOWN_ALIKE)}
+        by_name = _slot(_HasOne).value
+        if slots[object] == _slot(_HasNone).value != by_name != _slot(int).value:
+            for kind, slot in slots.items():
+                exchange(stack, kind, "__repr__", _numbered)
+                for one in _all_below(kind):
+                    if _slot(one).value == slot:
+                        stack.callback(_set_slot, one, slot)
+                        _set_slot(one, by_name)
+        yield
+
+
+def _slot(kind: type) -> ctypes.c_void_p:
+    return ctypes.c_void_p.from_address(id(kind) + _REPR_AT)
+
+
+def _set_slot(kind: type, value: int | None) -> None:
+    _slot(kind).value = value
+
+
+def _all_below(kind: type) -> set[type]:
+    """Return a type with all that are derived from it."""
+    found, waiting = {kind}, [kind]
+    while waiting:
+        new: set[type] = set(type.__subclasses__(waiting.pop())) - found
+        found |= new
+        waiting += new
+    return found
+
+
+__all__ = ["numbered_texts"]
