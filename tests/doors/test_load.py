@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import cProfile
 import pstats
+import subprocess
+import sys
+from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -87,3 +90,42 @@ def test_the_work_of_a_job_file_grows_with_its_entries(
         return work_of(path, tmp_path / "run.mcap")
 
     assert growth(work) < 2.2
+
+
+_SHARED = """
+import gc, sys
+from rsltrace import Job, NodeSpec, Simulation, StopSpec
+from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.handles.node import NodeHandle
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+def many():
+    nodes = []
+    for index in range(100):
+        node = Node(f"node_{index}")
+        publisher = node.create_publisher(UInt64, "count", 1)
+        node.create_subscription(UInt64, "count", lambda message: None, 1)
+        node.create_timer(0.5, lambda publisher=publisher: publisher.publish(UInt64()))
+        nodes.append(node)
+    return nodes
+
+with Simulation(Job(nodes=[NodeSpec(node=many)], stop=StopSpec(duration=1.0))) as simulation:
+    simulation.run()
+    gc.unfreeze()
+    for handle in gc.get_objects():
+        if isinstance(handle, (EntityHandle, NodeHandle)):
+            own = vars(handle)
+            print(type(handle).__name__, sys.getsizeof(own) < sys.getsizeof(dict(own)))
+"""
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="3.10 shares by other rules")
+def test_handles_share_the_names_of_their_attributes(tmp_path: Path) -> None:
+    """Else each has a table of its own of 1.5 kB, and 200 nodes do not fit into the cache."""
+    program = tmp_path / "program.py"
+    program.write_text(_SHARED)
+    done = subprocess.run([sys.executable, program], capture_output=True, text=True, check=True)
+    found = Counter(done.stdout.split("\n"))
+    assert found["NodeHandle True"] == found["SubscriptionHandle True"] == 100, found
+    assert not [line for line in found if line.endswith("False")]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.doors.rclpy.handles.destroyable import Destroyable
 from rsltrace.doors.rclpy.handles.node import NodeHandle
@@ -12,6 +12,9 @@ from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.middleware.entity import DomainEntity, Runnable, callback_name
 from rsltrace.middleware.receiver import Receiver
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 _LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
 
@@ -29,13 +32,21 @@ class EntityHandle(Destroyable, DomainEntity):
     """Name of the rclpy Node attribute that lists the wrappers."""
     begins_active = False
     stacks: Stacks
-    wrapper: Any = None
-    own_group = False
+    wrapper: Any
+    own_group: bool
     """Whether its callback group is of a class of the user's own."""
-    _listed: tuple[Any, Any] | None = None
+    _listed: tuple[Any, Any] | None
     """Node and wrapper, if somebody else has met them while looking for its own."""
 
     destroy = DomainEntity.destroy
+
+    def __new__(cls, *_: object, **__: object) -> Self:
+        # What a wrapper brings, which comes late. CPython lets objects share the table of their
+        # attributes' names as long as none of them gets a new one after many have been made.
+        self = super().__new__(cls)
+        self.wrapper = self._listed = None
+        self.own_group = False
+        return self
 
     def get_logger_name(self) -> str:
         """Return the node's logger name."""

@@ -47,7 +47,6 @@ class NodeHandle(Destroyable, Participant):
     """
 
     destroy = Participant.destroy
-    wrapper: Any = None
 
     def __init__(
         self,
@@ -83,7 +82,8 @@ class NodeHandle(Destroyable, Participant):
         given = entry.arguments if entry is not None else []
         own = given if programs.is_hosted else program.parameters
         self._outer = [context.arguments, *own] if use_global_arguments else []
-        self.entry_key = entry.key if entry is not None else ""
+        self._entry = entry
+        self.wrapper: Any = None
         self.process = program
         self.stacks = stacks
         self.real = real
@@ -97,7 +97,6 @@ class NodeHandle(Destroyable, Participant):
         self.state = states.add(self)
         self.mailbox: Mailbox | None = None
         self.rosout: DomainEntity | None = None
-        self.log_exceptions = entry is not None and entry.log_exceptions
         self._made = _node_being_made()
         self.user_waitables: dict[Any, Any] = {}
         self.waitable_count = 0
@@ -109,6 +108,16 @@ class NodeHandle(Destroyable, Participant):
         said = [each.rosout() for each in [*self._outer, self.arguments]]
         if enable_rosout and next((s for s in reversed(said) if s is not None), True):
             logs.attach(self, rosout_qos)
+
+    @property
+    def entry_key(self) -> str:
+        """The key of the job's entry that made it; empty if none did."""
+        return self._entry.key if self._entry is not None else ""
+
+    @property
+    def log_exceptions(self) -> bool:
+        """Whether a callback of its that raises is logged instead of ending the run."""
+        return self._entry is not None and self._entry.log_exceptions
 
     def _number_among_others(self) -> None:
         """Tell the node apart from others of its name. ROS allows that; it is seldom meant."""
