@@ -15,6 +15,7 @@ from contextlib import suppress
 from types import FrameType
 from typing import Any
 
+from rsltrace.debug.source import is_users
 from rsltrace.errors import DebugError
 from rsltrace.guard.guard import engage
 
@@ -67,7 +68,7 @@ class Conversation:
 
 
 class CallbackPdb(pdb.Pdb):
-    """Stops in the first line of what it calls that is neither ours nor rclpy's."""
+    """Stops in the first line of the user's in what it calls."""
 
     def __init__(self, conversation: Conversation) -> None:
         super().__init__(
@@ -85,7 +86,10 @@ class CallbackPdb(pdb.Pdb):
             super().user_call(frame, argument_list)
 
     def user_line(self, frame: FrameType) -> None:
-        """Stop at a line."""
+        """Stop at a line, the first of which is the user's."""
+        if not (self._has_begun or is_users(frame.f_code)):
+            self.set_step()
+            return
         self._has_begun = True
         super().user_line(frame)
 

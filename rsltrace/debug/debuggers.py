@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import inspect
 import select
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from types import CodeType
 from typing import Any, Protocol
 
 from rsltrace.debug.lines import Lines, Message
+from rsltrace.debug.source import code_of
 from rsltrace.debug.view import View
 
 Calls = Callable[..., None]
@@ -70,21 +69,13 @@ def _under_debugpy(copy: Copy, port: int) -> Calls:
         with copy.outside():
             if not editor.is_connected:
                 copy.end_apart(ok={"ended": "the editor has disconnected", "raised": ""})
-            code = code_of(callback)
+            code = code_of(copy.view.call.callback)
             if is_first and code is not None:
                 is_first.clear()
                 editor.stop_in(code)
         editor.call(callback, args)
 
     return calls
-
-
-def code_of(callback: Any) -> CodeType | None:
-    """Return the code of a callback, None if it is not written in Python."""
-    callback = getattr(callback, "func", callback)
-    callback = inspect.unwrap(getattr(callback, "__func__", callback))
-    code = getattr(callback, "__code__", None)
-    return code if isinstance(code, CodeType) else None
 
 
 def _end_when_told(copy: Copy) -> None:

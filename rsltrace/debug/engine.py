@@ -14,6 +14,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from greenlet import getcurrent, greenlet
+
 from rsltrace.debug import inspection
 from rsltrace.debug.conditions.message_fields import loaded_fields
 from rsltrace.debug.conditions.names import Names, names_of
@@ -23,11 +25,12 @@ from rsltrace.debug.forking import end_process, fork_beside, why_not
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described
 from rsltrace.debug.lines import Lines, Message
-from rsltrace.debug.view import View
+from rsltrace.debug.view import NO_CALL, Call, View, call_of
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.guard.guard import engage
 from rsltrace.guard.redirect import copy_of
 from rsltrace.model.event import EventKind
+from rsltrace.trace.format import EVENT_REST
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
@@ -77,6 +80,10 @@ class Engine:
         self._next_checkpoint_s = 0.0
         self._hit: Message | None = None
         self._copied_at = -1
+        self._calls: dict[greenlet, Call] = {}
+        """What each stack has called that is not yet over."""
+        self._is_unasked = False
+        """Whether a callback goes on of which nobody knows yet if that makes an event."""
         self._apart_calls: Callable[..., None] | None = None
         """What calls callbacks in a copy made for a debugger."""
         dispatcher = session.world.domain.dispatcher
@@ -84,6 +91,7 @@ class Engine:
         self._execute = dispatcher.execute
         dispatcher.end_event = self._ended  # type: ignore[method-assign]
         dispatcher.execute = self._executed  # type: ignore[method-assign, assignment]
+        dispatcher.on_resume = self._resumed
         ledger.on_difference = self._differs
 
     # -- where it is called ------------------------------------------------------------------------
@@ -96,7 +104,10 @@ class Engine:
 
     def _executed(self, handle: Any, entity: int, node: Any, kind: int, *rest: Any) -> None:
         """Stand in for ``Dispatcher.execute``."""
-        self.view.callback, self.view.args = rest[:2]
+        here = getcurrent()
+        outer = self._calls.get(here)
+        self._calls[here] = self.view.call = call_of(*rest[:2])
+        self._is_unasked = False
         if self._goal.asks_before:
             event = self.event
             event.handle, event.entity, event.node, event.kind = handle, entity, node, kind
@@ -104,6 +115,37 @@ class Engine:
         if self._apart_calls is not None:
             rest = (self._apart_calls, rest[:2], *rest[2:])
         self._execute(handle, entity, node, kind, *rest)
+        if outer is None:
+            del self._calls[here]
+        else:
+            self._calls[here] = outer  # which spins, and has run this one
+
+    def _resumed(self) -> None:
+        """See, on the stack of a callback that goes on, whether to stop before it does."""
+        self.view.call = self._calls.get(getcurrent(), NO_CALL)
+        self._is_unasked = False
+        if not self._goal.asks_before:
+            return
+        with engage(None):
+            is_event = self._is_event()
+        if is_event:
+            self._about_to_run()
+        elif is_event is None:
+            self._is_unasked, self._mark = True, 0
+
+    def _is_event(self) -> bool | None:
+        """Say whether a callback that goes on makes an event; None if nobody knows: one that spins
+        does so only if something comes of it."""
+        event = self.event
+        if not event.quiet:
+            return True
+        try:
+            rest, _ = self.ledger.history.row(self.ledger.events)
+        except IndexError:
+            return None if self.ledger.history.trace is None else False
+        known = EVENT_REST.unpack(rest)
+        now_ns = self.session.loop.now_ns
+        return (known[9], known[6], known[1]) == (EventKind.RESUME, event.entity, now_ns)
 
     def _differs(self) -> None:
         self.diverged = True
@@ -119,6 +161,10 @@ class Engine:
                 return
             if goal.after and self._ask(goal.after, index):
                 return
+            if self._is_unasked:
+                self._is_unasked = False
+                if self._ask(goal.before, index, before=True):
+                    return
             limit = self.ledger.history.limit
             if limit is not None and index >= limit:
                 self.over = self._why_over()
@@ -167,11 +213,12 @@ class Engine:
                     return
                 self.view.is_next = False
 
-    def _ask(self, watched: list[Watched], index: int) -> bool:
-        """Ask conditions; True if one of them has stopped the run."""
+    def _ask(self, watched: list[Watched], index: int, *, before: bool = False) -> bool:
+        """Ask conditions; True if one of them has stopped the run. ``before`` asks what was to be
+        asked before the event that has ended."""
         is_next = self.view.is_next
         for one in watched:
-            ask = one.armed.before if is_next else one.armed.after
+            ask = one.armed.before if is_next or before else one.armed.after
             try:
                 why = ask(self.view)
             except RsltraceError as error:

@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 import reprlib
+from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.debug.conditions.expressions import parse_expression
 from rsltrace.debug.conditions.names import nodes_called, short_name
+from rsltrace.debug.source import source
 from rsltrace.errors import DebugError, did_you_mean
 from rsltrace.middleware.overview import overview
 from rsltrace.middleware.receiver import Receiver
 
 if TYPE_CHECKING:
     from rsltrace.debug.conditions.names import Names
+    from rsltrace.debug.ledger import Ledger
     from rsltrace.debug.view import View
     from rsltrace.run.session import Session
 
 _JSON_BYTES_MAX = 1 << 20
-_SOURCE_LINES_MAX = 400
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 2000
@@ -33,6 +34,7 @@ class Standing(Protocol):
 
     view: View
     session: Session
+    ledger: Ledger
 
     def names(self) -> Names:
         """Return the names in the run."""
@@ -206,34 +208,14 @@ def message(run: Standing) -> dict[str, Any] | None:
     }
 
 
-def source(run: Standing) -> dict[str, Any] | None:
-    """Return file, first line, name and lines of the callback of the present event."""
-    found: Any = run.view.callback
-    found = getattr(found, "func", found)
-    found = inspect.unwrap(getattr(found, "__func__", found))
-    code = getattr(found, "__code__", None)
-    if code is None:
-        return None
-    try:
-        lines, first = inspect.getsourcelines(code)
-    except (OSError, TypeError):
-        lines, first = [], code.co_firstlineno
-    return {
-        "file": code.co_filename,
-        "line": first,
-        "name": getattr(found, "__qualname__", code.co_name),
-        "lines": [line.rstrip("\n") for line in lines[:_SOURCE_LINES_MAX]],
-    }
-
-
-INSPECTED = {
+INSPECTED: dict[str, Callable[[Standing], Any]] = {
     "nodes": nodes,
     "queues": queues,
     "timers": timers,
     "stacks": stacks,
     "graph": graph,
     "message": message,
-    "source": source,
+    "source": lambda run: source(run.view, run.ledger),
 }
 
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rsltrace.debug.conditions.view import Sent
+from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import get_message_class
 from rsltrace.model.event import OutputKind
@@ -17,11 +18,22 @@ if TYPE_CHECKING:
     from rsltrace.run.session import Session
 
 
+class Call(NamedTuple):
+    """What an event calls, with its arguments; ``task`` runs it if it is a coroutine."""
+
+    callback: Any
+    args: tuple[Any, ...]
+    task: TaskRun | None = None
+
+
+NO_CALL = Call(None, ())
+
+
 class View:
     """An ``EventView``: ``is_next`` says that the event is about to run, else it has just ended.
 
     One object serves a whole run; what it says is what is true when it is asked.
-    ``callback`` is what is called then, with ``args``.
+    ``call`` is what is called then.
     """
 
     def __init__(self, session: Session, ledger: Ledger) -> None:
@@ -29,8 +41,7 @@ class View:
         self._event = self._domain.event
         self._ledger = ledger
         self.is_next = False
-        self.callback: Any = None
-        self.args: tuple[Any, ...] = ()
+        self.call = NO_CALL
 
     @property
     def stamp_ns(self) -> int:
@@ -85,8 +96,11 @@ class View:
         return 0 if self.is_next else self._ledger.output_hash
 
     def received(self) -> tuple[str, object] | None:
-        """Return topic (or service) and message of its input, None if it has no message."""
-        message = self.args[0] if self.args else None
+        """Return topic (or service) and message of its input, None if it has no message.
+
+        Of a callback that goes on, that with which it began.
+        """
+        message = self.call.args[0] if self.call.args else None
         if not hasattr(message, "get_fields_and_field_types"):
             return None
         return self.entity_name, message
@@ -116,6 +130,12 @@ class View:
     def findings(self) -> Sequence[str]:
         """Return what the guard found in it (``clock``, ``random``); before it runs, nothing."""
         return () if self.is_next else [one.source.value for one in self._ledger.findings]
+
+
+def call_of(callback: Any, args: tuple[Any, ...]) -> Call:
+    """Return what of the user's an event calls: a task calls a coroutine."""
+    task = getattr(callback, "__self__", None)
+    return Call(*task.called, task) if isinstance(task, TaskRun) else Call(callback, args)
 
 
 def _decoded(type_name: str, data: bytes) -> object:

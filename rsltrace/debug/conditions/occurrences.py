@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from rsltrace.debug.conditions.condition import Armed, is_true, shown, shown_text
 from rsltrace.debug.conditions.expressions import Expression
 from rsltrace.debug.conditions.view import EventView, Sent
-from rsltrace.model.event import OutputKind
+from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.words.matching import is_named
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
@@ -69,8 +69,8 @@ class OnTopic(Armed):
     expression: Expression | None = None
 
     def before(self, view: EventView) -> str:
-        """Look at the input."""
-        found = view.received()
+        """Look at the input, which a callback has when it begins, not when it goes on."""
+        found = None if view.kind == EventKind.RESUME else view.received()
         if found is None or not is_named(self.pattern, found[0]):
             return ""
         return self._why(f"{view.node} receives {found[0]}", view, found[1])

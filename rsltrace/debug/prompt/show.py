@@ -209,5 +209,7 @@ def source_lines(source: Mapping[str, Any] | None) -> Iterator[str]:
         yield "(its source is not here)"
     first = int(source["line"])
     width = len(str(first + len(lines)))
+    at = source.get("at")
+    sign = "" if at is None else "   "
     for number, line in enumerate(lines, first):
-        yield printable(f"{number:>{width}}  {line}".rstrip())
+        yield printable(f"{'-> ' if number == at else sign}{number:>{width}}  {line}".rstrip())

@@ -37,6 +37,8 @@ class Dispatcher:
         self.unrecorded = 0
         self.on_node: Callable[..., None] | None = None
         """Told which node's code is going to run (or ``is_made``), if somebody has to know."""
+        self.on_resume: Callable[[], None] | None = None
+        """Told, on its own stack, that a callback goes on after a wait, if somebody has to know."""
         self.door: Door
 
     def execute(

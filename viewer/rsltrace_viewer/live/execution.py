@@ -25,12 +25,14 @@ _ADDRESS = re.compile(r" at 0x[0-9a-f]+(?=>)")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The callback of an event: ``line`` is the number of the first of ``lines``."""
+    """The callback of an event: ``line`` is the number of the first of ``lines``, ``at`` that of
+    the one at which it waits."""
 
     file: str
     line: int
     name: str
     lines: tuple[str, ...]
+    at: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,7 +166,7 @@ class Execution:
         if not found:
             return None
         lines = tuple(str(line) for line in found["lines"])
-        return Source(str(found["file"]), int(found["line"]), str(found["name"]), lines)
+        return Source(found["file"], int(found["line"]), found["name"], lines, found["at"])
 
     def _value(self, expression: str, node: str) -> str:
         for owner in (node, None):

@@ -56,10 +56,12 @@ class SourceView(VerticalScroll, can_focus=True):
                 theme="ansi_light" if light else "ansi_dark",
                 line_numbers=True,
                 start_line=source.line,
+                highlight_lines=set() if source.at is None else {source.at},
                 background_color="default",
             )
         )
-        self.scroll_home(animate=False)
+        above = 0 if source.at is None else source.at - source.line - self.size.height // 2
+        self.scroll_to(0, max(above, 0), animate=False)
 
 
 class BreakpointsPanel(Static):

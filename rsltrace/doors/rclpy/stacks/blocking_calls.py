@@ -130,6 +130,8 @@ def set_aside(stacks: Stacks) -> Iterator[None]:
         event.cause_event, event.cause_output = stacks.loop.events - 1, 0
         programs.constructing, event.on_end = constructing, on_end
         event.quiet = True
+        if dispatcher.on_resume is not None:
+            dispatcher.on_resume()
 
 
 def _refuse(stacks: Stacks) -> NoReturn:

@@ -59,7 +59,8 @@ class Coroutines:
 class TaskRun:
     """One rclpy Task under way: started once, resumed as often as it awaits.
 
-    ``cause_event``, ``cause_output`` and ``input_hash`` belong to the next dispatch.
+    ``called`` is what it runs, and with which arguments. ``cause_event``, ``cause_output`` and
+    ``input_hash`` belong to the next dispatch.
     """
 
     def __init__(
@@ -67,6 +68,7 @@ class TaskRun:
         coroutines: Coroutines,
         task: Any,
         *,
+        called: tuple[Callable[..., Any], tuple[Any, ...]],
         entity: int,
         node: Any,
         kind: int,
@@ -78,6 +80,7 @@ class TaskRun:
         self.domain = coroutines.domain
         self.mailbox = mailbox
         self.task = task
+        self.called = called
         self.entity = entity
         self.node = node
         self.kind = kind

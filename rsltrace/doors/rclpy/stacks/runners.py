@@ -182,6 +182,8 @@ class Wait:
         event.busy_ns = self._busy_ns
         if self.program is not programs.present:
             self.program.enter()
+        if dispatcher.on_resume is not None:
+            dispatcher.on_resume()
 
     def runnable(self) -> Runnable:
         """Describe it to a policy: a callback under way goes on, and has its worker."""

@@ -58,6 +58,7 @@ def start_coroutine(
     run = TaskRun(
         stacks.coroutines,
         Task(callback, args, None, executor=executor_of(stacks, handle)),
+        called=(callback, args),
         entity=handle.entity_id,
         node=handle.node,
         kind=kind,
@@ -94,6 +95,7 @@ def create_task(
     run = TaskRun(
         stacks.coroutines,
         task,
+        called=(callback, args),
         entity=event.entity,
         node=event.node,
         kind=_TASK,
