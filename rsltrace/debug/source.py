@@ -38,7 +38,7 @@ def source(view: View, ledger: Ledger) -> dict[str, Any] | None:
     ``at`` is the line at which that waits, or is about to go on; None where it does neither.
     """
     frame = _frame(view) if _is_inside(view, ledger) else None
-    code = code_of(view.call.callback) if frame is None else frame.f_code
+    code = code_of(_function(view)) if frame is None else frame.f_code
     if code is None or not is_users(code):
         return None
     try:
@@ -52,6 +52,14 @@ def source(view: View, ledger: Ledger) -> dict[str, Any] | None:
         "lines": [line.rstrip("\n") for line in lines[:_LINES_MAX]],
         "at": None if frame is None else frame.f_lineno,
     }
+
+
+def _function(view: View) -> Any:
+    """Return what is called: of an event that has made a node, its constructor."""
+    if view.kind == EventKind.CONSTRUCT:
+        made = view.nodes().get(view.node or view.entity_name)
+        return None if made is None else type(made).__init__
+    return view.call.callback
 
 
 def _is_inside(view: View, ledger: Ledger) -> bool:
