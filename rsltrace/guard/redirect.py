@@ -115,9 +115,15 @@ def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) ->
 
 
 def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
-    """Return a second function object that does what ``function`` does now."""
+    """Return a second function object that does what ``function`` does now.
+
+    Of one that is redirected that is what it calls: its definition will go.
+    """
     place = _Function.from_address(id(function))
     definition = place.definition
+    if definition and _MethodDef.from_address(definition).function == _CALL:
+        target: Callable[..., Any] = function.__self__  # type: ignore[assignment]
+        return target
     name = _MethodDef.from_address(definition).name if definition else None
     owner = function.__self__
     if name != function.__name__.encode() or place.owner not in (None, id(owner)):

@@ -124,7 +124,13 @@ def _paths_exist(job: JobFields) -> Iterator[Problem]:
         for index, node in enumerate(job.nodes)
         if node.script is not None
     ]
-    for place, file in [*scripts, *job.model_files()]:
+    typed = [
+        (("nodes", index, "stdin", number, "file"), item.file)
+        for index, node in enumerate(job.nodes)
+        for number, item in enumerate(node.stdin or ())
+        if item.file is not None
+    ]
+    for place, file in [*scripts, *typed, *job.model_files()]:
         path = job.resolve(file)
         if not path.is_file():
             what = "is not a file" if path.exists() else "there is no such file"

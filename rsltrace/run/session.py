@@ -190,6 +190,7 @@ class Session:
 
     def _open(self, stack: ExitStack) -> None:
         from rsltrace.doors.rclpy.boundary.installation import check_free
+        from rsltrace.doors.rclpy.world import World  # keeps functions that the guard redirects
 
         check_free()
         expanded = expand(self.job, why_not=why_not)
@@ -197,7 +198,7 @@ class Session:
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
         self._guarded = install_guard(stack, self.job)
-        self._make_world(stack)
+        self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():
             self._import_what_is_named()
@@ -227,10 +228,8 @@ class Session:
             for note in self._notes:
                 self._observer.note(note)
 
-    def _make_world(self, stack: ExitStack) -> None:
+    def _make_world(self, stack: ExitStack, kind: type[World]) -> None:
         """Make the loop and the world that the job describes, still without nodes."""
-        from rsltrace.doors.rclpy.world import World
-
         job = self.job
         self.loop = loop = self._kind_of_loop()(
             start_ns=self.start_ns if job.construct_time_ns is None else job.construct_time_ns,
@@ -242,7 +241,7 @@ class Session:
         )
         loop.min_step_ns = job.min_time_step_ns
         self.world = world = stack.enter_context(
-            World(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
+            kind(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
@@ -350,7 +349,7 @@ class Session:
             )
             self.world.domain.watch(self.job.stop.topic.name, watch)
         with self._failures(), self._engaged():
-            self.world.plan(self._entries)
+            self.world.plan(self._entries, self.start_ns)
             self.world.stacks.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
             for entry in later:

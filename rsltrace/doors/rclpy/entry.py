@@ -25,6 +25,11 @@ class StartRule:
     ended: str | None = None
 
 
+Typed = tuple[int | None, bytes | None]
+"""What is typed at once, None for the end of the input, and when (ns since the start of the run),
+None for when it is asked for."""
+
+
 @dataclass(frozen=True, slots=True)
 class Entry:
     """One entry of a job, ready to be constructed.
@@ -45,6 +50,8 @@ class Entry:
     """The command line, if ``make`` is a main to be run in a program of its own."""
     start_after: StartRule | None = None
     """When it starts, None for those that start with the run."""
+    stdin: Sequence[Typed] | None = None
+    """What is typed at its terminal, None if it has none."""
 
 
 def ros_arguments(

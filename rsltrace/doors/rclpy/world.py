@@ -37,6 +37,7 @@ from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_waiting
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.starts import Starts
 from rsltrace.doors.rclpy.stacks.threads import cooperative_threads
+from rsltrace.doors.rclpy.terminals.calls import Terminals, simulated_terminals
 from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.errors import DeadlockError, JobError, RunError
 from rsltrace.loop.loop import EventLoop
@@ -72,6 +73,7 @@ class World:
         self.domain.dispatcher.door = RclpyDoor(self.stacks, self._logs)
         self._surroundings = Surroundings(self.stacks, self._logs, self.states)
         self._boundary: Boundary
+        self._terminals: Terminals
         self._stack = ExitStack()
         self.constructed: list[Entry] = []
         """The entries in the order in which they have been constructed."""
@@ -97,6 +99,7 @@ class World:
             stack.enter_context(own_process_ends(stacks))
             stack.enter_context(forked_children_end(stacks))
             stack.enter_context(own_signal_handlers(stacks))
+            self._terminals = stack.enter_context(simulated_terminals(stacks))
             rclpy.init(args=[])
             stacks.runners.main = getcurrent()
             stacks.executor = SimExecutor(stacks, rclpy.get_default_context())
@@ -135,10 +138,12 @@ class World:
         """Give what nodes send delays and losses. Before the first node is made."""
         self.domain.transport.network = Network(self.domain.dispatcher, plan)
 
-    def plan(self, entries: Sequence[Entry]) -> None:
-        """Say what will be constructed: a main that ends must know of those that begin later."""
+    def plan(self, entries: Sequence[Entry], start_ns: int) -> None:
+        """Say what will be constructed, and when the run starts: a main that ends must know of
+        those that begin later."""
         programs = self.stacks.programs
         programs.all = [Program(programs, entry) for entry in entries if entry.argv is not None]
+        self._terminals.make(programs.all, start_ns)
 
     @contextmanager
     def importing(self) -> Iterator[None]:

@@ -159,6 +159,7 @@ class _Maker:
                 "entry_shorthand",
                 "value_shorthand",
                 "words",
+                "or_text",
                 "names",
             ):
                 value = getattr(function, name, None)
@@ -169,6 +170,8 @@ class _Maker:
         schema = self._by_type(annotation, facts)
         if "words" in facts:  # that stand for a whole list
             return {"anyOf": [{"enum": list(facts["words"])}, schema]}
+        if "or_text" in facts:
+            return {"anyOf": [{"type": "string"}, schema]}
         return schema
 
     def _by_type(self, annotation: Any, facts: Schema) -> Schema:

@@ -12,6 +12,7 @@ from pydantic import Field, model_validator
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.part import Part
 from rsltrace.job.parts.start_after import StartAfterSpec
+from rsltrace.job.parts.stdin import InputSpec, inputs
 from rsltrace.job.values.checks import attach, check, items, one_of, part, text
 from rsltrace.job.values.names import (
     check_executable,
@@ -232,6 +233,12 @@ class NodeSpec(Part):
         "started or ended.",
         examples=["2s", {"service": "/set_mode"}, {"ended": "my_robot/calibrate", "delay": "1s"}],
     )
+    stdin: Annotated[tuple[InputSpec, ...] | None, inputs] = Field(
+        default=None,
+        description="What is typed at the terminal that it reads from (`input()`, `sys.stdin`, "
+        "`termios`, `curses`): the name of a text file, or a list. Not for a `node`.",
+        examples=["answers.txt", ["start", {"at": "2s", "keys": "wwq"}]],
+    )
     # Not a key of a job file: where the entry came from, if not from the job itself.
     origin: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None, exclude=True, repr=False
@@ -255,6 +262,7 @@ class NodeSpec(Part):
             arguments: dict[str, Any] | Sequence[str] = ...,
             on_exception: Literal["stop", "log"] = "stop",
             start_after: StartAfterSpec | dict[str, Any] | TimeLike | None = None,
+            stdin: str | Sequence[InputSpec | dict[str, Any] | str] | None = None,
             origin: str | None = None,
             guard: GuardSpec | dict[str, Any] | bool | None = None,
         ) -> None: ...
@@ -281,6 +289,13 @@ class NodeSpec(Part):
                 f"{_WITH_WORDS}",
                 ("arguments",),
             )
+        if self.node is not None and self.stdin is not None:
+            raise Problem(
+                "a 'node' has no terminal of its own, all of them are in one process: give a "
+                f"function that spins it as {_WITH_WORDS}",
+                ("stdin",),
+                at_key=True,
+            )
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
             raise Problem(
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
@@ -296,8 +311,8 @@ class NodeSpec(Part):
     @property
     def absent(self) -> tuple[str, ...]:
         """The keys that stand for other kinds of entries, and those that only some entries have."""
-        later = () if self.start_after is not None else ("start_after",)
-        return (*(name for name in _KINDS if name != self.kind), *later)
+        not_given = [name for name in ("start_after", "stdin") if getattr(self, name) is None]
+        return (*(name for name in _KINDS if name != self.kind), *not_given)
 
     @property
     def target(self) -> str:

@@ -34,7 +34,7 @@ class _Probe(Session):
         hooks = int(self.job.hooks.before is not None)
         found, place = None, -1
         with self._failures(), self._engaged():
-            world.plan(self._entries)
+            world.plan(self._entries, self.start_ns)
             while found is None and not self.ended and place + 1 < len(self._entries):
                 place += 1
                 world.construct(self._entries[place])

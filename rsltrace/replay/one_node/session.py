@@ -149,7 +149,7 @@ class FedSession(Session):
         entries = dict(zip(unit.entries, self._entries, strict=True))
         last = 0
         with self._failures(), self._engaged():
-            world.plan(self._entries)
+            world.plan(self._entries, self.start_ns)
             world.stacks.programs.fed = True
             for place, event in enumerate(self._columns.constructions):
                 entry = entries.get(unit.entry_of(place))

@@ -20,6 +20,7 @@ from rsltrace.job.values.target import Target, target_text
 from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.executables import Mains
 from rsltrace.run.plans.target import load_target
+from rsltrace.run.plans.typed import typed_at
 
 _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
@@ -69,6 +70,7 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
                 start_after=_start_rule(job, spec, keys),
+                stdin=typed_at(job, index),
             )
         )
     return entries

@@ -1,9 +1,9 @@
 """One executable of a job: its ``main``, and what a process of its own would have.
 
 All mains of a job run in one process. What rclpy and Python keep per process (the default context,
-the global executor, ``sys.argv``, ``sys.path``, the module ``__main__``) is exchanged whenever the
-loop goes over to another main, so each finds its own. The nodes that the job itself constructs
-share one program, the host.
+the global executor, ``sys.argv``, ``sys.path``, ``sys.stdin``, the module ``__main__``) is
+exchanged whenever the loop goes over to another main, so each finds its own. The nodes that the job
+itself constructs share one program, the host.
 """
 
 from __future__ import annotations
@@ -56,6 +56,10 @@ class Programs:
         self.fed = False
         self.to_come: list[str] = []
         self.listeners: list[Callable[[str, str], None]] = []
+        self.stdin_of: Callable[[Program], Any] = lambda program: sys.stdin
+        """Returns the ``sys.stdin`` that a program begins with."""
+        self.on_enter: Callable[[Program], None] = lambda program: None
+        """Told which program's code is going to run."""
 
     def tell(self, what: str, key: str) -> None:
         """Say in the event under way that an entry has "started" or "ended"."""
@@ -113,16 +117,17 @@ class Program:
         before._kept = [names[name] for names, name, _ in places]
         if self._kept is None:
             self._kept = [first for _, _, first in places]
-            self._kept[:3] = self._first_values()
+            self._kept[:4] = self._first_values()
         for (names, name, _), value in zip(places, self._kept, strict=True):
             names[name] = value
+        self._programs.on_enter(self)
 
     def _first_values(self) -> tuple[object, ...]:
-        """Return what a process begins with: its arguments, its ``__main__``, where it imports."""
+        """Return what a process begins with: arguments, ``__main__``, where it imports, stdin."""
         argv = None if self.entry is None else self.entry.argv
         main = ModuleType("__main__")
         vars(main).update(__builtins__=builtins, __annotations__={})
-        return argv, main, list(sys.path)
+        return argv, main, list(sys.path), self._programs.stdin_of(self)
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -157,6 +162,7 @@ def _places() -> list[tuple[dict[str, Any], str, object]]:
         (vars(sys), "argv", None),
         (sys.modules, "__main__", None),
         (vars(sys), "path", None),
+        (vars(sys), "stdin", None),
         (vars(rclpy), "__executor", None),
         (vars(rclpy.utilities), "g_default_context", None),
         (vars(rclpy.context), "g_logging_ref_count", 0),
