@@ -171,14 +171,27 @@ def record_in(
     The trace goes to ``path``, or below ``folder`` under a name of its own. Paths in ``arguments``
     must be absolute.
     """
+    path = path or folder / f"{_name(around)}.mcap"
+    words = record_words(arguments, path)
+    done = run_in(around, words, folder, processes=processes, timeout_s=timeout_s)
+    return recorded(around, path, done)
+
+
+def run_in(
+    around: Surroundings,
+    words: Sequence[str],
+    folder: Path,
+    *,
+    processes: Processes | None = None,
+    timeout_s: float | None = None,
+) -> Done:
+    """Run ``rsltrace`` in a process with these surroundings. Paths in ``words`` are absolute."""
     values = around.values
-    name = "-".join(("run", str(around.number), *around.alone.split()))
-    cwd = folder / f"{name}.cwd" / values.get(FOLDER, ".")
+    cwd = folder / f"{_name(around)}.cwd" / values.get(FOLDER, ".")
     cwd.mkdir(parents=True, exist_ok=True)
-    path = path or folder / f"{name}.mcap"
     command = [sys.executable]
     command += ["-c", _NOISE, values[HEAP]] if HEAP in values else ["-m", "rsltrace"]
-    command += record_words(arguments, path)
+    command += words
     if "nice" in values.get(LOAD, "") and shutil.which("nice"):
         command = ["nice", "-n", "5", *command]
     if ADDRESSES not in values and can_fix_addresses():
@@ -186,8 +199,11 @@ def record_in(
     started = processes or Processes()
     load = started.beside([sys.executable, "-c", _BUSY]) if LOAD in values else nullcontext()
     with load:
-        done = started.run(command, cwd=cwd, env=_environment(values, cwd), timeout_s=timeout_s)
-    return recorded(around, path, done)
+        return started.run(command, cwd=cwd, env=_environment(values, cwd), timeout_s=timeout_s)
+
+
+def _name(around: Surroundings) -> str:
+    return "-".join(("run", str(around.number), *around.alone.split()))
 
 
 def record_words(arguments: Sequence[str], path: Path) -> list[str]:
