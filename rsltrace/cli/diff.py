@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
 
 _FORMATS = ("text", "json", "markdown", "junit", "github")
-_WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 140
+_WIDTH, _WIDTH_MIN, _WIDTH_MAX = 100, 60, 200
 _HEIGHT_MIN = 21
 _PROMPTS = 3
 """Lines a terminal shows beside the report: the command, perhaps on two lines, and the prompt."""
@@ -280,7 +280,7 @@ def _screen() -> tuple[int, int]:
 
     size = shutil.get_terminal_size((_WIDTH, HEIGHT + _PROMPTS))
     width = min(max(size.columns, _WIDTH_MIN), _WIDTH_MAX)
-    return width, min(max(size.lines - _PROMPTS, _HEIGHT_MIN), HEIGHT)
+    return width, max(size.lines - _PROMPTS, _HEIGHT_MIN)
 
 
 def _encodable(text: str) -> str:

@@ -104,7 +104,9 @@ class Search:
             if (left := _LEFT.search(said)) is not None:
                 self._on_note(f"revisions left after this one: {left[1]}, runs: about {left[2]}")
             elif "merge base must be tested" in said:
-                self._on_note("neither end comes from the other: the commit where they part is run")
+                self._on_note(
+                    "neither end comes from the other: the commit where they diverge is run"
+                )
             said = tree.bisect(self._at(tree.head).answer.value)
 
     # -- the ends --------------------------------------------------------------------------------

@@ -32,7 +32,7 @@ from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
-from rsltrace.model.stamp import format_seconds
+from rsltrace.words.phrases import seconds_text
 
 ANCESTORS_MAX = 5
 """Events told that led to a root: both runs have them, they only say how it came to run."""
@@ -315,13 +315,13 @@ class Explainer:
             if "://" in f"{path_a} {path_b}":  # which the viewer does not open
                 return f"rsltrace diff {path_a} {path_b} --all"
             return f"rsltrace view {path_a} {path_b}"
-        until = format_seconds(view.stamp_ns)
+        until = seconds_text(view.stamp_ns)
         if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
                 last = max(v.stamp_ns for v in (judgement.a, judgement.b) if v is not None)
-                again = f"{record.command} --until {format_seconds(last)} -o again.mcap --force"
+                again = f"{record.command} --until {seconds_text(last)} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
         path = path_a if judgement.a is not None else path_b
         node = view.entity.node

@@ -61,7 +61,7 @@ def bag_report(
         for topic in diff.topics:
             if topic.first is not None and topic.first is not diff.first:
                 sections.append(_message(topic.first, width))
-    sections.append(next_section(diff.next_step))
+    sections.append(next_section(diff.next_step, width=width))
     return fitted(head, sections, None if options.everything else height)
 
 

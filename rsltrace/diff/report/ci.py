@@ -45,7 +45,8 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
     lines = []
     for diff in diffs:
         level = "error" if diff.failed else "notice"
-        title = f"rsltrace: {diff.b.path} against {diff.a.path}: {diff.verdict.value}"
+        how = "diverges from" if diff.diverged else "compared with"
+        title = f"rsltrace: {diff.b.path} {how} {diff.a.path}: {diff.verdict.value}"
         text = plain_text(report_lines(diff, options)) if diff.failed else _message(diff)
         place = f"{_place(diff)},title={command_property(printable(title))}"
         lines.append(f"::{level} {place}::{command_data(text)}")

@@ -32,6 +32,9 @@ from rsltrace.words.phrases import seconds_text
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
 _DEPTH_MAX = 6
+_SIDE_BY_SIDE = 100
+"""Columns of a screen in which two lists of events stand side by side."""
+
 _REACHES_LINES = 2
 
 
@@ -54,11 +57,12 @@ def _event(found: Divergence, width: int) -> Section:
     assert some is not None or not found.messages
     if a is not None and b is not None and a.entity == b.entity and a.kind is b.kind:
         title = event_text(a)
-        if min(a.position, b.position) >= 0:
-            title += f", its event {a.position + 1}"
-            title += f" (b: {b.position + 1})" if a.position != b.position else ""
         if (a.index, a.stamp_ns) == (b.index, b.stamp_ns):
             title = f"event {a.index}, {format_seconds(a.stamp_ns)} s: {title}"
+        if min(a.position, b.position) >= 0:
+            counted = f", its event {a.position + 1}"
+            counted += f" (b: {b.position + 1})" if a.position != b.position else ""
+            title += counted if len(title) + len(counted) <= width else ""
         if not title.startswith("event ") or a.flags != b.flags or not found.messages:
             rows += _did([("a", Style.SIDE_A, a), ("b", Style.SIDE_B, b)], width)
         if code := printable(a.code or b.code):
@@ -122,7 +126,8 @@ def _state(found: Divergence, width: int) -> Section:
         )
         for one in found.state
     ]
-    return Section(line(("state of the node after it", Style.TITLE)), rows, 6, "values", least=2)
+    title = line(("state of the node after it", Style.TITLE))
+    return Section(title, rows, 6, "values", least=2, rank=3)
 
 
 def _value(value: str | None) -> str:
@@ -135,6 +140,8 @@ def _calls(found: Divergence, width: int) -> Section:
         return NOTHING
     rows = []
     here = {view.index for view in (found.a, found.b) if view is not None}
+    place = found.calls[0].where.partition(" in ")[0]
+    rank = 8 if place in found.root_sentence else 2  # said there, too
     for call in found.calls:
         events = [event for event in (call.event_a, call.event_b) if event is not None]
         earlier = "" if here.intersection(events) else f", event {events[0]}"
@@ -154,9 +161,9 @@ def _calls(found: Divergence, width: int) -> Section:
         rows.append(cut(line((f"      at {printable(call.where)}", Style.FAINT)), width))
     if len(rows) == 2:  # one call, with its answers beside it, and where it was made
         rows[0] = cut(line(("call from outside: ", Style.TITLE), *rows[0][1:]), width)
-        return Section((), rows, 2, "", least=1)
+        return Section((), rows, 2, "", least=1, rank=rank)
     title = "calls whose answers come from outside"
-    return Section(line((title, Style.TITLE)), rows, 8, "lines", least=3)
+    return Section(line((title, Style.TITLE)), rows, 8, "lines", least=3, rank=rank)
 
 
 def _cause(found: Divergence, width: int) -> Section:
@@ -168,7 +175,8 @@ def _cause(found: Divergence, width: int) -> Section:
     rows = [cut(_step(step, at, last=at == last), width) for at, step in enumerate(found.chain)]
     if last == 0:
         rows = []  # the divergence itself, which is shown already
-    return Section(title, [*more, *rows], 5, "steps", least=2, drop="middle")
+    fixed = len(more)
+    return Section(title, [*more, *rows], fixed + 4, "steps", fixed + 2, "middle", fixed=fixed)
 
 
 def _step(step: CauseStep, depth: int, *, last: bool) -> Line:
@@ -217,32 +225,54 @@ def _listed(
     if alike:
         rows = [cut(row, width) for row in in_columns([event_cells(e) for e in a], widest=52)]
         heading = line((f"{title} (the same in both)", Style.TITLE))
-        return Section(heading, rows, keep, "events", least, drop="first")
-    heading = line(
-        (f"{title} ", Style.TITLE), ("(a left, b right; = is the same in both)", Style.FAINT)
-    )
-    return Section(heading, _side_by_side(a, b, width), keep, "events", least, drop="first")
+        return Section(heading, rows, keep, "events", least, drop="first", rank=7)
+    if width < _SIDE_BY_SIDE:
+        how, rows = "(= is the same in both)", _below_each_other(a, b, width)
+    else:
+        how, rows = "(a left, b right; = is the same in both)", _side_by_side(a, b, width)
+    heading = line((f"{title} ", Style.TITLE), (how, Style.FAINT))
+    return Section(heading, rows, keep, "events", least, drop="first", rank=7)
 
 
-def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
-    """Return two lists of events as two columns, with the same events beside each other."""
-    half = (width - 5) // 2
+def _beside(
+    a: tuple[EventView, ...], b: tuple[EventView, ...]
+) -> list[tuple[EventView | None, EventView | None]]:
+    """Return two lists of events as pairs, with the same events beside each other."""
     keys_a, keys_b = ([event_key(event) for event in side] for side in (a, b))
-    rows = []
     found = SequenceMatcher(None, keys_a, keys_b, autojunk=False).get_opcodes()
     if len(found) > 1 and found[0][0] in ("delete", "insert"):
         found = found[1:]  # what the other list, which is as long, does not reach back to
-    for tag, i, i_end, j, j_end in found:
-        if tag == "equal":
-            for one, other in zip(a[i:i_end], b[j:j_end], strict=True):
-                rows.append(line("  ", f"{_brief(one, half):<{half}}", f"= {other.index}"))
-            continue
-        for left, right in zip_longest(a[i:i_end], b[j:j_end]):
-            text = f"  {_brief(left, half):<{half}}"
-            rows.append(
-                line((text, Style.SIDE_A), ("| ", Style.FAINT), (_brief(right, half), Style.SIDE_B))
-            )
+    pairs: list[tuple[EventView | None, EventView | None]] = []
+    for _, i, i_end, j, j_end in found:
+        pairs += zip_longest(a[i:i_end], b[j:j_end])
+    return pairs
+
+
+def _side_by_side(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
+    """Return two lists of events as two columns."""
+    half = (width - 5) // 2
+    rows = []
+    for left, right in _beside(a, b):
+        text = f"  {_brief(left, half):<{half}}"
+        if left is not None and right is not None and event_key(left) == event_key(right):
+            rows.append(line(text, f"= {right.index}"))
+        else:
+            other = (_brief(right, half), Style.SIDE_B)
+            rows.append(line((text, Style.SIDE_A), ("| ", Style.FAINT), other))
     return rows
+
+
+def _below_each_other(a: tuple[EventView, ...], b: tuple[EventView, ...], width: int) -> list[Line]:
+    """Return two lists of events as one, for a narrow screen: ``=`` what is in both."""
+    rows: list[list[Piece]] = []
+    for left, right in _beside(a, b):
+        if left is not None and right is not None and event_key(left) == event_key(right):
+            rows.append([("=", Style.FAINT), *event_cells(left)])
+            continue
+        for name, style, event in (("a", Style.SIDE_A, left), ("b", Style.SIDE_B, right)):
+            if event is not None:
+                rows.append([(name, style), *event_cells(event)])
+    return [cut(row, width) for row in in_columns(rows, widest=52)]
 
 
 def _brief(event: EventView | None, width: int) -> str:
@@ -272,4 +302,4 @@ def _reaches(found: Divergence, width: int) -> Section:
         rows = wrapped(f"reaches {', '.join(parts[:shown] + more)}", width, indent="  ")
         if len(rows) <= _REACHES_LINES:
             break
-    return Section((), rows, len(rows), "", len(rows))
+    return Section((), rows, len(rows), "", len(rows), rank=5)

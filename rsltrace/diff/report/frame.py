@@ -8,7 +8,7 @@ from rsltrace.diff.report.line import Line, Piece, Section, Style, line, side_li
 from rsltrace.model.printable import printable
 from rsltrace.words.phrases import as_sentence
 
-_SENTENCE_LINES = 3
+_SENTENCE_LINES = 6
 _NOTES_LEAST = 2
 
 
@@ -42,9 +42,13 @@ def notes_section(notes: Sequence[str], width: int) -> Section:
     return Section((), rows, min(len(rows), _NOTES_LEAST), "notes")
 
 
-def next_section(command: str, *before: str) -> Section:
-    """Return the command to run next, if there is one, below lines of text."""
+def next_section(command: str, *before: str, width: int) -> Section:
+    """Return the command to run next, if there is one, below lines of text.
+
+    It is one line, however long: that is what can be copied.
+    """
     rows = [line(text) for text in before]
     if command:
         rows.append(line(("next: ", Style.TITLE), (printable(command), Style.COMMAND)))
-    return Section((), rows, len(rows), "", len(rows))
+    wraps = sum(max(len("".join(text for text, _ in row)) - 1, 0) // width for row in rows)
+    return Section((), rows, len(rows), "", len(rows), wraps=wraps)

@@ -31,6 +31,9 @@ HEIGHT = 40
 _PATH_LEAST = 20
 """Characters of a path that stay: enough to tell the files of one folder apart."""
 
+_PATH_SHORT = 10
+"""Characters that stay in a very narrow terminal."""
+
 Piece = tuple[str, str]
 """(text, style)"""
 Line = tuple[Piece, ...]
@@ -86,7 +89,7 @@ def side_lines(rows: Sequence[Sequence[Piece]], width: int, *, kept: int) -> lis
     """Return what is said of the two files, one line each: name, path, then facts.
 
     Where that is wider than ``width``, first what both end with goes, then the beginning of the
-    paths, then what is behind the first ``kept`` cells.
+    paths, then what is behind the first ``kept`` cells, then more of the paths.
     """
 
     def columns(cells: Sequence[Sequence[Piece]]) -> tuple[list[Line], int]:
@@ -97,12 +100,16 @@ def side_lines(rows: Sequence[Sequence[Piece]], width: int, *, kept: int) -> lis
     if over > 0 and rows[0][-1] == rows[-1][-1]:
         rows = [row[:-1] for row in rows]
         lines, over = columns(rows)
-    if over > 0:
-        room = max(max(len(row[1][0]) for row in rows) - over, _PATH_LEAST)
-        rows = [[row[0], (_ending(row[1][0], room), row[1][1]), *row[2:]] for row in rows]
-        lines, over = columns(rows)
-    least = max(map(_length, in_columns([row[:kept] for row in rows], widest=60)))
-    return [cut(row, max(width, least)) for row in lines]
+    for least in (_PATH_LEAST, _PATH_SHORT):
+        if over > 0:
+            room = max(max(len(row[1][0]) for row in rows) - over, least)
+            rows = [[row[0], (_ending(row[1][0], room), row[1][1]), *row[2:]] for row in rows]
+            lines, over = columns(rows)
+        if over > 0:
+            short = zip(rows, lines, strict=True)
+            rows = [row if _length(shown) <= width else row[:kept] for row, shown in short]
+            lines, over = columns(rows)
+    return lines
 
 
 def _length(row: Line) -> int:
@@ -139,7 +146,9 @@ class Section:
 
     ``keep`` rows are kept if that is possible at all, ``least`` in any case; a section shortened
     to no row disappears. ``noun`` names what the rows show: ``… 7 more fields`` (empty: what is
-    left out is not worth a line). ``drop`` says where rows go: ``last``, ``first`` or ``middle``.
+    left out is not worth a line). ``drop`` says where rows go: ``last``, ``first`` or ``middle``;
+    the first ``fixed`` ones stay. Of sections with a ``rank`` the highest is left out first when
+    all that is not enough. ``wraps`` is how many lines a terminal adds by wrapping.
     """
 
     title: Line
@@ -149,54 +158,82 @@ class Section:
     least: int = 1
     drop: str = "last"
     hidden: int = field(default=0)
+    rank: int = 0
+    fixed: int = 0
+    wraps: int = 0
+    left_out: bool = field(default=False)
 
     @property
     def height(self) -> int:
         """Lines it takes, the blank one before it included."""
-        if not self.rows and (self.hidden or not self.title):
+        shown = len(self.rows) - self.hidden
+        if self.left_out or (not shown and (self.hidden or not self.title)):
             return 0
-        return 1 + bool(self.title) + len(self.rows) + bool(self.hidden and self.noun)
+        return 1 + bool(self.title) + shown + bool(self.hidden and self.noun) + self.wraps
 
     def lines(self) -> list[Line]:
         """Return the lines, a blank one first."""
         if not self.height:
             return []
-        noun = self.noun if self.hidden != 1 else _singular(self.noun)
-        more = (
-            [line((f"  … {self.hidden} more {noun}", Style.FAINT))] if self.hidden and noun else []
-        )
-        gap = {"first": 0, "middle": (len(self.rows) + 1) // 2}.get(self.drop, len(self.rows))
-        rows = [*self.rows[:gap], *more, *self.rows[gap:]]
+        more = [line((f"  … {self.hidden} more {self.noun}", Style.FAINT))]
+        rest = self.rows[self.fixed :]
+        kept = len(rest) - self.hidden
+        before = {"first": 0, "middle": (kept + 1) // 2}.get(self.drop, kept)
+        rows = [
+            *self.rows[: self.fixed],
+            *rest[:before],
+            *(more if self.hidden and self.noun else ()),
+            *rest[len(rest) - kept + before :],
+        ]
         return [BLANK, *([self.title] if self.title else []), *rows]
 
     def spare(self, *, hard: bool) -> int:
         """Return how many rows could go; ``hard`` if it must be."""
-        return len(self.rows) - (min(self.keep, self.least) if hard else self.keep)
-
-    def shorten(self) -> None:
-        """Leave out the row that matters least."""
-        self.rows.pop({"first": 0, "middle": len(self.rows) // 2}.get(self.drop, -1))
-        self.hidden += 1
-
-
-def _singular(noun: str) -> str:
-    return noun[:-3] + "y" if noun.endswith("ies") else noun.removesuffix("s")
+        keep = max(min(self.keep, self.least) if hard else self.keep, self.fixed)
+        return len(self.rows) - self.hidden - keep
 
 
 NOTHING = Section((), [], 0, "")
 """A section without lines."""
 
+_LEFT_OUT = line(("… a taller terminal shows more, and so does | less", Style.FAINT))
+
 
 def fitted(head: list[Line], sections: Sequence[Section], height: int | None) -> list[Line]:
     """Return head and sections in at most ``height`` lines (None: all of them), if they can be.
 
-    The section that has most to spare is shortened first; each says how much it leaves out.
+    The section that has most to spare is shortened first; each says how much it leaves out. Then
+    whole sections go, those that matter least first. What has room after all comes back: nothing is
+    left out to save a line. The last section is the next step, and always there.
     """
+    *others, last = [part for part in sections if part is not NOTHING] or [NOTHING]
+
+    def fits() -> bool:
+        told = any(part.left_out for part in others)
+        lines = len(head) + sum(part.height for part in (*others, last)) + told
+        return height is None or lines <= height
 
     for hard in (False, True):
-        while height is not None and len(head) + sum(part.height for part in sections) > height:
-            part = max(sections, key=lambda part: part.spare(hard=hard))
+        while not fits():
+            part = max(others, key=lambda part: part.spare(hard=hard), default=last)
             if part.spare(hard=hard) <= 0:
                 break
-            part.shorten()
-    return [*head, *(row for part in sections for row in part.lines())]
+            part.hidden += 1
+    while not fits() and (ranked := [part for part in others if part.rank and part.height]):
+        max(ranked, key=lambda part: part.rank).left_out = True
+    by_rank = sorted(others, key=lambda part: part.rank)
+    for part in by_rank:
+        if part.left_out:
+            part.left_out = False
+            part.left_out = not fits()
+    for part in by_rank:
+        while part.hidden and not part.left_out:
+            part.hidden -= 1
+            if not fits() and not (part.noun and not part.hidden):
+                part.hidden += 1
+                break
+    lines = [*head, *(row for part in others for row in part.lines())]
+    ending = last.lines()
+    if any(part.left_out for part in others):
+        ending.insert(1, _LEFT_OUT)
+    return [*lines, *ending]

@@ -25,12 +25,13 @@ from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.traces import Diff, Side
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
-from rsltrace.words.phrases import as_sentence
+from rsltrace.words.phrases import as_sentence, seconds_text
 
 if TYPE_CHECKING:
     from rsltrace.diff.result.divergence import Divergence
 
 _ALIKE_SHOWN = 12
+_NARROW = 70
 _ALL_HINT = "--all shows them"
 
 
@@ -58,15 +59,17 @@ def trace_report(
     if not options.everything:
         # Whoever asks for a longer context wants to see it.
         height += 2 * max(options.context - CONTEXT, 0)
-        return fitted(head, [*sections, _next(shown, len(others), hidden=hidden)], height)
-    lines = fitted(head, [*sections, _next(shown, 0)], None)
+        return fitted(head, [*sections, _next(shown, len(others), width, hidden=hidden)], height)
+    lines = fitted(head, [*sections, _next(shown, 0, width)], None)
     for number, other in enumerate(others, start=2):
         lines += [
             BLANK,
             line((f"independent divergence {number}: {other.verdict.value}", Style.TITLE)),
         ]
         lines += wrapped(as_sentence(other.sentence), width, style=Style.BAD)
-        lines += fitted([], [*divergence_sections(other, width, options), _next(other, 0)], None)
+        lines += fitted(
+            [], [*divergence_sections(other, width, options), _next(other, 0, width)], None
+        )
     return lines
 
 
@@ -76,7 +79,7 @@ def _head(diff: Diff, width: int) -> list[Line]:
         agree = "the first event agrees" if diff.agreeing else "no event before agrees"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
     verdict += "; shown is the first effect" if diff.effect is not None else ""
-    sides = [_facts(side) for side in (diff.a, diff.b)]
+    sides = [_facts(side, width) for side in (diff.a, diff.b)]
     good = diff.identical or (diff.agrees_until_cut and not diff.failed)
     lines = head_lines(diff.sentence, sides, verdict, width, good=good)
     return lines + ([] if diff.identical else _tolerance(diff, width))
@@ -95,13 +98,15 @@ def _tolerance(diff: Diff, width: int) -> list[Line]:
     return wrapped(f"  {text}", width, style=Style.TITLE, indent="    ")
 
 
-def _facts(side: Side) -> list[Piece]:
+def _facts(side: Side, width: int) -> list[Piece]:
+    narrow = width < _NARROW
+    time = seconds_text(side.end_ns) if narrow else format_seconds(side.end_ns)
     ended = side.stop_reason or ("" if side.complete else "interrupted")
     return [
         (printable(side.path), ""),
         (f"{side.events} events", ""),
-        (f"{format_seconds(side.end_ns)} s", ""),
-        (f"digest {side.digest}", ""),
+        (f"{time} s", ""),
+        (side.digest if narrow else f"digest {side.digest}", ""),
         (printable(ended), Style.FAINT),
     ]
 
@@ -128,31 +133,38 @@ def _afterwards(diff: Diff, width: int) -> Section:
         if diverged:
             of = diverged + count.matching
             rows.append(cut(line(f"  {diverged} of {of}  {printable(str(count.entity))}"), width))
-    return Section((), rows, least, "entities", least)
+    return Section((), rows, least, "entities", least, rank=9, fixed=least)
 
 
 def _settings(diff: Diff, width: int) -> Section:
     if not diff.settings:
         return NOTHING
-    room = max((width - 40) // 2, 16)
-    rows = in_columns(
-        [
-            [
-                (printable(str(setting)), ""),
-                (a, Style.SIDE_A),
-                ("|", Style.FAINT),
-                (b, Style.SIDE_B),
-            ]
-            for setting in diff.settings
-            for a, b in [_values(setting, room)]
-        ],
-        widest=max(room, 34),
-    )
     title: Piece = ("job and environment differ", Style.TITLE)
+    room = max((width - 40) // 2, 16)
+    table = [
+        [
+            (printable(str(setting)), ""),
+            (a, Style.SIDE_A),
+            ("|", Style.FAINT),
+            (b, Style.SIDE_B),
+        ]
+        for setting in diff.settings
+        for a, b in [_values(setting, room)]
+    ]
+    rows = in_columns(table, widest=max(room, 34))
+    told = 8 if diff.shown is not None and diff.shown.settings else 4
     if len(rows) == 1:
-        (row,) = rows
-        return Section((), [cut(line(title, ": ", *row[1:]), width)], 1, "settings")
-    return Section(line(title), rows, 2, "settings")
+        alone = line(title, ": ", *rows[0][1:])
+        if sum(len(text) for text, _ in alone) <= width:
+            return Section((), [alone], 1, "settings", rank=told)
+    shown: list[Line] = []
+    for row, (place, a, _, b) in zip(rows, table, strict=True):
+        if sum(len(text) for text, _ in row) <= width:
+            shown.append(row)
+        else:  # what differs must not be cut off
+            shown += [cut(line("  ", place), width)]
+            shown += [line("    ", a, ("  |  ", Style.FAINT), b)]
+    return Section(line(title), shown, 2, "lines", rank=told)
 
 
 def _values(setting: Setting, room: int) -> tuple[str, str]:
@@ -164,8 +176,8 @@ def _values(setting: Setting, room: int) -> tuple[str, str]:
     return shortened(a, room), shortened(b, room)
 
 
-def _next(found: Divergence, others: int, *, hidden: bool = False) -> Section:
+def _next(found: Divergence, others: int, width: int, *, hidden: bool = False) -> Section:
     count = f"more than {others}" if hidden else str(others)
     word = "divergence" if count == "1" else "divergences"
     more = [f"{count} further independent {word}: {_ALL_HINT}"] if others else []
-    return next_section(found.next_step, *more)
+    return next_section(found.next_step, *more, width=width)
