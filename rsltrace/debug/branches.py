@@ -15,6 +15,7 @@ from pathlib import Path
 
 from rsltrace.campaign.processes import Done, Processes, rsltrace_command
 from rsltrace.errors import DebugError, EditError, OutputError
+from rsltrace.model.regular_file import in_the_way
 from rsltrace.replay.edits import parse_edit
 
 _ERROR = "rsltrace: error: "
@@ -78,6 +79,8 @@ class Branches:
         if self.path is None:
             raise DebugError("nothing has been edited in this session: there is no branch to keep")
         place = Path(output)
+        if kind := in_the_way(place):
+            raise OutputError(f"{place} is {kind}; name a file, or remove it")
         if place.exists() and not force:
             raise OutputError(f"{place} exists; force=True replaces it")
         part = place.with_name(f".{place.name}.{os.getpid()}")

@@ -33,3 +33,14 @@ def read_regular(path: Path, size_max: int = -1) -> bytes:
         raise OSError(errno.EINVAL, f"it is {kind}", str(path))
     with path.open("rb") as file:
         return file.read(size_max)
+
+
+def in_the_way(path: Path) -> str:
+    """Return what is at ``path`` if a file must not replace it, "" for a file or nothing.
+
+    Renaming replaces whatever has the name: for root, /dev/null, too.
+    """
+    try:
+        return not_regular(path)
+    except OSError:
+        return ""

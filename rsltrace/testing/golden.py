@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, ClassVar
 
 from rsltrace.errors import OutputError, RsltraceError, TraceError
+from rsltrace.model.regular_file import in_the_way
 
 if TYPE_CHECKING:
     from rsltrace.diff.options import DiffOptions
@@ -124,6 +125,8 @@ def _write(run: Path, golden: Path) -> bool:
                 return False
     except RsltraceError:
         pass  # missing, damaged or of an older format: what the update is for
+    if kind := in_the_way(golden):
+        raise OutputError(f"the golden trace {golden} cannot be written: it is {kind}")
     # Beside the target first: an interrupted copy must not leave half a golden trace.
     part = golden.with_name(golden.name + ".part")
     try:

@@ -17,7 +17,8 @@ from typing import Any
 import pytest
 
 from rsltrace import DebugSession
-from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.debug.branches import Branches
+from rsltrace.errors import DebugError, OutputError, RsltraceError
 
 pytestmark = pytest.mark.ros
 
@@ -381,3 +382,17 @@ def test_requests_that_are_none_are_answered(folder: Path) -> None:
         with pytest.raises(DebugError, match="no event 100000"):
             session.event(100_000)
         assert session.step().position.index == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_a_branch_replaces_no_pipe_and_no_device(tmp_path: Path) -> None:
+    branches = Branches(tmp_path / "run.mcap", None, ())
+    branches.path = tmp_path / "branch.mcap"
+    branches.path.write_bytes(b"branch")
+    place = tmp_path / "kept.mcap"
+    os.mkfifo(place)
+    with pytest.raises(OutputError, match=r"kept\.mcap is a named pipe"):
+        branches.keep(place, force=True)
+    assert place.is_fifo()
+    place.unlink()
+    assert branches.keep(place, force=True).read_bytes() == b"branch"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -406,6 +407,27 @@ def test_output_that_cannot_be_is_refused(
     assert (tmp_path / "run.mcap").read_bytes() == before
     if (tmp_path / "run.rrd").exists():
         assert (tmp_path / "run.rrd").read_bytes() == b"precious"
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no named pipes")
+def test_a_device_or_pipe_is_not_replaced(tmp_path: Path) -> None:
+    """Root could have /dev/null replaced by a recording."""
+    trace_maker.write_run(tmp_path / "run.mcap", 10)
+    os.mkfifo(tmp_path / "run.rrd")
+    (tmp_path / "link.rrd").symlink_to("run.rrd")
+    for name in ("run.rrd", "link.rrd"):
+        with pytest.raises(OutputError, match=rf"{name} is a named pipe"):
+            export([tmp_path / "run.mcap"], tmp_path / name, force=True)
+    assert (tmp_path / "run.rrd").is_fifo()
+
+
+def test_a_link_leads_to_the_recording_that_is_replaced(tmp_path: Path) -> None:
+    trace_maker.write_run(tmp_path / "run.mcap", 10)
+    (tmp_path / "real.rrd").write_bytes(b"old")
+    (tmp_path / "link.rrd").symlink_to("real.rrd")
+    done = export([tmp_path / "run.mcap"], tmp_path / "link.rrd", force=True)
+    assert (tmp_path / "link.rrd").is_symlink()
+    assert (tmp_path / "real.rrd").stat().st_size == done.bytes > 100
 
 
 def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:

@@ -90,10 +90,19 @@ def test_update_writes_only_what_is_another_run(tmp_path: Path) -> None:
 
 def test_a_golden_trace_that_cannot_be_written_is_named_and_leaves_nothing(tmp_path: Path) -> None:
     golden = tmp_path / "golden.mcap"
-    golden.mkdir()
-    with pytest.raises(OutputError, match=r"golden trace .*golden\.mcap cannot be written: Is a"):
-        assert_matches_golden(A, golden, update=True)
-    assert list(tmp_path.iterdir()) == [golden]
+    makers: list[Callable[[Path], object]] = [Path.mkdir]
+    if hasattr(os, "mkfifo"):  # a device or a pipe would be replaced
+        makers.append(os.mkfifo)
+    for make in makers:
+        make(golden)
+        kind = golden.stat().st_mode
+        with pytest.raises(
+            OutputError, match=r"golden trace .*golden\.mcap cannot be written: it is a"
+        ):
+            assert_matches_golden(A, golden, update=True)
+        assert list(tmp_path.iterdir()) == [golden]
+        assert golden.stat().st_mode == kind
+        golden.rmdir() if golden.is_dir() else golden.unlink()
 
 
 def test_a_run_that_was_not_recorded_cannot_be_compared() -> None:

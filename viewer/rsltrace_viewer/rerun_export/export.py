@@ -13,6 +13,7 @@ import rerun as rr
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
+from rsltrace.model.regular_file import in_the_way
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for
 from rsltrace_viewer.rerun_export.divergence import Marks, divergence_chunks, marks_of
@@ -58,7 +59,8 @@ def export(
         )
         recording.set_log_time_enabled(False)
         recording.set_log_tick_enabled(False)
-        work = output.with_name(f".{output.name}.part-{os.getpid()}")
+        final = Path(os.path.realpath(output))
+        work = final.with_name(f".{final.name}.part-{os.getpid()}")
         try:
             recording.save(work)
         except RuntimeError as error:
@@ -68,7 +70,7 @@ def export(
             recording.flush()
             recording.disconnect()  # this writes the index at the end of the file
             size = work.stat().st_size
-            work.replace(output)
+            work.replace(final)
         except BaseException as error:
             recording.disconnect()
             work.unlink(missing_ok=True)
@@ -120,6 +122,8 @@ def _check_output(output: Path, traces: Sequence[Path], *, force: bool) -> None:
     for trace in traces:
         if output.exists() and trace.exists() and output.samefile(trace):
             raise OutputError(f"{output} is the trace itself; give the recording another name")
+    if kind := in_the_way(output):
+        raise OutputError(f"{output} is {kind}; name a file, or remove it")
     if output.exists() and not force:
         raise OutputError(f"{output} exists; use --force to replace it, or another name")
     if not output.absolute().parent.is_dir():
