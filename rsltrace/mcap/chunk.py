@@ -100,14 +100,17 @@ def _unlz4(data: memoryview, size: int) -> bytes:
         raise Damaged(f"the chunk cannot be decompressed ({error})") from None
 
 
-def message_at(records: bytes, offset: int) -> MessageView:
-    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none."""
+def message_at(records: bytes, offset: int, of_channel: int) -> MessageView:
+    """Return the message record at ``offset`` of a chunk. Raises Damaged if there is none, or if it
+    is of another channel."""
     if offset + _MESSAGE_BYTES_MIN > len(records):
         raise Damaged(f"no message fits at {offset} of the chunk")
     opcode, length, channel_id, sequence, log_time, _ = MESSAGE_HEAD.unpack_from(records, offset)
     end = offset + _HEAD_BYTES + length
     if opcode != MESSAGE or length < _MESSAGE_BYTES_MIN - _HEAD_BYTES or end > len(records):
         raise Damaged(f"there is no whole message at {offset} of the chunk")
+    if channel_id != of_channel:
+        raise Damaged(f"the message at {offset} is of another channel than the index says")
     return MessageView(channel_id, sequence, log_time, offset + _MESSAGE_BYTES_MIN, end)
 
 

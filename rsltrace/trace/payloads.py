@@ -15,7 +15,7 @@ import numpy.typing as npt
 from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.chunk import MessageView, message_at
+from rsltrace.mcap.chunk import message_at
 from rsltrace.mcap.records import Damaged, Fields, Span
 from rsltrace.mcap.source import ByteSource
 from rsltrace.trace.index import ChunkEntry, TraceIndex
@@ -53,7 +53,10 @@ class PayloadReader:
         if place >= len(offsets):
             raise self._missing(channel_id, sequence)
         records = self._records(entry.span)
-        message = self._message_at(entry, records, offsets[place], channel_id)
+        try:
+            message = message_at(records, offsets[place], channel_id)
+        except Damaged as error:
+            raise damaged(self._source, entry.span.offset, "the chunk", error) from error
         if message.sequence != sequence:
             raise damaged(self._source, entry.span.offset, "the chunk", "messages are out of order")
         return message.log_time, records[message.start : message.end]
@@ -69,10 +72,12 @@ class PayloadReader:
                 for c in wanted
                 for offset in self._read_offsets(entry.span, entry.indexes.get(c), c)
             ]
-            for offset, channel_id in sorted(places):
-                message = self._message_at(entry, records, offset, channel_id)
-                data = records[message.start : message.end]
-                yield channel_id, message.log_time, message.sequence, data
+            try:
+                for offset, channel_id in sorted(places):
+                    _, sequence, log_time, start, end = message_at(records, offset, channel_id)
+                    yield channel_id, log_time, sequence, records[start:end]
+            except Damaged as error:
+                raise damaged(self._source, entry.span.offset, "the chunk", error) from error
 
     def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
         try:
@@ -117,17 +122,6 @@ class PayloadReader:
         table: npt.NDArray[np.void] = np.frombuffer(entries, dtype=_INDEX_DTYPE)
         offsets: list[int] = table["offset"].tolist()
         return offsets
-
-    def _message_at(
-        self, entry: ChunkEntry, records: bytes, offset: int, channel_id: int
-    ) -> MessageView:
-        try:
-            message = message_at(records, offset)
-            if message.channel_id != channel_id:
-                raise Damaged(f"the message at {offset} is of another channel than the index says")
-        except Damaged as error:
-            raise damaged(self._source, entry.span.offset, "the chunk", error) from error
-        return message
 
     def _missing(self, channel_id: int, sequence: int) -> TraceError:
         info = self._index.channels.get(channel_id)
