@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from rsltrace.errors import TraceError
 from rsltrace.model.built_in import is_built_in
@@ -52,8 +52,13 @@ class EventWords:
             return f"{text} {detail}".rstrip()
         return f"{text} ({detail})" if detail else text
 
-    def outputs(self, outputs: Sequence[Output]) -> Iterator[str]:
-        """Yield the outputs of an event; repeated ones, and what every node has, are counted."""
+    def outputs(
+        self, outputs: Sequence[Output], more: Callable[[Output], str] = lambda output: ""
+    ) -> Iterator[str]:
+        """Yield the outputs of an event; repeated ones, and what every node has, are counted.
+
+        ``more`` gives what else to say of one.
+        """
         built_in = 0
         own = []
         for output in outputs:
@@ -61,7 +66,7 @@ class EventWords:
                 built_in += 1
             else:
                 own.append(output)
-        yield from counted(map(self.output, own))
+        yield from counted(f"{self.output(one)} {more(one)}".rstrip() for one in own)
         if built_in:
             yield f"{built_in} that every node has"
 

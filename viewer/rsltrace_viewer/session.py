@@ -5,14 +5,15 @@ The app changes this object and draws what it says; tests drive it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
-from rsltrace.model.stamp import format_duration
+from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
@@ -27,6 +28,7 @@ from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import Columns, layout
 from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
+from rsltrace_viewer.model.timeline.row_values import RowValues
 from rsltrace_viewer.model.timeline.short_names import ShortNames
 from rsltrace_viewer.model.view import Sign, SingleView, View
 
@@ -67,9 +69,11 @@ class Session:
         self.marks = Marks()
         self.openness = Openness()
         self.effects: Effects | None = None
-        self._texts = {"a": EventTexts(a)}
-        if b is not None:
-            self._texts["b"] = EventTexts(b)
+        self.base_ns = a.start_ns if a.since_epoch else 0
+        """What times count from: the start of the run, where they would be those since 1970."""
+        runs = {"a": a} if b is None else {"a": a, "b": b}
+        self._texts = {name: EventTexts(run, self.base_ns) for name, run in runs.items()}
+        self.values = {name: RowValues(run) for name, run in runs.items()}
         self._names = self._short_names()
         self.lane_window = LaneWindow([run for run in (a, b) if run is not None])
         self.logs: dict[str, Logs] = {}
@@ -98,7 +102,8 @@ class Session:
     def replace_run(self, run: Run) -> None:
         """Show a newer state of the same recording. The old file is closed."""
         old, self.a = self.a, run
-        self._texts["a"] = EventTexts(run)
+        self._texts["a"] = EventTexts(run, self.base_ns)
+        self.values["a"] = RowValues(run)
         self._names = self._short_names()
         self.view = SingleView(run.count)
         self.rows = AllRows(run.count)
@@ -157,6 +162,8 @@ class Session:
             node_width=texts.node_width,
             names=self._names,
             signs=self.b is not None,
+            deltas=self.comparison is not None and self.comparison.shifted,
+            relative=bool(self.base_ns),
         )
 
     def _short_names(self) -> dict[str, ShortNames]:
@@ -170,16 +177,36 @@ class Session:
         place = self.rows.at(row)
         index, index_b = self.view.a(place), self.view.b(place)
         if index is not None:
-            event = self._texts["a"].of(index)
-            if index_b is not None and not event.raised:
-                other = self._texts["b"].of(index_b)
-                if other.raised:  # what run a did here is not what one looks for
-                    outputs = f"b: {other.outputs}; a: {event.outputs or 'nothing'}"
-                    event = replace(event, raised=True, outputs=outputs)
+            event = self._with_values("a", index)
+            if index_b is not None:
+                event = self._with_other(event, index, index_b)
         else:
             assert index_b is not None  # a place stands for something
-            event = self._texts["b"].of(index_b)
+            event = self._with_values("b", index_b)
         return event, self.view.sign(place), place in self.marks, self._relation(place)
+
+    def _with_values(self, name: str, index: int) -> EventText:
+        event, known = self._texts[name].of(index), self.values[name].known(index)
+        return replace(event, outputs=known) if known else event
+
+    def _with_other(self, event: EventText, index: int, index_b: int) -> EventText:
+        """Return an event of run a with what is to be said of that of run b beside it."""
+        assert self.b is not None  # there is an event of it
+        if not event.raised:
+            other = self._texts["b"].of(index_b)
+            if other.raised:  # what run a did here is not what one looks for
+                outputs = f"b: {other.outputs}; a: {event.outputs or 'nothing'}"
+                event = replace(event, raised=True, outputs=outputs)
+        later_ns = self.b.stamp(index_b) - self.a.stamp(index)
+        return replace(event, delta=_short_duration(later_ns)) if later_ns else event
+
+    def read_values(self, rows: Sequence[int]) -> Iterator[int]:
+        """Read the values of some rows, a row at a time."""
+        places = [self.rows.at(row) for row in rows if row < self.rows.count]
+        found = [(self.view.a(place), self.view.b(place)) for place in places]
+        yield from self.values["a"].read([a for a, _ in found if a is not None])
+        if self.b is not None:
+            yield from self.values["b"].read([b for a, b in found if a is None and b is not None])
 
     def _relation(self, place: int) -> str:
         """Return ``cause`` or ``effect`` if that is what the event is to the selected one."""
@@ -325,6 +352,14 @@ class Session:
 
     # Words.
 
+    def mode(self) -> str:
+        """Return what is shown of it: one run, or of two which."""
+        if self.b is None:
+            return "one run"
+        return {"diff": "differences of a and b", "a": "run a of a, b", "b": "run b of a, b"}[
+            self.side
+        ]
+
     def title(self) -> str:
         """Return the name of what is open."""
         return self.a.name if self.b is None else f"{self.a.name} ↔ {self.b.name}"
@@ -343,8 +378,19 @@ class Session:
         if self.b is None and reason != "0":
             parts.append(f"exit code {reason}")
         parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
+        if self.base_ns:
+            began = datetime.fromtimestamp(self.base_ns // NS_PER_S, tz=timezone.utc)
+            parts.append(f"from {began:%Y-%m-%d %H:%M:%S} UTC")
         nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
         parts.append(f"{nodes} node{'' if nodes == 1 else 's'}")
         if self.b is None:
             parts.append(f"digest {trace.digest}")
         return "  ".join(parts)
+
+
+def _short_duration(duration_ns: int) -> str:
+    """Return a duration in three digits, with its sign: ``+1.5 ms``."""
+    for unit, scale in (("s", NS_PER_S), ("ms", 1_000_000), ("us", 1_000)):
+        if abs(duration_ns) >= scale:
+            return f"{duration_ns / scale:+.3g} {unit}"
+    return f"{duration_ns:+d} ns"

@@ -87,6 +87,9 @@ class LiveApp(ViewerApp):
         """The callback of the selected event."""
         return self.screen_stack[0].query_one(SourceView)
 
+    def _mode(self) -> str:
+        return "live: executing"
+
     def panes(self) -> list[Widget]:
         """The parts of the screen that one can go to."""
         return [self.timeline, self.inspector, self.source, self.lanes]

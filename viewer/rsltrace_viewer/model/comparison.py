@@ -53,6 +53,8 @@ class Comparison:
         self._divergences: list[int] = []
         """Places where rows begin to differ, after one that does not."""
         self._divergence_stamps: list[int] = []
+        self.shifted = False
+        """Whether an event is known that both runs have, but not at the same time."""
         self._first_place: int | None = None if first is None else first
         self._end_a = self._end_b = self.agreeing
         self._aligned_blocks: Iterator[AlignedBlock] = iter(())
@@ -138,6 +140,9 @@ class Comparison:
             return
         for item in block.items:
             self._add(item, _sign(item, block), block.stamp(item))
+            if item.a >= 0 and item.b >= 0 and not self.shifted:
+                stamp_b = block.rows_b.stamp[item.b - block.rows_b.first]
+                self.shifted = stamp_b != block.stamp(item)
         self._end_a, self._end_b = block.end_a, block.end_b
         self.done = block.at_end or len(self._a) > _ALIGNED_MAX
 

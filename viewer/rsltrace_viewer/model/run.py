@@ -19,12 +19,14 @@ from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, Event, Output
 from rsltrace.model.printable import printable
+from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.entities import RUN_NAME
 from rsltrace.words.events import EventWords
 
+_EPOCH_NS = 1_000_000 * NS_PER_S
 _SEGMENTS_KEPT = 24
 """About 0.4 MB each with outputs."""
 
@@ -179,6 +181,11 @@ class Run:
     def end_ns(self) -> int:
         """Stamp of the latest event (0: none)."""
         return int(self.segments["end_stamp"].max()) if len(self.segments) else 0
+
+    @cached_property
+    def since_epoch(self) -> bool:
+        """Whether times are those since 1970, as from bags: too long to be read."""
+        return self.start_ns >= _EPOCH_NS
 
     def input_of(self, event: Event) -> Output | None:
         """Return the output that was the input of ``event``, or None if no event caused it."""

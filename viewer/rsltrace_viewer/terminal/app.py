@@ -104,7 +104,9 @@ class ViewerApp(Stepping):
             self._filter(event.text)
         elif not self.session.empty and event.text.strip():
             if event.kind == "time":
-                self.go(self.session.place_at_time(parse_stamp(event.text)), centre=True)
+                stamp_ns = parse_stamp(event.text)
+                stamp_ns += self.session.base_ns if stamp_ns < self.session.base_ns else 0
+                self.go(self.session.place_at_time(stamp_ns), centre=True)
             else:
                 index = min(parse_index(event.text), self.session.a.count - 1)
                 self.go(self.session.view.place_of(index), centre=True)
@@ -257,6 +259,7 @@ class ViewerApp(Stepping):
     def action_other(self) -> None:
         """Inspect the differences, run a, run b in turn."""
         side = self.session.next_side()
+        self._show_header()
         self._show_rows()
         self._show_inspector()
         self._say({"diff": "the differences", "a": "run a only", "b": "run b only"}[side])
@@ -266,6 +269,7 @@ class ViewerApp(Stepping):
         if self._follow is not None:
             self._follow.stop()
             self._follow, self.following = None, False
+            self._show_header()
             self._say("no longer following")
         elif self.session.b is not None:
             self._say("only one trace can be followed")
@@ -273,6 +277,7 @@ class ViewerApp(Stepping):
             self._say("this trace is finished: there is nothing to follow")
         else:
             self.following = True
+            self._show_header()
             self._follow = Follow(self, Path(self.session.a.trace.name), self._grown)
             self._say("following; Esc stops")
 

@@ -111,6 +111,7 @@ class Shell(App[None]):
 
     def _after_second(self) -> None:
         self._show_inspector()
+        self._show_values()
         self.busy = False
         self.first_shown()
         walk(
@@ -196,11 +197,24 @@ class Shell(App[None]):
         self.screen_stack[0].query_one(HeaderBar).show(
             session.title(),
             session.facts(),
+            self._mode(),
             verdict,
             bad=bad,
             lines=2 if size.height >= 20 else 1 if size.height >= 10 else 0,
             width=size.width,
         )
+
+    def _mode(self) -> str:
+        following = "following, " if self.following else ""
+        return f"{following}{self.session.mode()}"
+
+    def _show_values(self) -> None:
+        """Read what the rows in sight say of messages, and show it once it is there."""
+        steps = self.session.read_values(self.timeline.in_sight)
+        walk(self, "values", steps, self._values_arrived, at_once_s=_EFFECTS_AT_ONCE_S)
+
+    def _values_arrived(self, _: int | None, done: bool) -> None:
+        self.timeline.redraw()
 
     def _show_rows(self, *, centre: bool = False) -> None:
         timeline, session = self.timeline, self.session
@@ -222,6 +236,7 @@ class Shell(App[None]):
         if session.comparison is not None:
             found = session.comparison.divergences_in(made.window, made.columns)
             first, divergences = found
+        lanes.base_ns = session.base_ns
         lanes.show(
             made, position, own=session.own_lane(), divergence=first, divergences=divergences
         )
@@ -287,6 +302,7 @@ class Shell(App[None]):
         # Whatever is selected now: the comparison may have given the event another place.
         if self.screen_stack:
             self._show_inspector()
+            self._show_values()
             self.busy = False
             self.rested()
 
@@ -302,6 +318,12 @@ class Shell(App[None]):
     def on_timeline_resized(self) -> None:
         """Lay the columns out again."""
         self._show_rows()
+        if not self.busy:
+            self._show_values()
+
+    def on_timeline_scrolled(self) -> None:
+        """Say what is in the rows that came into sight."""
+        self._show_values()
 
     def on_lanes_view_resized(self) -> None:
         """Count again."""

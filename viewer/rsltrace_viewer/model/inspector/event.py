@@ -64,7 +64,10 @@ def _title_lines(run: Run, event: Event, outputs: list[Output]) -> Iterator[Line
     entity = entity_of(run, event) or event.kind.label
     title = f"{node_of(run, event)}  {event.kind.label} {entity}"
     yield Line(0, f"event {event.index}", title, Role.SECTION, "event")
-    yield Line(1, "at", f"{format_seconds(event.stamp_ns)} s", Role.FIELD, "event.at")
+    at = f"{format_seconds(event.stamp_ns)} s"
+    if run.since_epoch:
+        at = f"{format_duration(event.stamp_ns - run.start_ns)} after the start, {at}"
+    yield Line(1, "at", at, Role.FIELD, "event.at")
     if EventFlag.RAISED in event.flags:
         raised = next((o for o in outputs if o.kind is OutputKind.EXCEPTION), None)
         what = run.words.output(raised).partition(" ")[2] if raised is not None else ""

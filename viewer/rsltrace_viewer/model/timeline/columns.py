@@ -11,6 +11,7 @@ from rsltrace_viewer.model.timeline.short_names import ShortNames
 
 GAP = 1
 """Cells between columns."""
+_DELTA = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,14 +31,19 @@ class Columns:
     columns: tuple[Column, ...] = field(default=())
     micros: bool = False
     """Whether times are shown to the microsecond (cut, not rounded) for want of room."""
+    relative: bool = False
+    """Whether times count from the start of the run."""
     names: Mapping[str, ShortNames] = field(default_factory=dict, compare=False)
     """By column, the names that may stand there: they are cut so that they stay distinct."""
 
     def header(self) -> str:
         """Return the line of titles."""
         return " " * GAP + (" " * GAP).join(
-            fit(_TITLES.get(c.name, c.name), c.width, right=c.right) for c in self.columns
+            fit(self._title(c.name), c.width, right=c.right) for c in self.columns
         )
+
+    def _title(self, name: str) -> str:
+        return "since start" if name == "time" and self.relative else _TITLES.get(name, name)
 
     def cells(self, event: EventText, *, sign: str = " ", mark: str = " ") -> list[tuple[str, str]]:
         """Return (column name, text of its exact width) of a row."""
@@ -46,6 +52,7 @@ class Columns:
             "mark": mark,
             "index": str(event.index),
             "time": event.time[:-3] if self.micros else event.time,
+            "delta": event.delta,
             "node": event.node,
             "kind": event.kind,
             "entity": event.entity,
@@ -66,6 +73,7 @@ _TITLES = {
     "mark": "",
     "index": "event",
     "time": "time s",
+    "delta": "b − a",
     "entity": "entity",
     "input": "in",
     "output": "out",
@@ -81,19 +89,22 @@ def layout(
     node_width: int,
     names: Mapping[str, ShortNames],
     signs: bool = False,
+    deltas: bool = False,
+    relative: bool = False,
 ) -> Columns:
     """Return the columns for a timeline of ``width`` cells. Narrow ones lose the least needed."""
     wanted = [Column("sign", 1)] if signs else []
     wanted += [Column("mark", 1), Column("index", index_width, right=True)]
     spare = width - sum(c.width + GAP for c in wanted) - GAP
     micros = width < 90
-    time = max(time_width - 3 if micros else time_width, 6)
+    time = max(time_width - 3 if micros else time_width, 11 if relative else 6)
     node = min(node_width, max(8, width // 6))
     for column, least in (
         (Column("time", time, right=True), 0),
+        *(((Column("delta", _DELTA, right=True), 0),) if deltas else ()),
         (Column("node", node), 0),
         (Column("kind", 6), 6),
-        (Column("entity", max(10, min(26, width // 5))), 0),
+        (Column("entity", max(10, min(22, width // 6))), 0),
     ):
         if spare - column.width - GAP < least:
             break
@@ -104,4 +115,4 @@ def layout(
         spare -= 14
     if spare > 3:
         wanted.append(Column("outputs", spare - GAP))
-    return Columns(width, tuple(wanted), micros, names)
+    return Columns(width, tuple(wanted), micros, relative, names)

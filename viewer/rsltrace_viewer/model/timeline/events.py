@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -36,16 +36,19 @@ class EventText:
     suspended: bool
     warns: bool
     """Whether it logged a warning or worse."""
+    delta: str = ""
+    """How much later it happened in run b, if not at the same time."""
 
 
 class EventTexts:
-    """Events of a run in words; what was shown last is kept."""
+    """Events of a run in words; what was shown last is kept. Times count from ``base_ns`` on."""
 
-    def __init__(self, run: Run) -> None:
+    def __init__(self, run: Run, base_ns: int = 0) -> None:
         self._run = run
+        self._base_ns = base_ns
         self.of = lru_cache(maxsize=_ROWS_KEPT)(self._of)
         self.index_width = max(len(str(max(run.count - 1, 0))), 5)
-        self.time_width = len(format_seconds(run.end_ns))
+        self.time_width = len(format_seconds(run.end_ns - base_ns))
         names = [run.node_name(e.id) for e in run.entities.values()]
         self.node_width = min(max(map(len, names), default=5), _NODE_WIDTH_MAX)
         entities = (_short(run.entity_name(e.id)) for e in run.entities.values())
@@ -69,7 +72,7 @@ class EventTexts:
         ]
         return EventText(
             index=index,
-            time=format_seconds(event.stamp_ns),
+            time=format_seconds(event.stamp_ns - self._base_ns),
             node=node_of(run, event),
             kind=SHORT_KINDS[event.kind],
             entity=entity_of(run, event),
@@ -106,11 +109,16 @@ def event_text(run: Run, event: Event) -> str:
     return f"{event.index}  {node_of(run, event)} {kind} {entity_of(run, event)}".rstrip()
 
 
-def outputs_text(run: Run, outputs: Sequence[Output], width: int = _SUMMARY_MAX) -> str:
-    """Return what an event did as one line."""
+def outputs_text(
+    run: Run,
+    outputs: Sequence[Output],
+    width: int = _SUMMARY_MAX,
+    more: Callable[[Output], str] = lambda output: "",
+) -> str:
+    """Return what an event did as one line; ``more`` gives what else to say of an output."""
     parts: list[str] = []
     length = 0
-    for text in run.words.outputs(outputs):
+    for text in run.words.outputs(outputs, more):
         parts.append(text)
         length += len(text)
         if length > width:

@@ -19,17 +19,17 @@ class HeaderBar(Static):
     """
 
     def show(
-        self, title: str, facts: str, verdict: str, *, bad: bool, lines: int, width: int
+        self, title: str, facts: str, mode: str, verdict: str, *, bad: bool, lines: int, width: int
     ) -> None:
-        """Show a title, facts about it, and the verdict on two runs in at most ``lines``, on a
-        screen of ``width`` cells."""
-        title, facts, verdict = map(printable, (title, facts, verdict))
+        """Show a title, facts about it, what is shown of it (``mode``), and the verdict on two
+        runs in at most ``lines``, on a screen of ``width`` cells."""
+        title, facts, mode, verdict = map(printable, (title, facts, mode, verdict))
         width = max(width - 2, 1)
-        title = fit(title, min(width, cells(title)))
-        rest = f"  {facts}"
-        room = width - cells(title)
-        rest = rest if cells(rest) <= room else fit(rest, room)
+        mode = fit(f" {mode}", min(cells(mode) + 1, width // 2))
+        title = fit(title, min(width - cells(mode), cells(title)))
+        rest = fit(f"  {facts}", width - cells(title) - cells(mode))
         parts: list[tuple[str, str] | str] = [(title, "bold"), (rest, "$text-muted")]
+        parts.append((mode, "bold $text-accent"))
         if verdict and lines:
             style = "bold $text-error" if bad else "bold $text-success"
             wrapped = wrap(verdict, width)

@@ -79,6 +79,8 @@ class LanesView(Widget, can_focus=True):
         super().__init__(id=id)
         self.lanes: Lanes | None = None
         self.cursor: int = 0
+        self.base_ns = 0
+        """What the times at the bottom count from."""
         self._position = 0
         self._own = ""
         self._divergence: int | None = None
@@ -254,9 +256,9 @@ class LanesView(Widget, can_focus=True):
             here = f"▲ {self._position}"
             scale = "one column is one event"
         else:
-            left = f"{format_seconds(window.start)[:-6]} s"
-            right = f"{format_seconds(window.end)[:-6]} s"
-            here = f"▲ {format_seconds(self._position)[:-3]} s"
+            left = f"{format_seconds(window.start - self.base_ns)[:-6]} s"
+            right = f"{format_seconds(window.end - self.base_ns)[:-6]} s"
+            here = f"▲ {format_seconds(self._position - self.base_ns)[:-3]} s"
             scale = f"{format_duration(window.step(lanes.columns))} per column"
         if lanes.known < 1:
             scale += f", {lanes.known:.0%} read"
@@ -264,7 +266,8 @@ class LanesView(Widget, can_focus=True):
         _put(line, 0, left)
         _put(line, lanes.columns - len(right), right)
         middle = (lanes.columns - len(scale)) // 2
-        if abs(self.cursor - lanes.columns // 2) > len(scale) // 2 + len(here) + 2:
+        hidden = any(middle <= column < middle + len(scale) for column in self._divergences)
+        if not hidden and abs(self.cursor - lanes.columns // 2) > len(scale) // 2 + len(here) + 2:
             _put(line, middle, scale)
         for column in self._divergences:
             _put(line, column, "≠")

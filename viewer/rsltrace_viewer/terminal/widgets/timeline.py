@@ -104,6 +104,9 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
             super().__init__()
             self.row = row
 
+    class Scrolled(Message):
+        """Other rows are in sight, by the mouse."""
+
     class Resized(Message):
         """There is another number of cells to lay columns out in."""
 
@@ -122,6 +125,12 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
     def page(self) -> int:
         """How many rows are in sight."""
         return max(self.scrollable_content_region.height - 1, 1)
+
+    @property
+    def in_sight(self) -> range:
+        """The rows in sight."""
+        top = round(self.scroll_y)
+        return range(top, min(top + self.page + 1, self._count))
 
     @property
     def row_width(self) -> int:
@@ -187,6 +196,14 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
         """Lay out again."""
         set_virtual_size(self, Size(max(self.row_width, 1), self._count + 1))
         self.post_message(self.Resized())
+
+    def on_mouse_scroll_down(self) -> None:
+        """Look further down, without going there."""
+        self.call_after_refresh(self.post_message, self.Scrolled())
+
+    def on_mouse_scroll_up(self) -> None:
+        """Look further up."""
+        self.call_after_refresh(self.post_message, self.Scrolled())
 
     def on_click(self, event: events.Click) -> None:
         """Select the row that was clicked."""
