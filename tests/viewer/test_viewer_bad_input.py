@@ -55,7 +55,7 @@ def test_one_event(tmp_path: Path, drive: Drive) -> None:
         await viewer.press(*EVERY_KEY)
         assert viewer.place == 0
         await viewer.press(*["plus"] * 50)
-        assert viewer.app.session.window.order
+        assert viewer.app.session.lane_window.window.order
 
     drive(path, steps)
 

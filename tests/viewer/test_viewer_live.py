@@ -231,11 +231,11 @@ def test_questions_to_the_run(live: Any) -> None:
         while "state" not in viewer.here.after:
             await viewer.press("up")
         end = viewer.here.index
-        await viewer.answer("E", "state * 2")
+        await viewer.answer("V", "state * 2")
         assert f"state * 2 = {2 * float(viewer.here.after['state'])}" in viewer.text
-        await viewer.answer("E", "stat +")
+        await viewer.answer("V", "stat +")
         assert "stat + = " in viewer.text
-        await viewer.answer("E", "")
+        await viewer.answer("V", "")
         assert "state * 2" not in viewer.text
         await viewer.answer("C", "alarm")
         alarm = viewer.here.index

@@ -8,24 +8,18 @@ from typing import Any, ClassVar, TypeVar
 
 from textual.app import ComposeResult
 from textual.binding import Binding
-from textual.containers import Container
-from textual.widget import Widget
 from textual.worker import get_current_worker
 
 from rsltrace.debug.client import DebugSession
 from rsltrace.debug.positions import Breakpoint
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace_viewer.live.execution import WATCHES_MAX, Executed, Execution, Stop, Superseded
-from rsltrace_viewer.live.panels import BreakpointsPanel, SourceView
+from rsltrace_viewer.live.panels import BreakpointsPanel
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import LIVE_KEYS
 from rsltrace_viewer.terminal.screens.pick import PickScreen
-from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar
-from rsltrace_viewer.terminal.widgets.inspector import Inspector
-from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt, Question
-from rsltrace_viewer.terminal.widgets.timeline import Timeline
 
 T = TypeVar("T")
 
@@ -45,16 +39,8 @@ class LiveApp(ViewerApp):
     CSS = (
         f"""{ViewerApp.CSS}"""
         """
-    #detail { height: 4fr; layout: horizontal; }
-    #detail #inspector, #detail #source { height: 1fr; width: 1fr; }
-    .wide #detail { layout: vertical; width: 3fr; height: 1fr; border-left: solid $panel; }
-    .wide #detail #inspector { height: 5fr; width: 1fr; border-left: none; }
-    .wide #detail #source { height: 4fr; }
-    .lowest #detail, .low #breakpoints { display: none; }
-    .only-timeline #detail, .only-timeline #breakpoints { display: none; }
-    .only-inspector #source, .only-inspector #breakpoints { display: none; }
-    .only-lanes #breakpoints { display: none; }
-    .only-source #timeline, .only-source #inspector, .only-source #lanes,
+    .low #breakpoints { display: none; }
+    .only-timeline #breakpoints, .only-inspector #breakpoints, .only-lanes #breakpoints,
     .only-source #breakpoints { display: none; }
     """
     )
@@ -71,28 +57,21 @@ class LiveApp(ViewerApp):
 
     def compose(self) -> ComposeResult:
         """Make the parts."""
-        yield HeaderBar(id="header")
-        yield LanesView(id="lanes")
-        with Container(id="body"):
-            yield Timeline(id="timeline")
-            with Container(id="detail"):
-                yield Inspector(id="inspector")
-                yield SourceView(id="source")
-        yield BreakpointsPanel(id="breakpoints")
-        yield Prompt(id="prompt")
-        yield FooterBar(id="footer")
+        for part in super().compose():
+            if isinstance(part, Prompt):
+                yield BreakpointsPanel(id="breakpoints")
+            yield part
 
-    @property
-    def source(self) -> SourceView:
-        """The callback of the selected event."""
-        return self.screen_stack[0].query_one(SourceView)
+    def on_mount(self) -> None:
+        """The source is always in sight."""
+        self.screen_stack[0].add_class("with-source")
+        super().on_mount()
+
+    def _show_source(self) -> None:
+        """What was executed says where it is."""
 
     def _mode(self) -> str:
         return "live: executing"
-
-    def panes(self) -> list[Widget]:
-        """The parts of the screen that one can go to."""
-        return [self.timeline, self.inspector, self.source, self.lanes]
 
     # Executing.
 

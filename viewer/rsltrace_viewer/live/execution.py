@@ -16,23 +16,12 @@ from rsltrace.debug.client import DebugSession
 from rsltrace.debug.positions import Breakpoint, Stopped
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.source import Source
 from rsltrace_viewer.model.timeline.events import node_of
 
 WATCHES_MAX = 8
 _ADDRESS = re.compile(r" at 0x[0-9a-f]+(?=>)")
 """Of an object without a text of its own: another one each time that it is made again."""
-
-
-@dataclass(frozen=True, slots=True)
-class Source:
-    """The callback of an event: ``line`` is the number of the first of ``lines``, ``at`` that of
-    the one at which it waits."""
-
-    file: str
-    line: int
-    name: str
-    lines: tuple[str, ...]
-    at: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +155,7 @@ class Execution:
         if not found:
             return None
         lines = tuple(str(line) for line in found["lines"])
-        return Source(found["file"], int(found["line"]), found["name"], lines, found["at"])
+        return Source(found["file"], int(found["line"]), found["name"], lines, at=found["at"])
 
     def _value(self, expression: str, node: str) -> str:
         for owner in (node, None):

@@ -85,8 +85,11 @@ def event_of(run: Run, line: LogLine) -> int | None:
 def mark_lanes(run: Run, maker: LaneMaker, logs: Logs) -> Iterator[int]:
     """Put warnings and findings of the guard into the lanes of their nodes."""
     found: dict[str, list[tuple[int, int]]] = {"w": [], "g": []}
-    for index in list(run.trace.findings)[:_MARKED_MAX]:
-        found["g"].append((run.stamp(index), maker.row_of(int(run.row(index)["entity"]))))
+    for index, met in list(run.trace.findings.items())[:_MARKED_MAX]:
+        row = maker.row_of(int(run.row(index)["entity"]))
+        if met[0].node in maker.labels:  # a constructor's entity is not of its node
+            row = maker.labels.index(met[0].node)
+        found["g"].append((run.stamp(index), row))
         yield index
     warnings = [line for line in logs.lines if line.record.level >= LEVEL_WARN]
     for line in warnings[:_MARKED_MAX]:

@@ -14,15 +14,20 @@ from textual.screen import Screen
 from textual.widget import Widget
 
 from rsltrace.errors import TraceError
+from rsltrace.model.printable import printable, shortened
 from rsltrace.words.times import parse_stamp
+from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.source import source_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.editor import edit
 from rsltrace_viewer.terminal.follow import Follow
 from rsltrace_viewer.terminal.keys import KEYS, keys_of
 from rsltrace_viewer.terminal.questions import parse_index, question_of
 from rsltrace_viewer.terminal.rerun_follower import RerunFollower
 from rsltrace_viewer.terminal.screens.help import HelpScreen
+from rsltrace_viewer.terminal.shell import SHARES, WIDE
 from rsltrace_viewer.terminal.stepping import Stepping
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
@@ -206,7 +211,7 @@ class ViewerApp(Stepping):
 
     def panes(self) -> list[Widget]:
         """The parts of the screen that one can go to."""
-        return [self.timeline, self.inspector, self.lanes]
+        return [self.timeline, self.inspector, self.source, self.lanes]
 
     def action_pane(self, step: int) -> None:
         """Go to the next part of the screen."""
@@ -229,6 +234,85 @@ class ViewerApp(Stepping):
             screen.remove_class(*_ONLY)
         elif self.focused is not None and f"only-{self.focused.id}" in _ONLY:
             screen.add_class(f"only-{self.focused.id}")
+
+    def action_resize(self, step: int) -> None:
+        """Make the pane one is in larger (1) or smaller (-1)."""
+        if self.focused is self.lanes:
+            self._more_lanes += step
+        else:
+            share = self._share or (7 if self.size.width >= WIDE else 6)
+            share += step if self.focused is self.timeline else -step
+            self._share = max(2, min(share, SHARES - 2))
+        self._fit(self.size.width, self.size.height)
+        self.call_after_refresh(self._redraw)
+
+    def action_overview(self) -> None:
+        """Show the run at a glance."""
+        from rsltrace_viewer.terminal.screens.overview import Choice, OverviewScreen
+
+        def chosen(choice: Choice | None) -> None:
+            if choice is None:
+                return
+            what, text = choice
+            if what == "event":
+                self.go(self.session.view.place_of(int(text)), centre=True)
+                return
+            try:
+                self._filter(text)
+            except QueryError as error:
+                self.notify(f"{text}: {error}", severity="error")
+
+        self.push_screen(OverviewScreen(self.session), chosen)
+
+    def action_log(self) -> None:
+        """Show all log records."""
+        from rsltrace_viewer.terminal.screens.logs import LogScreen
+
+        def chosen(place: int | None) -> None:
+            if place is not None:
+                self.go(place, centre=True)
+
+        self.push_screen(LogScreen(self.session), chosen)
+
+    def action_source(self) -> None:
+        """Show the source of the callback, or hide it."""
+        self.screen_stack[0].toggle_class("with-source")
+        self.call_after_refresh(self._redraw)
+        self._show_source()
+
+    def action_edit(self) -> None:
+        """Open the callback in an editor; the viewer waits for it."""
+        here = self.session.current()
+        if here is None:
+            return
+        try:
+            source = source_of(*here)
+        except TraceError as error:
+            self.notify(str(error), severity="error")
+            return
+        if source is None:
+            self._say("the trace does not say where its callback is")
+        elif not source.lines:
+            self.notify(f"{source.file}:{source.line} {source.note}", severity="warning")
+        else:
+            said = edit(self, Path(source.file), source.line)
+            self._say(said or source.note)
+
+    def action_yank(self) -> None:
+        """Copy the event, or the line of the inspector one is at, to the clipboard."""
+        inspector = self._focused_inspector()
+        if inspector is not None and inspector.current is not None:
+            line = inspector.current
+            text = f"{line.label} {line.value}".strip()
+        elif self.session.rows.count:
+            event = self.session.row(self.session.row_of_place())[0]
+            parts = (str(event.index), event.time, event.node, event.kind, event.entity)
+            text = " ".join((*parts, event.outputs)).strip()
+        else:
+            return
+        text = printable(text)
+        self.copy_to_clipboard(text)
+        self._say(f"copied: {shortened(text, 40)}")
 
     def action_theme(self) -> None:
         """Change between dark and light."""

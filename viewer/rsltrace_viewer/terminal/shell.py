@@ -20,15 +20,18 @@ from textual.worker import get_current_worker
 from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
+from rsltrace_viewer.model.source import Source, source_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt
+from rsltrace_viewer.terminal.widgets.source import SourceView
 from rsltrace_viewer.terminal.widgets.timeline import Row, Timeline
 
-_WIDE = 110
+WIDE = 110
+SHARES = 12
 _REPORT_S = 0.25
 _EFFECTS_AT_ONCE_S = 0.004
 _INSPECT_S = 0.02
@@ -45,16 +48,24 @@ class Shell(App[None]):
     Screen { layout: vertical; overflow: hidden; }
     #body { height: 1fr; layout: vertical; }
     #timeline { height: 5fr; width: 1fr; }
-    #inspector { height: 4fr; width: 1fr; border-top: solid $panel; }
+    #detail { height: 4fr; width: 1fr; layout: horizontal; }
+    #inspector { height: 1fr; width: 1fr; border-top: solid $panel; }
+    #source { height: 1fr; width: 1fr; display: none; }
+    .with-source #source { display: block; }
     .wide #body { layout: horizontal; }
     .wide #timeline { height: 1fr; width: 5fr; }
-    .wide #inspector { height: 1fr; width: 3fr; border-top: none; border-left: solid $panel; }
+    .wide #detail { layout: vertical; width: 3fr; height: 1fr; border-left: solid $panel; }
+    .wide #inspector { height: 5fr; border-top: none; }
+    .wide #source { height: 4fr; }
     .low #lanes { display: none; }
-    .lowest #inspector { display: none; }
+    .lowest #detail { display: none; }
     #inspector:focus { border-top: solid $accent; }
-    .wide #inspector:focus { border-top: none; border-left: solid $accent; }
-    .only-timeline #lanes, .only-timeline #inspector { display: none; }
-    .only-inspector #lanes, .only-inspector #timeline { display: none; }
+    .wide #inspector:focus { border-top: none; }
+    .wide #detail:focus-within { border-left: solid $accent; }
+    .only-timeline #lanes, .only-timeline #detail { display: none; }
+    .only-inspector #lanes, .only-inspector #timeline, .only-inspector #source { display: none; }
+    .only-source #timeline, .only-source #inspector, .only-source #lanes { display: none; }
+    .only-inspector #detail, .only-source #detail { border-left: none; }
     .only-lanes #body { display: none; }
     .only-lanes #lanes { height: 1fr; }
     """
@@ -72,6 +83,9 @@ class Shell(App[None]):
         self.busy = True
         """Whether something is about to be drawn that is not yet: for pictures and tests."""
         self._start = start
+        self._share = 0
+        """Of SHARES, how many the events have; 0: as the style sheet says."""
+        self._more_lanes = 0
         self._status = ""
         self._soon: Timer | None = None
         self.following = False
@@ -89,7 +103,9 @@ class Shell(App[None]):
         yield LanesView(id="lanes")
         with Container(id="body"):
             yield Timeline(id="timeline")
-            yield Inspector(id="inspector")
+            with Container(id="detail"):
+                yield Inspector(id="inspector")
+                yield SourceView(id="source")
         yield Prompt(id="prompt")
         yield FooterBar(id="footer")
 
@@ -167,6 +183,11 @@ class Shell(App[None]):
         return self.screen_stack[0].query_one(Inspector)
 
     @property
+    def source(self) -> SourceView:
+        """The callback of the selected event."""
+        return self.screen_stack[0].query_one(SourceView)
+
+    @property
     def lanes(self) -> LanesView:
         """The overview."""
         return self.screen_stack[0].query_one(LanesView)
@@ -179,13 +200,20 @@ class Shell(App[None]):
     def _fit(self, width: int, height: int) -> None:
         """Use the screen there is."""
         screen = self.screen_stack[0]
-        screen.set_class(width >= _WIDE, "wide")
+        screen.set_class(width >= WIDE, "wide")
         screen.set_class(height < 16, "low")
-        screen.set_class(height < 11 or (width < _WIDE and height < 14), "lowest")
+        screen.set_class(height < 11 or (width < WIDE and height < 14), "lowest")
         labels = self.session.lane_window.labels
         self.lanes.fit_labels(labels, width, two=self.session.b is not None)
-        most = max(4, height // 5)
-        self.lanes.styles.height = min(len(labels), most) + 1
+        rows = min(len(labels), max(4, height // 5))
+        self._more_lanes = max(1 - rows, min(self._more_lanes, len(labels) - rows))
+        self.lanes.styles.height = rows + self._more_lanes + 1
+        if self._share:
+            shares = f"{self._share}fr", f"{SHARES - self._share}fr"
+            detail = screen.query_one("#detail")
+            for widget, share in zip((self.timeline, detail), shares, strict=True):
+                widget.styles.width = share if width >= WIDE else "1fr"
+                widget.styles.height = "1fr" if width >= WIDE else share
 
     # Drawing.
 
@@ -254,6 +282,18 @@ class Shell(App[None]):
                 at_once_s=_EFFECTS_AT_ONCE_S,
             )
 
+    def _show_source(self) -> None:
+        """Show the text of the callback, if that is wanted. Files are read in a thread."""
+        here = self.session.current()
+        if here is not None and self.screen_stack[0].has_class("with-source"):
+            light = self.theme == "textual-light"
+
+            def arrive(found: list[Source | None] | None, done: bool) -> None:
+                if self.session.current() == here:
+                    self.source.show(found[0] if found else None, light=light)
+
+            walk(self, "source", ([source_of(*here)] for _ in range(1)), arrive, at_once_s=0)
+
     def _effects_arrived(self, effects: Effects | None, done: bool) -> None:
         here = self.session.current()
         if effects is None or here is None or effects.event != here[1]:
@@ -303,6 +343,7 @@ class Shell(App[None]):
         if self.screen_stack:
             self._show_inspector()
             self._show_values()
+            self._show_source()
             self.busy = False
             self.rested()
 

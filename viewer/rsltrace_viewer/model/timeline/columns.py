@@ -110,7 +110,7 @@ def layout(
             break
         wanted.append(column)
         spare -= column.width + GAP
-    if spare >= 14 + 24:
+    if spare >= 14 + 44:
         wanted += [Column("input", 6), Column("output", 6)]
         spare -= 14
     if spare > 3:

@@ -29,7 +29,7 @@ class HeaderBar(Static):
         title = fit(title, min(width - cells(mode), cells(title)))
         rest = fit(f"  {facts}", width - cells(title) - cells(mode))
         parts: list[tuple[str, str] | str] = [(title, "bold"), (rest, "$text-muted")]
-        parts.append((mode, "bold $text-accent"))
+        parts.append((mode, "bold $text-primary"))
         if verdict and lines:
             style = "bold $text-error" if bad else "bold $text-success"
             wrapped = wrap(verdict, width)

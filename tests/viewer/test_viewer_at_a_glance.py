@@ -1,0 +1,207 @@
+"""Overview, log, source, editor, clipboard, and panes of other sizes."""
+
+from __future__ import annotations
+
+import base64
+import shutil
+from collections.abc import Callable
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rsltrace_viewer.model.logs import LogLine, event_of, read_logs
+from rsltrace_viewer.model.overview import nodes_of, read_overview, topics_of, troubles_of
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.source import source_of
+from rsltrace_viewer.terminal.editor import command
+from rsltrace_viewer.terminal.screens.logs import LogScreen
+from rsltrace_viewer.terminal.screens.overview import OverviewScreen
+from rsltrace_viewer.terminal.widgets.source import SourceView
+
+from rsltrace.model.event import OutputKind
+from rsltrace.trace.counts import count
+
+Drive = Callable[..., None]
+SAMPLES = Path(__file__).parents[2] / "sample_traces"
+
+
+def test_the_overview_counts_what_the_trace_has(long_run: Run) -> None:
+    overview = list(read_overview(long_run))[-1]
+    counts = count(long_run.trace)
+    assert {e: s.count for e, s in overview.events.items()} == {
+        e: s.count for e, s in counts.events.items()
+    }
+    assert overview.share == 1.0
+    assert overview.raised_count == 1
+    assert overview.raised == [long_run.count - 1]
+    topics = {part.name: part for part in topics_of(long_run, overview)}
+    assert topics["/count"].rate_hz == pytest.approx(50, rel=0.01)
+    parts = nodes_of(long_run, overview)
+    assert {part.name for part in parts} == {"/talker", "/listener"}
+    assert sum(part.share for part in parts) == pytest.approx(1, abs=0.01)
+    logs = list(read_logs(long_run))[-1]
+    troubles = {one.what: one.count for one in troubles_of(long_run, overview, logs)}
+    assert troubles["exceptions"] == 1
+
+
+def test_log_records_lead_to_the_events_that_logged_them(long_run: Run) -> None:
+    logs = list(read_logs(long_run))[-1]
+    assert len(logs.lines) > 1000
+    for line in logs.lines[::701]:
+        index = event_of(long_run, line)
+        assert index is not None
+        assert long_run.stamp(index) == line.stamp_ns
+        logged = [o for o in long_run.outputs(index) if o.kind is OutputKind.LOG]
+        assert line.sequence in [output.sequence for output in logged]
+    nowhere = LogLine(long_run.end_ns, 10**6, logs.lines[0].record)
+    assert event_of(long_run, nowhere) is None
+
+
+def test_the_overview_leads_to_events(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        await viewer.press("O")
+        assert isinstance(viewer.app.screen, OverviewScreen)
+        for words in ("exceptions", "/talker", "/count", "exit code 3", "50 Hz"):
+            assert words in viewer.text
+        await viewer.press("j", "enter")
+        assert viewer.app.session.current()[1] == 602
+        await viewer.press("O", *["j"] * 8, "enter")
+        assert viewer.app.session.filter_text.startswith("node:")
+        await viewer.press("O", "escape")
+        assert not isinstance(viewer.app.screen, OverviewScreen)
+
+    drive(made, steps)
+
+
+def test_the_log_leads_to_events_and_levels_can_be_left_out(drive: Drive) -> None:
+    folder = SAMPLES / "missing_event"
+
+    async def steps(viewer: Any) -> None:
+        await viewer.press("g")
+        assert isinstance(viewer.app.screen, LogScreen)
+        assert "12 records" in viewer.text
+        assert "the gripper has not answered yet" in viewer.text
+        await viewer.press("w")
+        assert "warnings and worse" in viewer.text
+        await viewer.press("w")
+        assert "0 records" in viewer.text
+        await viewer.press("w", "home", "j", "enter")
+        session = viewer.app.session
+        index = session.view.b(viewer.place)
+        assert any(o.kind is OutputKind.LOG for o in session.b.outputs(index))
+
+    drive((folder / "a.mcap", folder / "b.mcap"), steps)
+
+
+def test_names_in_the_log_and_the_overview_steer_nothing(odd: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        for key in ("g", "O"):
+            await viewer.press(key)
+            assert "\x1b" not in viewer.text
+            assert "\u202e" not in viewer.text
+            await viewer.press("escape")
+
+    drive(odd, steps)
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a run with its code beside it."""
+    pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+    import rsltrace
+
+    folder = tmp_path_factory.mktemp("recorded")
+    shutil.copytree(SAMPLES / "delayed_input", folder, dirs_exist_ok=True)
+    job = rsltrace.load_job(folder / "job.yaml", overrides=["stop.duration=100ms"])
+    rsltrace.record(job, folder / "run.mcap")
+    return folder
+
+
+@pytest.mark.ros
+def test_the_source_of_a_callback_and_that_it_has_changed(
+    recorded: Path, tmp_path: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "job"
+    shutil.copytree(recorded, folder)
+    monkeypatch.chdir(tmp_path)
+    run = Run.open(folder / "run.mcap")
+    index = next(i for i in range(run.count) if run.event(i).kind.label == "timer")
+    source = source_of(run, index)
+    assert source is not None
+    assert source.lines[0].strip().startswith("def ")
+    assert Path(source.file).read_text().splitlines()[source.line - 1] == source.lines[0]
+    assert source.note == ""
+    code = folder / "rover.py"
+    code.write_text(code.read_text() + "\n# another line\n")
+    changed = source_of(run, index)
+    assert changed is not None
+    assert "changed since this run" in changed.note
+    assert changed.lines == source.lines
+    copied: list[str] = []
+
+    async def steps(viewer: Any) -> None:
+        await viewer.press("s")
+        shown = viewer.app.query_one(SourceView)
+        assert shown.display
+        assert "def " in viewer.text
+        assert "changed since this run" in viewer.text
+        monkeypatch.setattr(viewer.app, "suspend", nullcontext)
+        note = tmp_path / "note"
+        editor = tmp_path / "editor"
+        editor.write_text(f'#!/bin/sh\necho "$@" > {note}\n')
+        editor.chmod(0o755)
+        monkeypatch.setenv("VISUAL", f"{editor} --wait")
+        await viewer.press("E")
+        assert note.read_text() == f"--wait +{source.line} {source.file}\n"
+        monkeypatch.setenv("VISUAL", str(tmp_path / "none"))
+        await viewer.press("E")
+        assert "No such file" in viewer.text
+        monkeypatch.setattr(viewer.app, "copy_to_clipboard", copied.append)
+        await viewer.press("y")
+        assert copied[0].startswith(f"{index} ")
+        await viewer.press("s")
+        assert not shown.display
+        code.unlink()
+        await viewer.press("E", "s")
+        assert "not below this folder" in viewer.text
+
+    drive(folder / "run.mcap", steps, start=index)
+    run.close()
+
+
+def test_editors_get_the_line_as_they_want_it() -> None:
+    path = Path("a/b.py")
+    assert command(["vim", "-n"], path, 7) == ["vim", "-n", "+7", "a/b.py"]
+    assert command(["/usr/bin/code", "--wait"], path, 7)[-2:] == ["--goto", "a/b.py:7"]
+    assert command(["hx"], path, 7) == ["hx", "a/b.py:7"]
+
+
+def test_copies_go_through_the_terminal(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        written: list[str] = []
+        viewer.app._driver.write = written.append
+        await viewer.press("j", "j", "y")
+        found = [text for text in written if text.startswith("\x1b]52;c;")]
+        copied = base64.b64decode(found[0].removeprefix("\x1b]52;c;").rstrip("\a")).decode()
+        assert copied.startswith("2 10.020000000 /talker timer tick /count 3439")
+
+    drive(made, steps)
+
+
+def test_panes_can_be_resized(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        app = viewer.app
+        for size, side in (((120, 36), "width"), ((80, 36), "height")):
+            await viewer.resize(*size)
+            before = getattr(app.timeline.size, side)
+            await viewer.press("greater_than_sign")
+            larger = getattr(app.timeline.size, side)
+            assert larger > before
+            await viewer.press("tab", "greater_than_sign", "greater_than_sign", "shift+tab")
+            assert getattr(app.timeline.size, side) < larger
+        rows = app.lanes.size.height
+        await viewer.press("shift+tab", "less_than_sign")
+        assert app.lanes.size.height < rows
+
+    drive(made, steps)

@@ -1,0 +1,80 @@
+"""The text of the callback that an event ran, as the file has it now."""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from dataclasses import dataclass
+from pathlib import PurePosixPath
+
+from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.reader import Trace
+from rsltrace.words.code import code_file, code_place
+from rsltrace_viewer.model.run import Run
+
+_LINES_MAX = 400
+_BYTES_MAX = 4 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """The callback of an event: ``line`` is the number of the first of ``lines``, ``at`` that of
+    the one at which it waits. ``note`` says why there are none, or that they may not be those of
+    the run."""
+
+    file: str
+    line: int
+    name: str
+    lines: tuple[str, ...]
+    note: str = ""
+    at: int | None = None
+
+
+def source_of(run: Run, index: int) -> Source | None:
+    """Return the callback of event ``index``; None where the trace names none.
+
+    Raises TraceError, IndexError.
+    """
+    place = code_place(run.trace, run.event(index))
+    if not place:
+        return None
+    found = code_file(run.trace, place)
+    name, _, line = place.rpartition(":")
+    if found is None:
+        note = "not below this folder or that of the trace: open it where the job is"
+        return Source(name, int(line) if line.isdecimal() else 1, place, (), note)
+    path, first = found
+    try:
+        data = path.read_bytes()[:_BYTES_MAX]
+    except OSError as error:
+        return Source(str(path), first, place, (), f"cannot be read: {error.strerror or error}")
+    text = data.decode("utf-8", "replace")
+    lines = text.splitlines()
+    note = "" if _is_that_of(run.trace, name, data) else "changed since this run: it may be others"
+    if first > len(lines):
+        note = f"changed since this run: it has {len(lines)} lines now"
+    last = min(_last_line(text, first), first + _LINES_MAX)
+    return Source(str(path), first, place, tuple(lines[first - 1 : last]), note)
+
+
+def _is_that_of(trace: Trace, name: str, data: bytes) -> bool:
+    """Whether a file is the one that ran; of one that the trace has no hash of, nobody knows."""
+    known = trace.metadata(METADATA_SOURCES)
+    module = ".".join(PurePosixPath(name).with_suffix("").parts).removesuffix(".__init__")
+    recorded = known.get(module) or known.get(f"file:{name}")
+    return recorded is None or recorded == hashlib.sha256(data).hexdigest()[:16]
+
+
+def _last_line(text: str, first: int) -> int:
+    """Return the last line of the function that begins at a line, its decorators included."""
+    try:
+        tree = ast.parse(text)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return first + 40
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda, ast.ClassDef)):
+            decorators = getattr(node, "decorator_list", [])
+            begin = min([node.lineno, *(one.lineno for one in decorators)])
+            if begin == first and not isinstance(node, ast.ClassDef):
+                return node.end_lineno or first
+    return first + 40

@@ -1,0 +1,135 @@
+"""A list of lines with a cursor. Only the lines on screen are made, however long the list is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import ClassVar
+
+from rich.segment import Segment as Piece
+from textual import events
+from textual.geometry import Size
+from textual.message import Message
+from textual.scroll_view import ScrollView
+from textual.strip import Strip
+
+from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
+
+STYLES = ("plain", "muted", "title", "good", "error", "warning", "link", "bar")
+Pieces = Sequence[tuple[str, str]]
+"""Texts of a line, each with one of STYLES. They must be printable."""
+
+
+class ListView(ScrollView, can_focus=True, inherit_bindings=False):
+    """Lines that somebody else provides. It moves by the usual keys; Enter and clicks choose."""
+
+    COMPONENT_CLASSES: ClassVar[set[str]] = {f"list--{name}" for name in (*STYLES, "cursor")}
+    DEFAULT_CSS = """
+    ListView { background: $background; scrollbar-size: 1 1; overflow-x: hidden;
+               overflow-y: scroll; height: 1fr; width: 1fr; padding: 0 0 0 1; }
+    ListView > .list--plain { color: $text; }
+    ListView > .list--muted { color: $text-muted; }
+    ListView > .list--title { color: $text; text-style: bold underline; }
+    ListView > .list--good { color: $text-success; }
+    ListView > .list--error { color: $text-error; text-style: bold; }
+    ListView > .list--warning { color: $text-warning; }
+    ListView > .list--link { color: $text-primary; }
+    ListView > .list--bar { color: $text-primary; }
+    ListView > .list--cursor { background: $primary 30%; }
+    """
+
+    class Moved(Message):
+        """The cursor is at another line."""
+
+        def __init__(self, line: int) -> None:
+            super().__init__()
+            self.line = line
+
+    class Chosen(Message):
+        """A line was chosen, by Enter or a click."""
+
+        def __init__(self, line: int) -> None:
+            super().__init__()
+            self.line = line
+
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
+        super().__init__(id=id)
+        self.cursor = 0
+        self._source: Callable[[int], Pieces] = lambda line: ()
+        self.count = 0
+
+    @property
+    def page(self) -> int:
+        """How many lines are in sight."""
+        return max(self.scrollable_content_region.height, 1)
+
+    def show(self, source: Callable[[int], Pieces], count: int) -> None:
+        """Show ``count`` lines; the cursor stays where it is if there is such a line."""
+        self._source, self.count = source, count
+        set_virtual_size(self, Size(max(self.size.width, 1), count))
+        self.cursor = max(min(self.cursor, count - 1), 0)
+        self.refresh()
+
+    def go(self, line: int) -> None:
+        """Move the cursor to a line, and bring it into sight."""
+        self.cursor = max(min(line, self.count - 1), 0)
+        top = round(self.scroll_y)
+        if not top <= self.cursor < top + self.page:
+            above = self.cursor < top
+            wanted = self.cursor if above else self.cursor - self.page + 1
+            self.scroll_to(y=max(wanted, 0), animate=False, force=True, immediate=True)
+        self.refresh()
+        self.post_message(self.Moved(self.cursor))
+
+    def on_key(self, event: events.Key) -> None:
+        """Move, or choose."""
+        steps = {
+            "down": 1,
+            "j": 1,
+            "up": -1,
+            "k": -1,
+            "pagedown": self.page,
+            "space": self.page,
+            "pageup": -self.page,
+            "home": -self.count,
+            "end": self.count,
+            "G": self.count,
+        }
+        if event.key in steps:
+            self.go(self.cursor + steps[event.key])
+        elif event.key == "enter" and self.count:
+            self.post_message(self.Chosen(self.cursor))
+        else:
+            return
+        event.stop()
+
+    def on_click(self, event: events.Click) -> None:
+        """Choose the line that was clicked."""
+        line = round(self.scroll_y) + event.y
+        if line < self.count:
+            self.go(line)
+            self.post_message(self.Chosen(line))
+
+    def on_focus(self) -> None:
+        """Show the cursor."""
+        self.refresh()
+
+    def on_blur(self) -> None:
+        """Hide the cursor."""
+        self.refresh()
+
+    def render_line(self, y: int) -> Strip:
+        """Return line ``y`` of the widget."""
+        line = round(self.scroll_y) + y
+        width = self.scrollable_content_region.width
+        style = self.get_component_rich_style
+        if line >= self.count:
+            return Strip([Piece(" " * width, style("list--plain"))], width)
+        pieces = [Piece(text, style(f"list--{name}")) for text, name in self._source(line)]
+        strip = Strip(pieces)
+        if strip.cell_length > width:
+            strip = Strip([*strip.crop(0, width - 1), Piece("…", style("list--muted"))])
+        strip = strip.adjust_cell_length(width, style("list--plain"))
+        if self.has_focus and line == self.cursor:
+            over = background_of(style("list--cursor"))
+            return Strip([Piece(text, (old or over) + over) for text, old, _ in strip], width)
+        return strip
