@@ -16,13 +16,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.output.text_file import write_text
+from rsltrace.diff.file_kind import is_recording
 from rsltrace.errors import OutputError, SetupError, TraceError
 from rsltrace.terminal import tell
 
 if TYPE_CHECKING:
     from rsltrace_viewer.session import Session
     from rsltrace_viewer.terminal.app import ViewerApp
+    from rsltrace_viewer.terminal.recordings.app import RecordingApp
     from rsltrace_viewer.terminal.rerun_follower import RerunFollower
+    from rsltrace_viewer.terminal.screenshot import Shown
 
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
@@ -72,6 +75,8 @@ def view(
 ) -> None:
     """Look at TRACE, or compare two: step through events, follow causes, read messages.
 
+    Bags and native recordings open, too (a folder, .mcap or .db3): topics, rates, messages, plots.
+
     With --live, the job in TRACE runs again as one steps: each event is verified, and shown with
     what it changed in its node and with the source of its callback. This runs code, under the
     conditions of "rsltrace replay".
@@ -95,6 +100,13 @@ def view(
     chosen = traces or _choose(exporting=export is not None)
     if not chosen:
         return
+    if any(is_recording(path) for path in chosen):
+        if at is not None or filter_text or follow or live or rerun:
+            raise click.UsageError(
+                "--at, --filter, --follow, --live and --rerun need traces; these are recordings"
+            )
+        _show(_recordings(chosen, light=light), export, size, keys)
+        return
     with ExitStack() as stack:
         session, made = _opened(stack, chosen, live=live, job_folder=job_folder, trust=trust)
         app = made(
@@ -104,10 +116,21 @@ def view(
             filter_text=_checked_filter(session, filter_text),
             rerun=_follower(stack, chosen) if rerun else None,
         )
-        if export is not None:
-            _export(app, export, _parse_size(size), keys.split())
-        else:
-            _run(app)
+        _show(app, export, size, keys)
+
+
+def _show(app: Shown, export: Path | None, size: str, keys: str) -> None:
+    if export is not None:
+        _export(app, export, _parse_size(size), keys.split())
+    else:
+        _run(app)
+
+
+def _recordings(paths: tuple[Path, ...], *, light: bool) -> RecordingApp:
+    """Return the app for bags and native recordings, or one of them beside a trace."""
+    from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
+
+    return RecordingApp(open_recordings(paths), light=light)
 
 
 def _opened(
@@ -216,7 +239,7 @@ def _parse_size(text: str) -> tuple[int, int]:
     return int(found[1]), int(found[2])
 
 
-def _export(app: ViewerApp, path: Path, size: tuple[int, int], keys: list[str]) -> None:
+def _export(app: Shown, path: Path, size: tuple[int, int], keys: list[str]) -> None:
     if path.suffix not in (".svg", ".txt"):
         raise click.BadParameter(f"{path} should end in .svg or .txt", param_hint="--export")
     from rsltrace_viewer.terminal.screenshot import screen_of
@@ -230,7 +253,7 @@ def _has_terminal() -> bool:
     return "TEXTUAL_DRIVER" in os.environ or (sys.stdin.isatty() and sys.stdout.isatty())
 
 
-def _run(app: ViewerApp) -> None:
+def _run(app: Shown) -> None:
     if not _has_terminal():
         raise SetupError(
             "the viewer needs a terminal; --export writes a screen to a file, `rsltrace cat` prints"

@@ -81,7 +81,7 @@ def test_what_is_wrong_is_said(
 
 
 def test_files_that_cannot_be_opened(made: Path, tmp_path: Path) -> None:
-    for path, message in ((tmp_path / "no.mcap", "does not exist"), (tmp_path, "is a folder")):
+    for path, message in ((tmp_path / "no.mcap", "does not exist"), (tmp_path, "not a bag")):
         result = view(path, "--export", tmp_path / "x.txt")
         assert result.exit_code == 2
         assert message in result.output

@@ -21,12 +21,13 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 from rsltrace_viewer.live.app import LiveApp
 from rsltrace_viewer.live.execution import Execution
-from rsltrace_viewer.live.panels import BreakpointsPanel, SourceView
+from rsltrace_viewer.live.panels import BreakpointsPanel
 from rsltrace_viewer.live.state import LiveSession
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import node_of
 from rsltrace_viewer.terminal.keys import KEYS, LIVE_KEYS
 from rsltrace_viewer.terminal.screenshot import settle, text_of
+from rsltrace_viewer.terminal.widgets.source import SourceView
 
 from rsltrace import DebugSession
 from rsltrace.cli.main import cli

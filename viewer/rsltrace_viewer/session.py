@@ -35,6 +35,7 @@ from rsltrace_viewer.model.view import Sign, SingleView, View
 if TYPE_CHECKING:
     from rsltrace.diff.alignment.blocks import AlignedBlock
     from rsltrace_viewer.model.comparison import Comparison
+    from rsltrace_viewer.model.plots.runs import RunPlots
 
 SEEK: dict[str, tuple[Condition, str]] = {
     "raised": (conditions.RAISED, "exception"),
@@ -351,6 +352,20 @@ class Session:
         return self.view.place_of(self.a.index_at(stamp_ns))
 
     # Words.
+
+    def plots(self) -> RunPlots:
+        """Return what can be plotted."""
+        from rsltrace_viewer.model.plots.runs import RunPlots
+
+        found = self.same("topic")
+        return RunPlots(
+            [run for run in (self.a, self.b) if run is not None],
+            self.title(),
+            topic=found[1] if found is not None else "",
+            stamp_ns=None if self.empty else self.stamp(),
+            base_ns=self.base_ns,
+            diff=self.comparison.diff if self.comparison is not None else None,
+        )
 
     def mode(self) -> str:
         """Return what is shown of it: one run, or of two which."""

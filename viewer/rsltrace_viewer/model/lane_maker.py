@@ -145,9 +145,9 @@ class LaneMaker:
             return self._around(
                 run.stamp(selected), step_from(self._narrowest(selected, columns)), columns
             )
-        length = window.fitted(columns).step(columns)
-        length = step_below(length) if step > 0 else step_from(length + 1)
-        if step > 0 and length < self._narrowest(selected, columns):
+        shown = window.fitted(columns).step(columns)
+        length = step_below(shown) if step > 0 else step_from(shown + 1)
+        if step > 0 and (length == shown or length < self._narrowest(selected, columns)):
             return Window(0, columns, order=True)
         return self._around(run.stamp(selected) if run.count else 0, length, columns)
 

@@ -326,7 +326,7 @@ class ViewerApp(Stepping):
         """Open the plots."""
         from rsltrace_viewer.terminal.screens.plot import PlotScreen
 
-        self.push_screen(PlotScreen(self.session))
+        self.push_screen(PlotScreen(self.session.plots()))
 
     def action_verdict(self) -> None:
         """Show the whole report on two traces."""

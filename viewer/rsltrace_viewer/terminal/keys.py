@@ -84,11 +84,9 @@ KEYS: tuple[Key, ...] = (
         "search",
         2,
     ),
-    Key("n", "n", "next_match(1)", "next match; without a search, next divergence", FIND),
+    Key("n", "n", "next_match(1)", "next match; without a search, divergence", FIND),
     Key("N", "N", "next_match(-1)", "previous match or divergence", FIND),
-    Key(
-        "F", "F", "ask('filter')", "show only some events: node:/x kind:timer …", FIND, "filter", 6
-    ),
+    Key("F", "F", "ask('filter')", "show only some events: node:/x …", FIND, "filter", 6),
     Key("escape", "Esc", "escape", "end search, filter, zoom, following", FIND),
     Key("enter", "Enter", "enter", "open or close a field; follow a link", LOOK, "open", 11),
     Key("tab", "Tab", "pane(1)", "next pane: events, event, lanes", LOOK, "pane", 7),

@@ -5,8 +5,13 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
-from rsltrace_viewer.terminal.app import ViewerApp
+if TYPE_CHECKING:
+    from rsltrace_viewer.terminal.app import ViewerApp
+    from rsltrace_viewer.terminal.recordings.app import RecordingApp
+
+    Shown: TypeAlias = ViewerApp | RecordingApp
 
 _FONT_FACE = re.compile(r"@font-face\s*\{[^}]*\}\s*")
 _FONTS = 'font-family: "Fira Code", "DejaVu Sans Mono", Menlo, Consolas, monospace;'
@@ -14,7 +19,7 @@ _SETTLE_S = 30.0
 _PAUSE_S = 0.03
 
 
-def screen_of(app: ViewerApp, size: tuple[int, int], keys: Sequence[str] = (), *, svg: bool) -> str:
+def screen_of(app: Shown, size: tuple[int, int], keys: Sequence[str] = (), *, svg: bool) -> str:
     """Return what ``app`` shows on a screen of ``size`` cells after ``keys`` were pressed.
 
     Keys are named as Textual does (``down``, ``n``, ``slash``).
@@ -22,9 +27,7 @@ def screen_of(app: ViewerApp, size: tuple[int, int], keys: Sequence[str] = (), *
     return asyncio.run(_screen_of(app, size, keys, svg=svg))
 
 
-async def _screen_of(
-    app: ViewerApp, size: tuple[int, int], keys: Sequence[str], *, svg: bool
-) -> str:
+async def _screen_of(app: Shown, size: tuple[int, int], keys: Sequence[str], *, svg: bool) -> str:
     async with app.run_test(size=size, notifications=True) as pilot:
         await settle(app, pilot.pause)
         for key in keys:
@@ -38,14 +41,14 @@ async def _screen_of(
         return text_of(app)
 
 
-def text_of(app: ViewerApp) -> str:
+def text_of(app: Shown) -> str:
     """Return the screen as lines of text; none ends in spaces."""
     # Textual has pictures only; this is what it makes them of.
     strips = app.screen._compositor.render_strips(app.size)
     return "\n".join(strip.text.rstrip() for strip in strips) + "\n"
 
 
-async def settle(app: ViewerApp, pause: object) -> None:
+async def settle(app: Shown, pause: object) -> None:
     """Wait until nothing works in the background and the screen is drawn."""
     assert callable(pause)
     loop = asyncio.get_running_loop()

@@ -88,7 +88,7 @@ def fields_of(run: Run, topic: str) -> list[Source]:
     """Return the numeric fields of a topic, as its first message has them. Raises TraceError."""
     for _, _, data in run.trace.messages(topic):
         message = run.trace.decode(topic, data)
-        return [Source("field", topic, path) for path in _numeric_paths(message, "")]
+        return [Source("field", topic, path) for path in numeric_paths(message)]
     return []
 
 
@@ -111,7 +111,8 @@ def _publishers(run: Run) -> list[Entity]:
     return list(seen.values())
 
 
-def _numeric_paths(value: Any, path: str) -> Iterator[str]:
+def numeric_paths(value: Any, path: str = "") -> Iterator[str]:
+    """Yield the paths of the numbers in a decoded message: ``pose.position.x``, ``ranges[3]``."""
     if isinstance(value, (bool, int, float)):
         yield path
     elif isinstance(value, np.ndarray):
@@ -119,15 +120,15 @@ def _numeric_paths(value: Any, path: str) -> Iterator[str]:
             yield f"{path}[{place}]"
     elif isinstance(value, list):
         for place in range(min(len(value), 4)):
-            yield from _numeric_paths(value[place], f"{path}[{place}]")
+            yield from numeric_paths(value[place], f"{path}[{place}]")
     elif dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
             if field.name not in _NOT_OF_THE_MESSAGE:
                 inner = f"{path}.{field.name}" if path else field.name
-                yield from _numeric_paths(getattr(value, field.name), inner)
+                yield from numeric_paths(getattr(value, field.name), inner)
 
 
-def _value_at(message: Any, path: str) -> float:
+def value_at(message: Any, path: str) -> float:
     """Return a number by its path; NaN where an array is shorter."""
     value = message
     for part in path.replace("[", ".[").split("."):
@@ -157,7 +158,7 @@ def _field_series(run: Run, source: Source) -> Iterator[Series]:
         if found is None:
             continue
         times.append(found[0] / 1e9)
-        values.append(_value_at(trace.decode(channel, found[2]), source.field))
+        values.append(value_at(trace.decode(channel, found[2]), source.field))
         if len(times) % 100 == 0:
             yield Series(np.array(times), np.array(values), f"{note}, {sequence / count:.0%} read")
     yield Series(np.array(times), np.array(values), note)

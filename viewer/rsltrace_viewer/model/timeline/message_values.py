@@ -12,7 +12,8 @@ import numpy as np
 
 from rsltrace.model.printable import printable, shortened
 
-_NOT_SHOWN = frozenset(("structure_needs_at_least_one_member", "__msgtype__", "header", "stamp"))
+_NEVER = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
+_NOT_SHOWN = _NEVER | {"header", "stamp"}
 _VALUES_MAX = 5
 _LEAVES_MAX = 60
 _TEXT_MAX = 30
@@ -35,29 +36,46 @@ def message_values(message: object) -> str:
     return printable(" ".join(parts))
 
 
-def _leaves(value: Any, path: str) -> Iterator[tuple[str, str]]:
+def differing_values(a: object, b: object) -> tuple[str, str]:
+    """Return the first values in which two decoded messages differ, in full."""
+    leaves = [dict(list(_leaves(one, "", in_full=True))[:_LEAVES_MAX]) for one in (a, b)]
+    paths = [path for path in leaves[0] if leaves[0][path] != leaves[1].get(path)]
+    texts = [
+        printable(" ".join(f"{path.rpartition('.')[2]}={one.get(path, '-')}" for path in paths))
+        for one in leaves
+    ]
+    return texts[0], texts[1]
+
+
+def _leaves(value: Any, path: str, in_full: bool = False) -> Iterator[tuple[str, str]]:
     if isinstance(value, (bool, np.bool_)):
         yield path, "true" if value else "false"
-    elif isinstance(value, (int, float, np.number)):
-        yield path, number(float(value)) if isinstance(value, (float, np.floating)) else str(value)
+    elif isinstance(value, (int, np.integer)):
+        yield path, str(value)
+    elif isinstance(value, (float, np.floating)):
+        yield path, repr(float(value)) if in_full else number(float(value))
     elif isinstance(value, str):
         yield path, f'"{shortened(value, _TEXT_MAX)}"'
     elif isinstance(value, (list, np.ndarray)):
-        if "covariance" not in path:
+        if in_full:
+            for place, item in enumerate(value[:_LEAVES_MAX]):
+                yield from _leaves(item, f"{path}[{place}]", in_full)
+        elif "covariance" not in path:
             yield path, _items(value)
     elif dataclasses.is_dataclass(value):
-        yield from _fields(value, path)
+        yield from _fields(value, path, in_full)
 
 
-def _fields(message: Any, path: str) -> Iterator[tuple[str, str]]:
-    names = [f.name for f in dataclasses.fields(message) if f.name not in _NOT_SHOWN]
-    if names == ["x", "y", "z", "w"]:  # a quaternion: on the ground the turn is what one looks for
+def _fields(message: Any, path: str, in_full: bool) -> Iterator[tuple[str, str]]:
+    left_out = _NEVER if in_full else _NOT_SHOWN
+    names = [f.name for f in dataclasses.fields(message) if f.name not in left_out]
+    if names == ["x", "y", "z", "w"] and not in_full:  # a quaternion: its turn is what tells
         yield f"{path}.θ".lstrip("."), number(_yaw(*(float(getattr(message, n)) for n in names)))
         return
     turns = "angular" in path and names == ["x", "y", "z"]
     for name in names:
         inner = _TURNS[name] if turns else name.rstrip("_")
-        yield from _leaves(getattr(message, name), f"{path}.{inner}".lstrip("."))
+        yield from _leaves(getattr(message, name), f"{path}.{inner}".lstrip("."), in_full)
 
 
 def _items(values: Any) -> str:

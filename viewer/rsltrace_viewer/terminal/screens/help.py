@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 from typing import ClassVar
 
 from textual.app import ComposeResult
@@ -18,7 +19,10 @@ from rsltrace_viewer.model.query.fields import FIELDS
 from rsltrace_viewer.terminal.keys import Key, keys_of
 
 _KEY_WIDTH = 13
-_COLUMN = 62
+_COLUMN = 56
+_COLUMNS_MAX = 3
+_WIDTH_MAX = 200
+_FRAME = 6
 
 
 class HelpScreen(ModalScreen[None]):
@@ -27,7 +31,7 @@ class HelpScreen(ModalScreen[None]):
     BINDINGS: ClassVar[list[BindingType]] = [("escape,q,question_mark,enter", "dismiss", "close")]
     DEFAULT_CSS = """
     HelpScreen { align: center middle; }
-    HelpScreen > VerticalScroll { width: 100%; height: 100%; max-width: 130; background: $surface;
+    HelpScreen > VerticalScroll { width: 100%; height: 100%; max-width: 200; background: $surface;
                                   border: round $primary; padding: 0 1; }
     """
 
@@ -44,25 +48,45 @@ class HelpScreen(ModalScreen[None]):
             yield Static(help_text(self.app.size.width, two=self._two, live=self._live))
 
 
+class KeysScreen(HelpScreen):
+    """The keys of another screen, and no more."""
+
+    def __init__(self, keys: Sequence[Key]) -> None:
+        super().__init__(two=False)
+        self._keys = keys
+
+    def compose(self) -> ComposeResult:
+        """Make the text."""
+        groups = dict.fromkeys(key.group for key in self._keys)
+        lines = [
+            line for group in groups for line in [*_keys_block(group, self._keys), Content("")]
+        ]
+        with VerticalScroll() as box:
+            box.border_title = "rsltrace view: keys"
+            box.border_subtitle = "Esc closes, ↓ scrolls"
+            yield Static(Content("\n").join(lines))
+
+
 def help_text(width: int, *, two: bool, live: bool = False) -> Content:
-    """Return the help for a screen of ``width`` cells: two columns where there is room."""
+    """Return the help for a screen of ``width`` cells, in columns where there is room."""
     keys = keys_of(two=two, live=live)
     blocks = [_keys_block(group, keys) for group in dict.fromkeys(key.group for key in keys)]
     blocks.append(_signs_block(two))
     blocks += [_lanes_block(), _filter_block()]
-    if width < 2 * _COLUMN + 6:
+    count = max(1, min((width - _FRAME) // _COLUMN, _COLUMNS_MAX))
+    if count == 1:
         return Content("\n").join([line for block in blocks for line in [*block, Content("")]])
+    room = (min(width, _WIDTH_MAX) - _FRAME) // count
     total = sum(len(block) + 1 for block in blocks)
-    left: list[Content] = []
-    right: list[Content] = []
+    columns: list[list[Content]] = [[]]
     for block in blocks:
-        column = left if len(left) + len(block) // 2 < total / 2 else right
-        column += [*block, Content("")]
+        if len(columns) < count and len(columns[-1]) + len(block) // 2 > total / count:
+            columns.append([])
+        columns[-1] += [*block, Content("")]
     lines = []
-    for place in range(max(len(left), len(right))):
-        one = left[place] if place < len(left) else Content("")
-        other = right[place] if place < len(right) else Content("")
-        lines.append(Content.assemble(one, " " * max(_COLUMN - one.cell_length, 1), other))
+    for row in zip_longest(*columns, fillvalue=Content("")):
+        cut = [one.truncate(room - 1, ellipsis=True, pad=True) for one in row]
+        lines.append(Content(" ").join(cut))
     return Content("\n").join(lines)
 
 
@@ -72,7 +96,7 @@ def _keys_block(group: str, keys: Sequence[Key]) -> list[Content]:
         if key.group == group:
             shown = fit(key.shown, _KEY_WIDTH)
             lines.append(Content.assemble("  ", (shown, "bold $text-primary"), key.help))
-    if group == "Look":
+    if group == "Look" and any(key.action == "follow" for key in keys):
         shown = fit("Ctrl+P", _KEY_WIDTH)
         lines.append(Content.assemble("  ", (shown, "bold $text-primary"), "command palette"))
     return lines

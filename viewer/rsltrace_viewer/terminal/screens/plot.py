@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import ClassVar
 
 from rich.segment import Segment as Piece
 from rich.style import Style
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal
+from textual.containers import Horizontal, Vertical
 from textual.content import Content
 from textual.screen import Screen
 from textual.strip import Strip
@@ -17,19 +16,12 @@ from textual.widget import Widget
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rsltrace.errors import TraceError
+from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.plots.braille import Plot, plot
-from rsltrace_viewer.model.plots.series import (
-    Series,
-    Source,
-    fields_of,
-    series_of,
-    sources_of,
-    topics_with_messages,
-)
-from rsltrace_viewer.session import Session
+from rsltrace_viewer.model.plots.data import PlotData, difference
+from rsltrace_viewer.model.plots.series import Series, Source
 from rsltrace_viewer.terminal.background import walk
 
 _AXIS = 11
@@ -47,8 +39,8 @@ class PlotView(Widget):
     PlotView > .plot--both { color: $text; }
     """
 
-    def __init__(self) -> None:
-        super().__init__()
+    def __init__(self, *, id: str) -> None:  # Textual's name for it
+        super().__init__(id=id)
         self._series: list[Series] = []
         self._title = ""
         self._cursor_s: float | None = None
@@ -104,13 +96,15 @@ class PlotScreen(Screen[None]):
     PlotScreen Horizontal { height: 1fr; }
     PlotScreen OptionList { width: 36; height: 1fr; border: none; background: $surface; }
     PlotScreen OptionList:focus { border: none; }
+    PlotScreen #plot { height: 2fr; }
+    PlotScreen #difference { height: 1fr; border-top: solid $panel; }
     PlotScreen.narrow Horizontal { layout: vertical; }
     PlotScreen.narrow OptionList { width: 1fr; height: 7; }
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, data: PlotData) -> None:
         super().__init__()
-        self._session = session
+        self._data = data
         self._choices: list[Source | str] = []
         self._topic = ""
 
@@ -119,23 +113,42 @@ class PlotScreen(Screen[None]):
         yield Static(id="what")
         with Horizontal():
             yield OptionList()
-            yield PlotView()
+            with Vertical():
+                yield PlotView(id="plot")
+                yield PlotView(id="difference")
         yield Static("↑↓ choose   Enter shows the fields of a topic   Esc back   q closes")
 
     def on_mount(self) -> None:
-        """Offer topics, rates and latencies; plot the topic of the selected event."""
+        """Plot the field that differs first, or the topic of what is selected."""
         self.set_class(self.app.size.width < 100, "narrow")
-        self._top_level()
+        topic, field = self._data.first()
+        if not topic or not field or not self._fields_level(topic, field):
+            self._top_level(topic)
 
-    def _top_level(self) -> None:
-        run = self._session.a
+    def _top_level(self, topic: str = "") -> None:
         self._topic = ""
-        topics = topics_with_messages(run)
-        here = self._session.same("topic")
-        first = topics.index(here[1]) if here is not None and here[1] in topics else 0
-        self._offer([*topics, *sources_of(run)], first)
-        title = self._session.title()
-        self.query_one("#what", Static).update(Content(f"plots  {title}"))
+        topics = self._data.topics()
+        first = topics.index(topic) if topic in topics else 0
+        self._offer([*topics, *self._data.others()], first)
+        self.query_one("#what", Static).update(Content(f"plots  {self._data.title()}"))
+
+    def _fields_level(self, topic: str, field: str = "") -> bool:
+        fields = self._fields(topic)
+        if not fields:
+            return False
+        self._topic = topic
+        names = [source.field for source in fields]
+        place = names.index(field) if field in names else fields.index(_most_telling(fields))
+        self._offer(list(fields), place)
+        self.query_one("#what", Static).update(Content(f"plots  {printable(topic)}"))
+        return True
+
+    def _fields(self, topic: str) -> list[Source]:
+        try:
+            return self._data.fields(topic)
+        except RsltraceError as error:
+            self.query_one("#plot", PlotView).show(printable(str(error)), [], None)
+            return []
 
     def _offer(self, choices: list[Source | str], highlighted: int = 0) -> None:
         self._choices = choices
@@ -151,62 +164,45 @@ class PlotScreen(Screen[None]):
         choice = self._choices[event.option_index]
         if isinstance(choice, Source):
             self._plot(choice)
+            return
+        fields = [field for field in self._fields(choice) if "stamp" not in field.field]
+        if fields:
+            self._plot(_most_telling(fields))
         else:
-            try:
-                fields = [f for f in fields_of(self._session.a, choice) if "stamp" not in f.field]
-            except TraceError as error:
-                self.query_one(PlotView).show(printable(str(error)), [], None)
-                return
-            if fields:
-                self._plot(_most_telling(fields))
-            else:
-                self.query_one(PlotView).show(f"{printable(choice)} has no numbers", [], None)
+            self._show(f"{printable(choice)} has no numbers", [])
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         """Show the fields of a topic."""
         choice = self._choices[event.option_index]
         if isinstance(choice, str):
-            try:
-                fields = fields_of(self._session.a, choice)
-            except TraceError as error:
-                self.app.notify(str(error), severity="error")
-                return
-            if fields:
-                self._topic = choice
-                self._offer(list(fields), fields.index(_most_telling(fields)))
-                self.query_one("#what", Static).update(Content(f"plots  {printable(choice)}"))
+            self._fields_level(choice)
 
     def _plot(self, source: Source) -> None:
-        session = self._session
-        runs = [session.a] + ([session.b] if session.b is not None else [])
-        cursor = None if session.empty else session.stamp() / 1e9
-
-        def steps() -> Iterator[list[Series]]:
-            done: list[Series] = []
-            for run in runs:
-                latest = None
-                for latest in series_of(run, source):
-                    yield [*done, latest]
-                if latest is not None:
-                    done.append(latest)
-            yield done
-
         def arrive(series: list[Series] | None, finished: bool) -> None:
             if not self.is_attached:
                 return
             series = series or []
             notes = [one.note for one in series if one.note]
             title = f"{source.label}  {source.unit}".rstrip() + f"  ({', '.join(notes[:1])})"
-            if len(runs) > 1:
+            if len(series) > 1:
                 title += "  a solid, b dotted"
-            self.query_one(PlotView).show(printable(title), series, cursor)
+            self._show(printable(title), series)
 
-        walk(self.app, "plot", steps(), arrive)
+        walk(self.app, "plot", self._data.series(source), arrive)
+
+    def _show(self, title: str, series: list[Series]) -> None:
+        cursor = self._data.cursor_s()
+        self.query_one("#plot", PlotView).show(title, series, cursor)
+        below = self.query_one("#difference", PlotView)
+        between = difference(series)
+        below.display = between is not None
+        if between is not None:
+            below.show(f"a − b  ({between.note})", [between], cursor)
 
     def action_back(self) -> None:
         """From the fields to the topics, from there out."""
         if self._topic:
-            self._top_level()
+            self._top_level(self._topic)
         else:
             self.dismiss()
 

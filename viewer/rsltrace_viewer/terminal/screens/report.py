@@ -14,6 +14,7 @@ from textual.widgets import Static
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import report_lines
 from rsltrace.diff.report.line import Style
+from rsltrace.diff.result.bags import BagDiff
 from rsltrace.diff.result.traces import Diff
 
 _STYLES = {
@@ -37,7 +38,7 @@ class ReportScreen(ModalScreen[None]):
                                     background: $surface; border: round $primary; }
     """
 
-    def __init__(self, diff: Diff) -> None:
+    def __init__(self, diff: Diff | BagDiff) -> None:
         super().__init__()
         self._diff = diff
 

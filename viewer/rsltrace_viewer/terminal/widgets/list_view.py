@@ -80,6 +80,12 @@ class ListView(ScrollView, can_focus=True, inherit_bindings=False):
         self.refresh()
         self.post_message(self.Moved(self.cursor))
 
+    def scroll_to_cursor(self) -> None:
+        """Bring the cursor into sight."""
+        if not round(self.scroll_y) <= self.cursor < round(self.scroll_y) + self.page:
+            wanted = max(self.cursor - self.page // 2, 0)
+            self.scroll_to(y=wanted, animate=False, force=True, immediate=True)
+
     def on_key(self, event: events.Key) -> None:
         """Move, or choose."""
         steps = {

@@ -1,0 +1,84 @@
+"""Plots of one or two runs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from rsltrace.diff.result.traces import Diff
+from rsltrace_viewer.model.plots.series import (
+    Series,
+    Source,
+    fields_of,
+    series_of,
+    sources_of,
+    topics_with_messages,
+)
+from rsltrace_viewer.model.run import Run
+
+
+class RunPlots:
+    """What can be plotted of ``runs``. ``topic`` is that of the selected event, or empty."""
+
+    def __init__(
+        self,
+        runs: Sequence[Run],
+        title: str,
+        *,
+        topic: str,
+        stamp_ns: int | None,
+        base_ns: int = 0,
+        diff: Diff | None = None,
+    ) -> None:
+        self._runs = runs
+        self._title = title
+        self._topic = topic
+        self._stamp_ns = stamp_ns
+        self._base_ns = base_ns
+        self._diff = diff
+
+    def title(self) -> str:
+        """Return the names of the runs."""
+        return self._title
+
+    def topics(self) -> list[str]:
+        """Return the topics with messages of run a."""
+        return topics_with_messages(self._runs[0])
+
+    def others(self) -> list[Source]:
+        """Return rates and latencies."""
+        return sources_of(self._runs[0])
+
+    def fields(self, topic: str) -> list[Source]:
+        """Return the numeric fields of a topic. Raises TraceError."""
+        return fields_of(self._runs[0], topic)
+
+    def first(self) -> tuple[str, str]:
+        """Return the field that differs first; otherwise the topic of the selected event."""
+        known = self.topics()
+        for divergence in self._diff.divergences if self._diff is not None else ():
+            for message in divergence.messages:
+                if message.topic in known and message.fields:
+                    return message.topic, message.fields[0].path
+        return (self._topic if self._topic in known else ""), ""
+
+    def cursor_s(self) -> float | None:
+        """Return the time of the selected event."""
+        return None if self._stamp_ns is None else (self._stamp_ns - self._base_ns) / 1e9
+
+    def series(self, source: Source) -> Iterator[list[Series]]:
+        """Yield the series of each run. Raises TraceError."""
+        done: list[Series] = []
+        for run in self._runs:
+            latest = None
+            for latest in series_of(run, source):
+                yield [*done, self._since_base(latest)]
+            if latest is not None:
+                done.append(self._since_base(latest))
+        yield done
+
+    def _since_base(self, one: Series) -> Series:
+        if not self._base_ns:
+            return one
+        return Series(np.asarray(one.times - self._base_ns / 1e9), one.values, one.note)

@@ -1,0 +1,1 @@
+"""Bags, and recordings of native runs: topics and their messages, of one or two files."""
