@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from rsltrace.audit import rules
+from rsltrace.audit.durations import is_difference_of_now
 from rsltrace.audit.model import Rule
 from rsltrace.audit.names import Names
 from rsltrace.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, rule_of
@@ -19,6 +20,7 @@ _SQL = re.compile(
     re.IGNORECASE,
 )
 _SORTERS = ("builtins.sorted", "builtins.min", "builtins.max")
+_DIVISIONS = (ast.Div, ast.FloorDiv, ast.Mod)
 _ORDERINGS = (ast.Lt, ast.LtE, ast.Gt, ast.GtE)
 _LISTINGS_UNORDERED = (
     "builtins.sorted",
@@ -72,6 +74,12 @@ def _at(module: Module, node: ast.AST, names: Names) -> Iterator[Place]:
         last = spec.values[-1] if isinstance(spec, ast.JoinedStr) and spec.values else None
         if isinstance(last, ast.Constant) and str(last.value).endswith("n"):
             yield Place(node.value, "format 'n'", rules.LOCALE_FORMAT)
+    elif (
+        isinstance(node, ast.BinOp)
+        and isinstance(node.op, _DIVISIONS)
+        and is_difference_of_now(node.right, module.scope_of(node))
+    ):
+        yield Place(node, f"division by {_text(node.right)}", rules.STANDS_STILL)
     if isinstance(node, ast.expr):
         scope = module.scope_of(node)
         if is_set(node, scope, names) and order_matters(node, scope, names):

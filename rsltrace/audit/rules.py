@@ -78,6 +78,18 @@ _DEVICE = Rule(
 _BLOCKING = Rule(
     "blocking", _N, "blocks the whole run in real time", "a topic, a service or a parameter"
 )
+_TERMINAL = Rule(
+    "blocking",
+    _V,
+    "reads what the job says in stdin: (without it, that is an error)",
+    "a topic, a service or a parameter",
+)
+STANDS_STILL = Rule(
+    "clock",
+    _V,
+    "is 0: ROS clocks stand still in a callback, unless the job says clocks: {advances: true}",
+    "measure from one callback to the next, or allow for 0",
+)
 _ASYNC_IO = Rule(
     "blocking",
     _V,
@@ -275,9 +287,9 @@ RULES: dict[str, Rule] = {
     **_named(_class(_DEVICE), "serial", "Serial"),
     **_named(_class(_DEVICE), "cv2", "VideoCapture"),
     **_named(_DEVICE, "grpc", "insecure_channel secure_channel"),
-    **_named(_BLOCKING, "builtins", "input"),
+    **_named(_TERMINAL, "builtins", "input"),
     **_named(_BLOCKING, "getpass", "getpass"),
-    **_named(_BLOCKING, "sys.stdin", "read readline readlines"),
+    **_named(_TERMINAL, "sys.stdin", "read readline readlines"),
     **_named(_BLOCKING, "select", "select poll epoll"),
     **_named(_BLOCKING, "signal", "pause sigwait sigwaitinfo sigtimedwait"),
     **_named(_BLOCKING, "os", "wait waitpid wait3 wait4"),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from rsltrace.job.parts.bag import BagSpec
-from rsltrace.job.parts.clocks import ClockSpec
+from rsltrace.job.parts.clocks import ClockSpec, clocks_part
 from rsltrace.job.parts.delay import DelaysSpec
 from rsltrace.job.parts.distribution import files_of
 from rsltrace.job.parts.guard import GuardSpec, guard_part
@@ -181,10 +181,14 @@ class JobFields(Part):
         "they send leaves when they end.",
         examples=[{"nodes": {"/detector": {"normal": {"mean": "30ms", "sd": "5ms"}}}}],
     )
-    clocks: Annotated[tuple[ClockSpec, ...], parts()] = Field(
+    clocks: Annotated[tuple[ClockSpec, ...], clocks_part] = Field(
         default=(),
-        description="Clocks of nodes that do not show simulated time, as real ones do not.",
-        examples=[[{"node": "/lidar", "offset": "-20ms", "drift": "50ppm"}]],
+        description="Clocks of nodes that do not show simulated time, as real ones do not; a "
+        "mapping alone is for all of them.",
+        examples=[
+            [{"node": "/lidar", "offset": "-20ms", "drift": "50ppm"}],
+            {"advances": True},
+        ],
     )
 
     # Not keys of a job file, hence ``exclude``: where the job came from.
@@ -225,7 +229,7 @@ class JobFields(Part):
             min_time_step_ns: int = 0,
             executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,
             execution: ExecutionSpec | dict[str, Any] | None = None,
-            clocks: Sequence[ClockSpec | dict[str, Any]] = (),
+            clocks: Sequence[ClockSpec | dict[str, Any]] | dict[str, Any] = (),
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,

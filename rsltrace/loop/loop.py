@@ -184,6 +184,17 @@ class EventLoop:
             return release_ns
         return timer.deadline_ns
 
+    def later_ns(self) -> int | None:
+        """Return when the first timer or release is due that is not due yet, None if none is."""
+        next_ns = self.next_ns()
+        if next_ns is None or next_ns > self.now_ns:
+            return next_ns
+        times = [release[0] for release in self.scheduled if release[0] > self.now_ns]
+        timer = self.timers.due(self.now_ns)[1]
+        if timer is not None:
+            times.append(timer.deadline_ns)
+        return min(times, default=None)
+
     def run_step(self) -> None:
         """Run everything that is due at the present time.
 

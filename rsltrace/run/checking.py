@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.loop.stop import Stop
 from rsltrace.run.plans.bags import PLAYER
+from rsltrace.run.plans.executables import source_of
 from rsltrace.run.plans.starts import impossible_starts
 from rsltrace.run.process import Observer, kept_process
 from rsltrace.run.session import Session
@@ -63,7 +66,24 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
         unused = (*session.unused(), *never)
         session.stop = Stop("checked")
         session.finish()
+        notes += _divisions_by_nothing(session.job)
         return Checked(session.job, session.start_ns, found, tuple(notes), unused)
+
+
+def _divisions_by_nothing(job: Job) -> Iterator[str]:
+    """Yield where nodes divide by the difference of two ROS times of one callback."""
+    from rsltrace.audit.audit import audit_job
+
+    if any(clock.advances and clock.node == "*" for clock in job.clocks):
+        return
+    try:
+        found = audit_job(job, lambda target, where: source_of(target, where=where)).found
+    except JobError:  # made in Python: there is no source to look at
+        return
+    for one in found:
+        if one.call.startswith("division by "):
+            path = os.path.relpath(one.path, job.base_dir)
+            yield f"{path}:{one.line}:{one.column}: {one.call}, which {one.does}"
 
 
 def _played_and_published(found: Overview) -> Iterator[str]:

@@ -91,8 +91,8 @@ FOUND = [
     ("import socket\nsocket.socket()", "socket.socket()", "detected"),
     ("import urllib.request\nurllib.request.urlopen(u)", "urllib.request.urlopen()", "detected"),
     ("import requests\nrequests.get(u)", "requests.get()", "detected"),
-    ("input()", "input()", "nothing"),
-    ("import sys\nsys.stdin.readline()", "sys.stdin.readline()", "nothing"),
+    ("input()", "input()", "virtual"),
+    ("import sys\nsys.stdin.readline()", "sys.stdin.readline()", "virtual"),
     ("import os\nos.listdir('.')", "os.listdir()", "virtual"),
     ("import glob\nfor f in glob.glob('*'): f", "glob.glob()", "virtual"),
     ("for f in folder.iterdir(): f", "iterdir()", "virtual"),
@@ -124,11 +124,20 @@ FOUND = [
     ("class A:\n  s: set = set()\n  def f(self):\n    return self.s.pop()",
      "order of the set self.s", "virtual"),
     ("f(*{g(), h()})", "order of the set {g(), h()}", "virtual"),
+    ("def f(self):\n  a = self.get_clock().now()\n  g()\n  dt = self.get_clock().now() - a\n"
+     "  return 1 / (dt.nanoseconds / 1e9)", "division by dt.nanoseconds / 1000000000.0", "virtual"),
+    ("def f(clock):\n  a = clock.now().nanoseconds * 1e-9\n  b = clock.now().nanoseconds * 1e-9\n"
+     "  return 3 // float(b - a)", "division by float(b - a)", "virtual"),
     ("next(iter(set(a)))", "order of the set set(a)", "virtual"),
     ("s = set(a)\ns = s - b\nlist(s)", "order of the set s", "virtual"),
 ]  # fmt: skip
 
 NOT_FOUND = [
+    # the time before this callback, another clock's, a difference that is guarded, a plain number
+    "def f(self):\n  return 1 / (self.get_clock().now() - self.last).nanoseconds",
+    "def f(self, a):\n  return 1 / (self.get_clock().now() - a).nanoseconds",
+    "def f(self):\n  a = clock.now()\n  return 1 / max((clock.now() - a).nanoseconds, 1)",
+    "def f(self):\n  a = clock.now()\n  return (clock.now() - a).nanoseconds / 1e9",
     "def f(time):\n  return time.time()",
     "import time\ntime.strftime('%H', stamp)",
     "import time\ntime.localtime(3)",

@@ -28,7 +28,8 @@ _WHEELS = frozenset(
 _STANDS_STILL = (
     "\n  If that was a difference of two times: computing takes no simulated time, so a ROS clock "
     "shows the same throughout a callback, as it may under use_sim_time: allow for a difference "
-    "of 0, or measure from one callback to the next"
+    "of 0, measure from one callback to the next, or write clocks: {advances: true} in the job, "
+    "which lets it advance by a nanosecond per look"
 )
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")

@@ -12,7 +12,6 @@ from typing import Any
 
 from greenlet import getcurrent, greenlet
 
-from rsltrace.chance.clock import ClockModel
 from rsltrace.chance.network import NetworkPlan
 from rsltrace.doors.rclpy.boundary.boundary import Boundary, Surroundings
 from rsltrace.doors.rclpy.boundary.installation import installed
@@ -21,7 +20,7 @@ from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.executors.user_executors import own_executors
 from rsltrace.doors.rclpy.handles.logs import Logs
 from rsltrace.doors.rclpy.handles.node_state import NodeStates
-from rsltrace.doors.rclpy.node_clocks import NodeClocks
+from rsltrace.doors.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.doors.rclpy.parameters import Parameters, parameters_of
 from rsltrace.doors.rclpy.stacks.asyncio_loops import simulated_event_loops
 from rsltrace.doors.rclpy.stacks.blocked_groups import held_back
@@ -155,8 +154,8 @@ class World:
         finally:
             programs.importing = False
 
-    def use_clocks(self, rules: tuple[tuple[str, ClockModel], ...], start_ns: int) -> None:
-        """Let the clocks of some nodes (globs) be wrong. Before the first node is made."""
+    def use_clocks(self, rules: tuple[ClockRule, ...], start_ns: int) -> None:
+        """Let the clocks of some nodes be different. Before the first node is made."""
         if rules:
             self.clocks = NodeClocks(self.domain, rules, seed=self._seed, start_ns=start_ns)
             self._surroundings.clocks = self.clocks

@@ -160,6 +160,7 @@ class _Maker:
                 "value_shorthand",
                 "words",
                 "or_text",
+                "or_entry",
                 "names",
             ):
                 value = getattr(function, name, None)
@@ -170,6 +171,8 @@ class _Maker:
         schema = self._by_type(annotation, facts)
         if "words" in facts:  # that stand for a whole list
             return {"anyOf": [{"enum": list(facts["words"])}, schema]}
+        if "or_entry" in facts:
+            return {"anyOf": [schema["items"], schema]}
         if "or_text" in facts:
             return {"anyOf": [{"type": "string"}, schema]}
         return schema

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, given, parts, positive_time, text
+from rsltrace.job.values.checks import attach, check, flag, given, parts, positive_time, text
 from rsltrace.job.values.names import check_node_glob
 from rsltrace.job.values.problem import Problem, describe
 from rsltrace.job.values.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
@@ -95,7 +95,16 @@ class ClockSpec(Part):
     TIMES: ClassVar[dict[str, str]] = {"offset": "offset_ns"}
 
     node: Annotated[str, check(text(check_node_glob))] = Field(
-        description="Node, a glob; the first entry that fits counts.", examples=["/lidar"]
+        default="*",
+        description="Node, a glob; the first entry that fits counts.",
+        examples=["/lidar"],
+    )
+    advances: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether each look at a ROS clock shows a nanosecond more than the one before "
+        "it at the same time, though never the time of the next event. Otherwise ROS clocks stand "
+        "still throughout a callback.",
+        examples=[True],
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(
         default=0,
@@ -128,3 +137,18 @@ class ClockSpec(Part):
     def drift(self) -> Fraction:
         """The drift as an exact fraction."""
         return Fraction(self.drift_ppm) / 1_000_000
+
+
+def _clocks(value: object) -> object:
+    """Let one mapping stand for a list with it."""
+    if isinstance(value, dict):
+        return (value,)
+    if not isinstance(value, (list, tuple)):
+        raise Problem(
+            "expected a list of clocks, or what is different about all of them "
+            f"(advances: true), got {describe(value)}"
+        )
+    return tuple(value)
+
+
+clocks_part = check(_clocks, or_entry=True)

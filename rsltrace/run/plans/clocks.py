@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from rsltrace.chance.clock import ClockModel
+from rsltrace.doors.rclpy.node_clocks import ClockRule
 from rsltrace.job import Job, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.model.stamp import format_duration
 
 
-def clocks_of(job: Job) -> tuple[tuple[str, ClockModel], ...]:
-    """Return (glob of the node, what is wrong with its clock), the first that fits first."""
+def clocks_of(job: Job) -> tuple[ClockRule, ...]:
+    """Return what is different about clocks, the first that fits first."""
     found = []
     for spec in job.clocks:
         random = spec.random_jumps
@@ -22,7 +23,7 @@ def clocks_of(job: Job) -> tuple[tuple[str, ClockModel], ...]:
             random_every_ns=0 if random is None else random.every_ns,
             random_most_ns=0 if random is None else random.most_ns,
         )
-        found.append((spec.node, model))
+        found.append(ClockRule(spec.node, model, spec.advances))
     return tuple(found)
 
 

@@ -144,6 +144,13 @@ class Boundary:
             return self.now_ns()
         return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
 
+    def look_ns(self, owner: str | None) -> int:
+        """Return what a ROS clock of a node shows to user code, which may advance by the look."""
+        world = self._world
+        if world is None or world.clocks is None:
+            return self.now_ns()
+        return world.clocks.look(owner or self.current_node_name(), world.stacks.loop.now_ns)
+
     def current_node_name(self) -> str | None:
         """Return the name of the node whose callback or constructor runs, if any does."""
         node = self._world.stacks.event.node if self._world is not None else None

@@ -38,7 +38,11 @@ class ClockHandle(Handle):
 
     def get_now(self) -> _Now:
         """Return simulated time, or what the clock of this node's computer shows instead."""
-        return _Now(self.boundary.shown_ns(self._owner))
+        return _Now(self.boundary.look_ns(self._owner))
+
+    def now_ns(self) -> int:
+        """Return the same without that it counts as a look."""
+        return int(self.boundary.shown_ns(self._owner))
 
     def get_ros_time_override_is_enabled(self) -> bool:
         """Return whether ``use_sim_time`` switched this clock; it shows simulated time anyway."""
@@ -109,7 +113,7 @@ class ClockEventHandle:
         return self._event.is_set()
 
     def _wait_until(self, clock: Any, until: Any) -> bool:
-        left_ns = until.nanoseconds - clock.get_now().nanoseconds
+        left_ns = until.nanoseconds - clock.now_ns()
         return left_ns <= 0 or self._event.wait_ns(left_ns)
 
     wait_until_steady = _wait_until
