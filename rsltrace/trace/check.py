@@ -8,16 +8,20 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from mcap.opcode import Opcode
 
 from rsltrace.errors import TraceError
-from rsltrace.mcap.records import MAGIC, Damaged
+from rsltrace.mcap.records import MAGIC, Damaged, parse_channel, parse_schema
 from rsltrace.mcap.source import ByteSource
-from rsltrace.mcap.summary import check_data
-from rsltrace.mcap.walk import walk_records
+from rsltrace.mcap.summary import Summary, check_data
+from rsltrace.mcap.walk import read_body, walk_records
 from rsltrace.trace.chain import hash64, verify_chain
 from rsltrace.trace.format import OUTPUT_DTYPE, OUTPUT_HASHED
+from rsltrace.trace.index import TraceIndex
 from rsltrace.trace.pieces import damaged
 from rsltrace.trace.segments import SegmentReader
+
+_DEFINITIONS = frozenset((Opcode.SCHEMA, Opcode.CHANNEL))
 
 
 def check_data_section(source: ByteSource, summary_start: int) -> None:
@@ -28,16 +32,38 @@ def check_data_section(source: ByteSource, summary_start: int) -> None:
         raise damaged(source, 0, "the data section", error) from error
 
 
-def check_records(source: ByteSource, summary_start: int) -> None:
-    """Raise TraceError unless the records before the summary follow each other without a gap.
+def check_records(source: ByteSource, index: TraceIndex) -> None:
+    """Raise TraceError unless the records before the summary follow each other without a gap, and
+    have the channels and schemas that the summary says.
 
-    A checksum may have been made for bytes that are no MCAP file.
+    A checksum may have been made for bytes that are no MCAP file, and who reads a file from its
+    start knows no summary.
     """
+    told = Summary()
     try:
-        for _ in walk_records(source, len(MAGIC), summary_start):
-            pass
+        for opcode, span in walk_records(source, len(MAGIC), index.summary_start):
+            if opcode in _DEFINITIONS:
+                _add_once(told, opcode, read_body(source, span, opcode))
     except Damaged as error:
         raise damaged(source, 0, "the data section", error) from error
+    found = TraceIndex(complete=True, header=index.header)
+    found.take(told)
+    if found.channels != index.channels:
+        raise damaged(
+            source, index.summary_start, "the summary", "its channels are not those before it"
+        )
+
+
+def _add_once(told: Summary, opcode: int, body: bytes) -> None:
+    """Add a channel or schema. Raises Damaged if there is another one of its id."""
+    if opcode == Opcode.SCHEMA:
+        schema = parse_schema(body)
+        is_only = told.schemas.setdefault(schema.id, schema) == schema
+    else:
+        channel = parse_channel(body)
+        is_only = told.channels.setdefault(channel.id, channel) == channel
+    if not is_only:
+        raise Damaged("a channel or schema is defined twice, in two ways")
 
 
 def check_hashes(source: ByteSource, segments: SegmentReader) -> None:

@@ -229,7 +229,7 @@ class Trace:
         """
         if self._index.summary_start:
             check_data_section(self._source, self._index.summary_start)
-            check_records(self._source, self._index.summary_start)
+            check_records(self._source, self._index)
         check_hashes(self._source, self._segments)
 
     # Entities.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from mcap.opcode import Opcode
+from mcap.records import Schema
 
 from rsltrace.errors import TraceError
 from rsltrace.trace.contents import check_contents
@@ -69,6 +70,44 @@ def test_what_was_changed_under_right_checksums_does_not(
         _checked(path)
     assert str(path) in str(raised.value)
     assert "after it was recorded" in str(raised.value) or "damaged" in str(raised.value)
+
+
+def _without_channel(parts: list[mcap_parts.Part], end: int) -> None:
+    parts.remove(next(part for part in parts if part.opcode == Opcode.CHANNEL))
+
+
+def _with_another_type(parts: list[mcap_parts.Part], end: int) -> None:
+    part = [part for part in parts[:end] if part.opcode == Opcode.SCHEMA][-1]
+    schema = part.record
+    assert isinstance(schema, Schema)
+    schema.name += "s"
+    part.record = schema
+
+
+def _with_another_type_in_between(parts: list[mcap_parts.Part], end: int) -> None:
+    place = max(at for at in range(end) if parts[at].opcode == Opcode.SCHEMA)
+    parts.insert(place + 1, mcap_parts.Part(Opcode.SCHEMA, parts[place].body))
+    _with_another_type(parts, end)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (_without_channel, "its channels are not those before it"),
+        (_with_another_type, "its channels are not those before it"),
+        (_with_another_type_in_between, "defined twice, in two ways"),
+    ],
+)
+def test_definitions_that_the_summary_has_otherwise_are_found(
+    tmp_path: Path, change: Callable[[list[mcap_parts.Part], int], None], said: str
+) -> None:
+    """Who reads a file from its start sees those, and no summary."""
+    parts = mcap_parts.take_apart(SAMPLE.read_bytes())
+    change(parts, [part.opcode for part in parts].index(Opcode.DATA_END))
+    path = tmp_path / "forged.mcap"
+    path.write_bytes(mcap_parts.put_together(parts))
+    with pytest.raises(TraceError, match=said):
+        _checked(path)
 
 
 def test_forging_nothing_passes(tmp_path: Path) -> None:

@@ -179,6 +179,7 @@ def _unknown_texts(rng: Random, case: Case, corpus: Corpus) -> None:
         else _dumped(job).encode().decode("unicode_escape", "replace")
     )
     _ask(rng, case, raw)
+    case.user_code = True  # a node may not take the text as its parameter
 
 
 def _nesting(rng: Random, case: Case, corpus: Corpus) -> None:

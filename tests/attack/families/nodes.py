@@ -47,7 +47,7 @@ _GROUPS: dict[str, str] = {
 _WHERE = ("constructor", "timer", "timer", "message", "destroy")
 
 _SIGNALS_OF = {
-    "abort": {-6},
+    "abort": {-6, 134},
     "segfault": {-11},
     "kill_self": {-9, 137},
     "set_timer": {-14},  # of its own, if a slow machine takes longer than it to close the run

@@ -10,6 +10,8 @@ from tests.attack import execution, oracle
 from tests.attack.model import Case, Complaint, Ran, Wrong
 
 OUTPUT = "out.mcap"
+UNFINISHED = "out.unfinished.mcap"
+_BESIDE = f"wrote {UNFINISHED} ({OUTPUT} is as it was)"
 _DIGEST = re.compile(r"^digest ([0-9a-f]{16})  events (\d+)", re.MULTILINE)
 _TOLD = re.compile(r"^digest\s+([0-9a-f]{16})$", re.MULTILINE)
 _EVENTS = re.compile(r"^events\s+(\d+)", re.MULTILINE)
@@ -43,7 +45,10 @@ def judge(
     place = case.folder / OUTPUT
     found: list[Complaint] = []
     if ran.status == oracle.OK or ran.status in whole_if:
-        found += _judge_whole(case, ran)
+        beside = _BESIDE in ran.stderr.decode(errors="replace")
+        found += _judge_whole(case, ran, UNFINISHED if beside else OUTPUT)
+        if beside and fingerprint(case) != old:
+            found.append(Complaint(Wrong.LOST, "said to be as it was, and is not", line))
     if must_fail and ran.status == oracle.OK:
         found.append(Complaint(Wrong.LOST, "ended well although its output was taken away", line))
     if tampers or ran.status == oracle.OK:
@@ -65,11 +70,11 @@ def judge(
     return found
 
 
-def _judge_whole(case: Case, ran: Ran) -> list[Complaint]:
-    place = case.folder / OUTPUT
+def _judge_whole(case: Case, ran: Ran, output: str) -> list[Complaint]:
+    place = case.folder / output
     if not place.exists():
         return [Complaint(Wrong.LOST, f"status {ran.status}, and there is no trace", ran.line)]
-    checked = _ask(case, "info", OUTPUT, "--check")
+    checked = _ask(case, "info", output, "--check")
     text = checked.stdout.decode("utf-8", "replace")
     if checked.status != oracle.OK:
         error = checked.stderr.decode(errors="replace")[-300:]
