@@ -26,7 +26,7 @@ $(INSTALLED): pyproject.toml
 		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
 	@echo "setting up $(VENV) (once, about a minute)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,graph,remote,rerun,dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,remote,rerun,dev]'
 	@touch $@
 
 demo: $(INSTALLED)

@@ -62,7 +62,8 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
         if not _is_python(source) and (":" not in source or Path(source).exists())
     ]
     nodes = [_look(source, folder) for source in sources if source not in bags]
-    text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes))
+    path = _search_path(nodes, folder, guess=not sources)
+    text = "".join(_job_text(job, [_bag_text(bag, folder) for bag in bags], nodes, path))
     schema = folder / _SCHEMA
     has_schema = schema.exists()
     if not has_schema:
@@ -77,6 +78,9 @@ def init(job: Path, sources: tuple[str, ...]) -> None:
 
     if sources:
         load_job(job)  # what was written must be a job
+    if path:
+        why = "the nodes are there" if nodes else "there is Python code"
+        tell(f"search_path: [{', '.join(path)}], relative to {job}: {why}")
     written = f"{job}" if has_schema else f"{job} and {schema}"
     tell(f"wrote {written}; next: rsltrace check {job}")
 
@@ -94,7 +98,19 @@ def _look(target: str, folder: Path) -> Found:
     return look_up(target, [place for place in places if place.is_dir()])
 
 
-def _job_text(job: Path, bags: list[str], nodes: list[Found]) -> Iterator[str]:
+def _search_path(nodes: list[Found], folder: Path, *, guess: bool) -> list[str]:
+    """Return where modules are, if that is not only beside the job; ``guess`` without any node."""
+    found = {os.path.relpath(n.folder, folder) for n in nodes if n.folder is not None}
+    if guess:
+        found = {place for place in _PLACES if place != ".." and any((folder / place).glob("*.py"))}
+        packages = (path.parent.parent for path in (folder / "src").glob("*/*/__init__.py"))
+        found |= {os.path.relpath(path, folder) for path in packages}
+    return [".", *sorted(found - {"."})] if found - {"."} else []
+
+
+def _job_text(
+    job: Path, bags: list[str], nodes: list[Found], search_path: list[str]
+) -> Iterator[str]:
     yield _HEAD.format(name=job)
     # A key without a value is a mistake, so of a job of bags alone this is a comment.
     yield "\n# nodes:\n" if bags and not nodes else "\nnodes:\n"
@@ -105,9 +121,8 @@ def _job_text(job: Path, bags: list[str], nodes: list[Found]) -> Iterator[str]:
         yield f"{start}node: my_package.my_module:MyNode  # module:Class of a Node\n"
         yield "#     name: another_name\n#     parameters: {rate: 10.0}\n"
         yield "#     remappings: {odom: /robot/odom}\n"
-    folders = {os.path.relpath(n.folder, job.parent) for n in nodes if n.folder is not None}
-    if folders - {"."}:
-        yield f"search_path: [{', '.join(['.', *sorted(folders - {'.'})])}]\n"
+    if search_path:
+        yield f"search_path: {_yaml(search_path)}  # where modules are, before Python's own path\n"
     elif not nodes:
         yield "# search_path: [., ../src]  # where modules are, before Python's own path\n"
     yield "\n"

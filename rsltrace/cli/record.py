@@ -16,7 +16,7 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
-from rsltrace.errors import NodeError
+from rsltrace.errors import NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.model.finding import Source
 from rsltrace.model.printable import printable
@@ -185,9 +185,25 @@ def _note(text: str) -> None:
     tell(f"rsltrace: note: {text}")
 
 
+def _silent_topics(result: RunResult) -> list[str]:
+    """Return who listens to what nobody publishes."""
+    if result.path is None or result.error is not None or not result.path.is_file():
+        return []
+    from rsltrace.trace.reader import Trace
+    from rsltrace.words.silent_topics import silent_topics
+
+    try:
+        with Trace.open(result.path) as trace:
+            found = silent_topics(trace.entities.values())
+    except RsltraceError:
+        return []  # somebody took it away meanwhile
+    return [f"{found}; rsltrace check tells who talks to whom"] if found else []
+
+
 def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
     error = result.error
-    for note in result.notes:
+    silent = _silent_topics(result)
+    for note in (*result.notes, *silent):
         if note not in told:  # when the run began
             tell(f"note: {note}")
     if error is not None:
@@ -208,7 +224,7 @@ def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
                     "stop_reason": result.stop_reason,
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
-                    "notes": [*result.notes, *([result.kept] if result.kept else [])],
+                    "notes": [*result.notes, *silent, *([result.kept] if result.kept else [])],
                 }
             )
         )

@@ -249,3 +249,28 @@ class Picky(Node):
         "deadline 2 s, lifespan 1 s; /picky asks for reliable, volatile, keep last 1, "
         "liveliness manual by topic, deadline 1 s, lease 500 ms)\n"
     )
+
+
+def test_an_arrow_back_has_one_head_and_a_way_of_its_own() -> None:
+    pytest.importorskip("fast_sugiyama")
+    from rsltrace.cli.output.graph_svg import graph_svg
+    from rsltrace.middleware.overview import End, Link, NodeView, Overview
+
+    nodes = tuple(NodeView(name, "", ()) for name in ("/plan", "/drive"))
+    plan, drive = End("/plan"), End("/drive")
+    links = (
+        Link("topic", "/cmd", "", (plan,), (drive,)),
+        Link("topic", "/odom", "", (drive,), (plan,)),
+        Link("topic", "/own", "", (plan,), (plan,)),
+    )
+    paths = [
+        e.attrib for e in ET.fromstring(graph_svg(Overview(nodes, links))).iter() if "d" in e.attrib
+    ]
+    arrows = [path for path in paths if path.get("class", "").startswith("edge")]
+    assert len(arrows) == 6
+    assert all("marker-end" in arrow and "marker-start" not in arrow for arrow in arrows)
+    back = [arrow for arrow in arrows if "back" in arrow["class"]]
+    assert len(back) == 2  # one closes the loop of two nodes, one that of a node with itself
+    begins = {arrow["d"].split(" C")[0] for arrow in arrows if arrow not in back}
+    ends = {" ".join(arrow["d"].split()[-2:]) for arrow in back}
+    assert not {begin[1:] for begin in begins} & ends

@@ -82,7 +82,10 @@ def folder(tmp_path: Path) -> Path:
 def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
     done = rsltrace("init", "--from", "a.db3", "--from", "robot.nodes:Hearer")
     assert (done.returncode, done.stdout) == (0, "")
-    assert done.stderr == "wrote job.yaml and job.schema.json; next: rsltrace check job.yaml\n"
+    assert done.stderr == (
+        "search_path: [., src], relative to job.yaml: the nodes are there\n"
+        "wrote job.yaml and job.schema.json; next: rsltrace check job.yaml\n"
+    )
     assert json.loads((folder / "job.schema.json").read_text()) == job_schema()
     assert not (folder / "imported").exists()
     text = (folder / "job.yaml").read_text()
@@ -93,7 +96,7 @@ def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
         "    #   deep.a: 1",
         "    #   deep.b: [1.0, 2.0]",
         "    # more parameters: c, computed",
-        "search_path: [., src]",
+        "search_path: [., src]  # where modules are, before Python's own path",
         "    name: hearer",
         "      - /n       # std_msgs/msg/UInt64, 3 messages",
         "      # - /rosout  # rcl_interfaces/msg/Log, 0 messages",
@@ -189,3 +192,10 @@ def test_a_job_of_a_main_runs(rsltrace: Any, folder: Path) -> None:
     assert "  - main: robot.mains:main  # it runs as it is" in (folder / "job.yaml").read_text()
     done = rsltrace("record", "job.yaml", "-o", "run.mcap", "--until", "1")
     assert done.returncode == 0, done.stderr
+
+
+def test_without_a_node_a_search_path_is_guessed_and_said(rsltrace: Any, folder: Path) -> None:
+    done = rsltrace("init", "guessed.yaml")
+    assert done.returncode == 0
+    assert "search_path: [., src], relative to guessed.yaml: there is Python code" in done.stderr
+    assert "\nsearch_path: [., src]  #" in (folder / "guessed.yaml").read_text()

@@ -22,6 +22,9 @@ _ROW = 54.0
 _BOX_HEIGHT = 28.0
 _GAP = 70.0
 _MARGIN = 24.0
+_BACK = 34.0
+"""How far below the boxes an arrow goes back."""
+
 _STYLE = """\
 text { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; fill: #1f2328; }
 .small { font-size: 10px; fill: #57606a; }
@@ -30,6 +33,7 @@ text { font: 12px ui-monospace, "DejaVu Sans Mono", monospace; fill: #1f2328; }
 .service rect { fill: #fff8c5; stroke: #9a6700; }
 .action rect { fill: #fbefff; stroke: #8250df; }
 .edge { fill: none; stroke: #57606a; stroke-width: 1.3; }
+.back { stroke: #8c959f; }
 .apart { stroke: #cf222e; stroke-dasharray: 5 4; stroke-width: 1.6; }
 .lonely rect { stroke-dasharray: 3 3; }
 """
@@ -53,11 +57,12 @@ class _Box:
 
 @dataclass
 class _Edge:
-    """An arrow between boxes; ``both`` has one at either end, ``apart`` never connects."""
+    """An arrow between boxes; ``apart`` never connects. ``back`` goes against the direction of the
+    picture: it runs below the boxes, so that no arrow seems to have a head at either end."""
 
     source: int
     target: int
-    both: bool = False
+    back: bool = False
     apart: str = ""
     through: list[tuple[float, float]] = field(default_factory=list)
 
@@ -85,12 +90,10 @@ def _boxes_and_edges(overview: Overview) -> tuple[list[_Box], list[_Edge]]:
         senders = _numbers(link.senders, number, boxes)
         receivers = _numbers(link.receivers, number, boxes)
         for sender in senders:
-            both = sender in receivers
-            edges.append(_Edge(sender, here, both, _apart(link, boxes[sender].label, 0)))
+            edges.append(_Edge(sender, here, apart=_apart(link, boxes[sender].label, 0)))
         edges += [
-            _Edge(here, receiver, apart=_apart(link, boxes[receiver].label, 1))
+            _Edge(here, receiver, receiver in senders, _apart(link, boxes[receiver].label, 1))
             for receiver in receivers
-            if receiver not in senders
         ]
     return boxes, edges
 
@@ -119,13 +122,13 @@ def _apart(link: Link, name: str, side: Literal[0, 1]) -> str:
 def _lay_out(boxes: list[_Box], edges: list[_Edge]) -> None:
     if find_spec("fast_sugiyama") is None:
         raise SetupError(
-            "drawing a graph needs fast-sugiyama, which is not installed; install it with "
-            "pip install 'rsltrace[graph]' (Python 3.11 or newer)"
+            "drawing a graph needs fast-sugiyama, which comes with rsltrace for Python 3.11 or "
+            "newer: pip install fast-sugiyama"
         )
     from fast_sugiyama import from_edges
 
     # Its vertices are the boxes in order of use, so that equal graphs give equal pictures.
-    pairs = [(edge.source, edge.target) for edge in edges]
+    pairs = [(edge.source, edge.target) for edge in edges if not edge.back]
     above = 0.0
     placed: dict[int, tuple[float, float]] = {}
     for positions, _, height, layout_edges in from_edges(pairs, vertex_spacing=_ROW):
@@ -142,6 +145,7 @@ def _lay_out(boxes: list[_Box], edges: list[_Edge]) -> None:
         boxes[vertex].x, boxes[vertex].y = left[x], y
     for edge in edges:
         edge.through = [(left.get(x, x), y) for x, y in edge.through]
+        edge.back = boxes[edge.target].x <= boxes[edge.source].x
 
 
 def _columns(
@@ -198,6 +202,7 @@ def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
     right = max([box.x + box.width / 2 for box in boxes] + [x for x, _ in points] + [0.0])
     top = min([box.y for box in boxes] + [y for _, y in points] + [0.0]) - _BOX_HEIGHT
     bottom = max([box.y for box in boxes] + [y for _, y in points] + [0.0]) + _BOX_HEIGHT
+    bottom += _BACK + (right - left) * 0.05 if any(edge.back for edge in edges) else 0.0
     width, height = right - left + 2 * _MARGIN, bottom - top + 2 * _MARGIN
     yield (
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
@@ -206,7 +211,7 @@ def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
     yield f"<style>{_STYLE}</style>"
     yield (
         '<defs><marker id="head" viewBox="0 0 8 8" refX="7" refY="4" markerWidth="7" '
-        'markerHeight="7" orient="auto-start-reverse"><path d="M0 0 L8 4 L0 8 z" fill="#57606a"/>'
+        'markerHeight="7" orient="auto"><path d="M0 0 L8 4 L0 8 z" fill="#57606a"/>'
         "</marker></defs>"
     )
     yield (
@@ -221,18 +226,31 @@ def _svg(boxes: list[_Box], edges: list[_Edge]) -> Iterator[str]:
 
 
 def _path(source: _Box, target: _Box, edge: _Edge) -> str:
+    path = _around(source, target) if edge.back else _straight(source, target, edge)
+    style = "edge back" if edge.back else "edge"
+    style += " apart" if edge.apart else ""
+    title = f"<title>does not connect: {escape(edge.apart)}</title>" if edge.apart else ""
+    return f'<path class="{style}" d="{path}" marker-end="url(#head)">{title}</path>'
+
+
+def _around(source: _Box, target: _Box) -> str:
+    """Return a way back: out of the bottom of one box, into that of another."""
+    aside = 10.0 if source.x == target.x else 0.0
+    ax, bx = source.x + aside, target.x - aside
+    ay, by = source.y + _BOX_HEIGHT / 2, target.y + _BOX_HEIGHT / 2
+    low = max(ay, by) + _BACK + abs(ax - bx) * 0.05
+    return f"M{ax:.1f} {ay:.1f} C{ax:.1f} {low:.1f} {bx:.1f} {low:.1f} {bx:.1f} {by + 2:.1f}"
+
+
+def _straight(source: _Box, target: _Box, edge: _Edge) -> str:
     points = [(source.x, source.y), *edge.through, (target.x, target.y)]
-    sides = [1 if b[0] >= a[0] else -1 for a, b in (points[:2], points[-2:])]
-    points[0] = (source.x + sides[0] * source.width / 2, source.y)
-    points[-1] = (target.x - sides[1] * (target.width / 2 + 2), target.y)
+    points[0] = (source.x + source.width / 2, source.y)
+    points[-1] = (target.x - (target.width / 2 + 2), target.y)
     path = f"M{points[0][0]:.1f} {points[0][1]:.1f}"
     for (ax, ay), (bx, by) in pairwise(points):
         bend = (bx - ax) / 2
         path += f" C{ax + bend:.1f} {ay:.1f} {bx - bend:.1f} {by:.1f} {bx:.1f} {by:.1f}"
-    start = ' marker-start="url(#head)"' if edge.both else ""
-    style = "edge apart" if edge.apart else "edge"
-    title = f"<title>does not connect: {escape(edge.apart)}</title>" if edge.apart else ""
-    return f'<path class="{style}" d="{path}" marker-end="url(#head)"{start}>{title}</path>'
+    return path
 
 
 def _drawn(box: _Box) -> str:
