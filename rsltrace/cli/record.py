@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -18,7 +19,7 @@ from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.errors import NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
-from rsltrace.model.finding import Source
+from rsltrace.model.finding import READ_BY, Source
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
@@ -239,10 +240,12 @@ def _warn(result: RunResult) -> None:
     found = [met for met in result.guarded if met.is_finding]
     if not found:
         return
-    calls: dict[tuple[str, str], int] = {}
+    calls: Counter[tuple[str, str]] = Counter()
     for met in found:
-        key = (met.source.value, f"{met.call} in {met.node or 'the run'}")
-        calls[key] = calls.get(key, 0) + met.count
+        what, _, library = met.call.partition(READ_BY)
+        if library:  # what it is configured by, as a rule
+            what = f"environment variables{READ_BY}{library}"
+        calls[met.source.value, f"{what} in {met.node or 'the run'}"] += met.count
     tell("guard: these calls can make runs differ (see docs/guard.md):")
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
         times = f", {count} times" if count > 1 else ""

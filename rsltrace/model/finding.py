@@ -36,6 +36,9 @@ class Mode(str, Enum):
     ALLOW = "allow"
 
 
+READ_BY = ", read by "
+"""Stands between an environment variable and the library that reads it, in what was called."""
+
 _ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
 MODES: Mapping[Source, tuple[Mode, ...]] = {
     Source.CLOCK: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),

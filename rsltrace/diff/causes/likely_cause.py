@@ -75,7 +75,7 @@ def call_sentence(call: CallDifference, node: str) -> str:
 
 
 def _what(source: Source, call: str) -> str:
-    if source is Source.ENVIRONMENT and (found := _VARIABLE.fullmatch(call)):
+    if source is Source.ENVIRONMENT and (found := _VARIABLE.match(call)):
         return found[2]
     if source is Source.FILE and (found := _FILE.match(call)):
         return found[2]

@@ -14,6 +14,7 @@ import re
 from types import TracebackType
 
 from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
+from rsltrace.guard.virtual import set_order
 
 _WHEELS = frozenset(
     """
@@ -30,6 +31,11 @@ _STANDS_STILL = (
     "shows the same throughout a callback, as it may under use_sim_time: allow for a difference "
     "of 0, measure from one callback to the next, or write clocks: {advances: true} in the job, "
     "which lets it advance by a nanosecond per look"
+)
+
+_COMPILED = (
+    "\n  The guard has compiled this code so that it goes through sets in order; "
+    "to run it as it is, write 'guard: {order: allow}' in the job"
 )
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")
@@ -85,6 +91,8 @@ def hint_for(error: BaseException) -> str:
     """Return what to add to the text of an exception that user code raised while it ran."""
     if isinstance(error, ZeroDivisionError):
         return _STANDS_STILL
+    if _is_of_order(error):
+        return _COMPILED
     if type(error).__name__ == "InvalidParameterTypeException":
         return _as_double(str(error))
     if isinstance(error, AttributeError) and is_unmade(error.obj):
@@ -94,6 +102,16 @@ def hint_for(error: BaseException) -> str:
     package = error.name.partition(".")[0]
     _, line = _last_line(error.__traceback__)
     return f"\n  {where_to_get(package)}" if _is_interface(package, line) else ""
+
+
+def _is_of_order(error: BaseException) -> bool:
+    """Whether an error names a call with which the guard puts sets in order, or is raised by it."""
+    if "__rsltrace_" in str(error):
+        return True
+    traceback, last = error.__traceback__, None
+    while traceback is not None:
+        last, traceback = traceback.tb_frame.f_code.co_filename, traceback.tb_next
+    return last == set_order.__file__
 
 
 def parameter_in(error: BaseException | None) -> str | None:

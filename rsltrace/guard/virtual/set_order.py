@@ -24,6 +24,7 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.library_imports import importing
 from rsltrace.guard.virtual.clocks import numpy_now
+from rsltrace.guard.virtual.original_code import keep_source
 from rsltrace.model.finding import Mode, Source
 
 _ORDERED = "__rsltrace_ordered__"
@@ -210,6 +211,7 @@ def rewritten(source: bytes, path: str) -> CodeType:
     """Return a module's code with sets in order."""
     tree = ast.parse(source, path)
     order_sets(tree)
+    keep_source(path, source)
     code: CodeType = compile(tree, path, "exec", dont_inherit=True)
     return code
 
@@ -220,7 +222,7 @@ def code_of_script(source: bytes, path: str) -> CodeType:
 
     :raises SyntaxError, ValueError: if it is not Python.
     """
-    if any(type(finder) is _Finder for finder in sys.meta_path):
+    if any(type(finder) is _Finder and finder.orders for finder in sys.meta_path):
         return rewritten(source, path)
     code: CodeType = compile(source, path, "exec", dont_inherit=True)
     return code
@@ -249,10 +251,14 @@ class _Finder:
     """Finds modules of user code, and those of libraries, which have their own import time."""
 
     def __init__(
-        self, packages: frozenset[str], on_loaded: Mapping[str, Callable[[], None]]
+        self,
+        packages: frozenset[str],
+        on_loaded: Mapping[str, Callable[[], None]],
+        orders: bool,
     ) -> None:
         self._packages = packages
         self._on_loaded = on_loaded
+        self.orders = orders
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
@@ -267,7 +273,7 @@ class _Finder:
         of_node = name.partition(".")[0] in self._packages
         if of_node or is_user_file(file):
             library = is_installed(file) and not of_node
-            spec.loader = _Loader(spec.loader, ordered=True, library=library)
+            spec.loader = _Loader(spec.loader, ordered=self.orders, library=library)
         elif is_library(file):
             spec.loader = _Loader(spec.loader, ordered=False, library=True)
         if name in self._on_loaded:
@@ -300,9 +306,12 @@ def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
 
 @contextmanager
 def ordered_sets(
-    packages: frozenset[str], on_loaded: Mapping[str, Callable[[], None]]
+    packages: frozenset[str],
+    on_loaded: Mapping[str, Callable[[], None]],
+    *,
+    orders: bool = True,
 ) -> Iterator[None]:
-    """Let user modules that are imported from now on go through sets in order.
+    """Let user modules that are imported from now on go through sets in order, if ``orders``.
 
     ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
     """
@@ -312,7 +321,7 @@ def ordered_sets(
         _POP: pop,
         _NOW: numpy_now,
     }
-    finder = _Finder(packages, on_loaded)
+    finder = _Finder(packages, on_loaded, orders)
     for name, function in helpers.items():
         setattr(builtins, name, function)  # for good: modules may outlive the run
     sys.meta_path.insert(0, finder)

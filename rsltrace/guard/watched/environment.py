@@ -17,9 +17,10 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.callers import module_of, user_frame
+from rsltrace.guard.callers import is_of_python, module_of, user_frame
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.model.finding import Mode, Source
+from rsltrace.guard.libraries import is_library
+from rsltrace.model.finding import READ_BY, Mode, Source
 
 _NOT_READ = ("PYTHON", "ROS_PYTHON_CHECK_FIELDS")
 """What Python looks at for itself, and what every class of messages does when it is imported."""
@@ -53,17 +54,17 @@ class _Watched(_Environ):  # type: ignore[misc]
         try:
             value = str(super().__getitem__(name))
         except KeyError:
-            guard.watched(Source.ENVIRONMENT, call, "not set", frame)
+            guard.watched(Source.ENVIRONMENT, call + _reader(frame), "not set", frame)
             raise
-        guard.watched(Source.ENVIRONMENT, call, _shown(name, value), frame)
+        guard.watched(Source.ENVIRONMENT, call + _reader(frame), _shown(name, value), frame)
         return value
 
     def __iter__(self) -> Iterator[str]:
         guard = _guard_of(self)
         if guard is not None:
-            guard.watched(
-                Source.ENVIRONMENT, "os.environ", f"{len(self)} variables", sys._getframe(1)
-            )
+            frame = sys._getframe(1)
+            call = "os.environ" + _reader(frame)
+            guard.watched(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
         names: Iterator[str] = super().__iter__()
         return names
 
@@ -95,6 +96,15 @@ def _lays_out_help(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
+
+
+def _reader(frame: FrameType | None) -> str:
+    """Name the library that reads a variable, if the node itself does not."""
+    while frame is not None and is_of_python(frame):
+        frame = frame.f_back
+    if frame is None or not is_library(frame.f_code.co_filename):
+        return ""
+    return f"{READ_BY}{module_of(frame).partition('.')[0]}"
 
 
 def _shown(name: str, value: str) -> str:

@@ -7,6 +7,7 @@ import logging
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,13 @@ from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
+from rsltrace.guard.virtual.original_code import READERS, show_original
 from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.virtual.torch_streams import torch_streams
 from rsltrace.job import Job, NodeSpec, policy_of
-from rsltrace.model.finding import Finding, GuardCount, Source
+from rsltrace.model.finding import Finding, GuardCount, Mode, Source
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
 from rsltrace.trace.reader import Trace
@@ -135,14 +137,25 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
-            REWRITES: lambda: ordered_in_pytest(stack),
+            **{name: partial(show_original, name, stack) for name in READERS},
         }
+        orders = _orders_sets(job)
+        if orders:
+            at_once[REWRITES] = lambda: ordered_in_pytest(stack)
         for name, begin in at_once.items():
             if name in sys.modules:
                 begin()
         on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(ordered_sets(_packages(job.nodes), on_loaded))
+        stack.enter_context(ordered_sets(_packages(job.nodes), on_loaded, orders=orders))
     return made
+
+
+def _orders_sets(job: Job) -> bool:
+    """Return whether sets are to be looked at anywhere: else all code is compiled as it is."""
+    policies = [policy_of(job.guard)]
+    policies += [policy_of(job.guard, spec.guard) for spec in job.nodes if spec.guard is not None]
+    modes = (policy.modes.get(Source.ORDER, Mode.VIRTUAL) for policy in policies)
+    return any(mode is not Mode.ALLOW for mode in modes)
 
 
 def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
