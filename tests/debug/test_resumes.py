@@ -9,10 +9,15 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
+from rsltrace_viewer.live.execution import Executed
+from rsltrace_viewer.live.state import LiveSession
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.timeline.events import node_of
+
 from rsltrace import DebugSession
 from rsltrace.debug.positions import Stopped
 from rsltrace.job import load_job
-from rsltrace.model.event import EventKind
+from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.run import record
 from rsltrace.trace.reader import Trace
 
@@ -224,6 +229,21 @@ def test_a_message_is_received_once(session: DebugSession, trace: Trace) -> None
         for index in events_of(trace, "/asker")
         if trace.event(index).kind is EventKind.SUBSCRIPTION
     ]
+
+
+def test_what_the_viewer_says_of_those_that_go_on(waiting: Path) -> None:
+    """A main that has run a callback on its own stack goes on because of it, with nothing of it."""
+    run = Run.open(waiting / "run.mcap")
+    events = [run.event(index) for index in range(run.count)]
+    inputs = [run.input_of(one) for one in events if one.kind is EventKind.RESUME]
+    assert {None if one is None else one.kind for one in inputs} == {None, OutputKind.TASK}
+    shown = LiveSession(run)
+    shown.place = next(one.index for one in events if node_of(run, one) == "(run)")
+    shown.executed = Executed(shown.place, "(run)", {}, {}, None)
+    lines = [f"{line.label} {line.value}" for line in shown.lines()]
+    assert lines
+    assert not any("state of" in line or "parameters" in line for line in lines), lines
+    run.close()
 
 
 def test_a_main_of_a_job_that_nobody_has_recorded(waiting: Path, trace: Trace) -> None:

@@ -58,7 +58,8 @@ def where_lines(position: Position) -> Iterator[str]:
     if position.is_next:
         yield _ended(event)
     if event.get("cause_event") is not None:
-        yield f"   caused by event {event['cause_event']}, its output {event['cause_output']}"
+        nth = "" if event["kind"] == "resume" else f", its output {event['cause_output']}"
+        yield f"   caused by event {event['cause_event']}{nth}"
     hashes = [("chain", event.get("chain_hash")), ("state", event.get("state_hash"))]
     known = (f"{name} hash {value}" for name, value in hashes if value and set(value) != {"0"})
     yield printable(f"   {', '.join(known)}")

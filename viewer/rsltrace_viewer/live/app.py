@@ -98,7 +98,7 @@ class LiveApp(ViewerApp):
         if executed.wrong:
             self._say("diverged")
         self.inspector.show(session.lines(), top=False)
-        self.source.show(executed.source, light=self.theme == "textual-light")
+        self.source.show(executed.source)
 
     def _drive(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from rsltrace.words.entities import RUN_NAME
 from rsltrace_viewer.live.execution import Executed
 from rsltrace_viewer.model.inspector.lines import Line, Role
 from rsltrace_viewer.session import Session
@@ -37,6 +38,8 @@ class LiveSession(Session):
             return
         for text, value in here.watched:
             yield Line(0, text, f"= {value}", Role.FIELD, f"live.watch.{text}")
+        if here.node == RUN_NAME:
+            return  # a main has no attributes
         changed = here.changed
         count = len(changed)
         said = f"{count or 'nothing'} changed"

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, Event, Output
+from rsltrace.model.event import NO_EVENT, Event, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
@@ -188,16 +188,23 @@ class Run:
         return self.start_ns >= _EPOCH_NS
 
     def input_of(self, event: Event) -> Output | None:
-        """Return the output that was the input of ``event``, or None if no event caused it."""
+        """Return the output that was the input of ``event``, or None if no event caused it.
+
+        What goes on after a callback that ran on its own stack has that as its cause, but nothing
+        of it as its input.
+        """
         if not 0 <= event.cause_event < self.count:
             return None
         outputs = self.outputs(event.cause_event)
-        if event.cause_output >= len(outputs):
+        found = outputs[event.cause_output : event.cause_output + 1]
+        if event.kind is EventKind.RESUME and not any(o.kind is OutputKind.TASK for o in found):
+            return None
+        if not found:
             raise TraceError(
                 f"event {event.index} names output {event.cause_output} of event "
                 f"{event.cause_event} as its cause, which has {len(outputs)}; the trace is damaged"
             )
-        return outputs[event.cause_output]
+        return found[0]
 
     def _segment(self, number: int) -> Segment:
         """Read a segment. Events of a damaged one are stood in for: one can step over them, they

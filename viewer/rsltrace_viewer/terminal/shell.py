@@ -286,11 +286,10 @@ class Shell(App[None]):
         """Show the text of the callback, if that is wanted. Files are read in a thread."""
         here = self.session.current()
         if here is not None and self.screen_stack[0].has_class("with-source"):
-            light = self.theme == "textual-light"
 
             def arrive(found: list[Source | None] | None, done: bool) -> None:
                 if self.session.current() == here:
-                    self.source.show(found[0] if found else None, light=light)
+                    self.source.show(found[0] if found else None)
 
             walk(self, "source", ([source_of(*here)] for _ in range(1)), arrive, at_once_s=0)
 

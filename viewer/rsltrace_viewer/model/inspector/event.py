@@ -20,6 +20,7 @@ from rsltrace.model.event import (
 )
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.words.entities import RUN_NAME
 from rsltrace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
@@ -242,7 +243,7 @@ def event_link(run: Run, index: int, path: str, since_ns: int | None = None) -> 
 def _parameter_lines(run: Run, event: Event, openness: Openness) -> Iterator[Line]:
     node = node_of(run, event)
     entity = run.entities.get(event.entity)
-    if entity is None or entity.kind is EntityKind.SYSTEM:
+    if entity is None or entity.kind is EntityKind.SYSTEM or node == RUN_NAME:
         return
     is_open = openness.is_open("parameters", False)
     yield Line(0, "parameters", f"of {node} now", Role.SECTION, "parameters", is_open)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rich.syntax import Syntax
 from textual.app import ComposeResult
 from textual.containers import VerticalScroll
 from textual.content import Content
+from textual.highlight import highlight
 from textual.widgets import Static
 
 from rsltrace.model.printable import printable
@@ -28,18 +28,17 @@ class SourceView(VerticalScroll, can_focus=True):
     def __init__(self, *, id: str) -> None:  # Textual's name for it
         super().__init__(id=id)
         self._shown: Source | None = None
-        self._light = False
 
     def compose(self) -> ComposeResult:
         """Make the text."""
         yield Static(id="note")
         yield Static(id="code")
 
-    def show(self, source: Source | None, *, light: bool) -> None:
-        """Show a callback; None: there is none in Python."""
-        if (source, light) == (self._shown, self._light) and source is not None:
+    def show(self, source: Source | None) -> None:
+        """Show a callback, with a sign at the line that waits; None: there is none in Python."""
+        if source == self._shown and source is not None:
             return
-        self._shown, self._light = source, light
+        self._shown = source
         code, note = self.query_one("#code", Static), self.query_one("#note", Static)
         note.display = bool(source is not None and source.note)
         if source is None:
@@ -48,17 +47,21 @@ class SourceView(VerticalScroll, can_focus=True):
             return
         self.border_title = Content(printable(f"{Path(source.file).name}:{source.line}"))
         note.update(Content(printable(source.note)))
-        lines = [printable(line) for line in source.lines]
+        text = "\n".join(printable(line) for line in source.lines)
+        rows = highlight(text or printable(source.name), language="python").split(
+            "\n", allow_blank=True
+        )
+        width = len(str(source.line + len(rows))) if source.lines else 0
         code.update(
-            Syntax(
-                "\n".join(lines) or printable(source.name),
-                "python",
-                theme="ansi_light" if light else "ansi_dark",
-                line_numbers=bool(lines),
-                start_line=source.line,
-                highlight_lines=set() if source.at is None else {source.at},
-                background_color="default",
+            Content("\n").join(
+                _numbered(number, row, width, waits=number == source.at)
+                for number, row in enumerate(rows, source.line)
             )
         )
         above = 0 if source.at is None else source.at - source.line - self.size.height // 2
         self.scroll_to(0, max(above, 0), animate=False)
+
+
+def _numbered(number: int, row: Content, width: int, *, waits: bool) -> Content:
+    sign, style = ("▶", "bold $text-accent") if waits else (" ", "$text-muted")
+    return Content.styled(f"{sign}{number:>{width}} ", style) + row if width else row
