@@ -102,10 +102,16 @@ def _search_path(nodes: list[Found], folder: Path, *, guess: bool) -> list[str]:
     """Return where modules are, if that is not only beside the job; ``guess`` without any node."""
     found = {os.path.relpath(n.folder, folder) for n in nodes if n.folder is not None}
     if guess:
-        found = {place for place in _PLACES if place != ".." and any((folder / place).glob("*.py"))}
+        found = {place for place in ("src", "scripts") if _holds_modules(folder / place)}
         packages = (path.parent.parent for path in (folder / "src").glob("*/*/__init__.py"))
         found |= {os.path.relpath(path, folder) for path in packages}
     return [".", *sorted(found - {"."})] if found - {"."} else []
+
+
+def _holds_modules(folder: Path) -> bool:
+    """Whether a folder has modules, or packages that are not those of colcon."""
+    inner = (path for path in folder.glob("*/*.py") if path.name != "setup.py")
+    return any(folder.glob("*.py")) or any(inner)
 
 
 def _job_text(
