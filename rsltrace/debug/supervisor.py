@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rsltrace.debug.lines import Lines, Message
-from rsltrace.debug.tree import ClientGone, Tree
+from rsltrace.debug.tree import ClientGone, Over, Tree
 from rsltrace.errors import DebugError, RsltraceError
 
 
@@ -80,7 +80,7 @@ class Supervisor:
             if do is None:
                 raise DebugError(f"there is no request {request.get('do')!r}")
             return {"ok": do(request)}
-        except ClientGone:
+        except (ClientGone, Over):
             raise
         except RsltraceError as error:
             return {"error": _said(error)}

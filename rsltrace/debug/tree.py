@@ -24,6 +24,10 @@ class ClientGone(DebugError):
     """Nobody is there to answer."""
 
 
+class Over(DebugError):
+    """The session cannot go on. The message says why."""
+
+
 class Refused(DebugError):
     """An error that a process of the simulation has answered; ``kind`` is the class it names."""
 
@@ -89,12 +93,21 @@ class Tree:
     # -- the cursor --------------------------------------------------------------------------------
 
     def ask_cursor(self, request: Message) -> Any:
-        """Ask the process that stands where the session does."""
-        return self._ask(self._cursor, request)
+        """Ask the process that stands where the session does.
+
+        :raises Lost: it has ended; the session is back there.
+        """
+        return self._ask_cursor(request)
+
+    def _ask_cursor(self, request: Message, *, whole: bool = False) -> Any:
+        try:
+            return self._ask(self._cursor, request, whole=whole)
+        except Lost as error:
+            raise self._come_back(self.position, error) from None
 
     def ask_apart(self, request: Message, limit_s: float | None = _APART_LIMIT_S) -> Any:
         """Ask for what runs a user's code: a copy does it, and may be killed."""
-        answer = self._ask(self._cursor, request, whole=True)
+        answer = self._ask_cursor(request, whole=True)
         if "with" not in answer:
             return answer["ok"]
         copy = SimProcess(Lines(_socket(answer["with"][0])), answer["ok"]["pid"])
@@ -112,22 +125,29 @@ class Tree:
         request = {"do": "run", "interval_s": self._interval(), **goal}
         if "until" in goal:
             request["ladder"] = self._checkpoints.ladder(int(before["index"]), goal["until"])
-        try:
-            answer: Message = self._ask(self._cursor, request)
-        except Lost as error:
-            raise self._come_back(before, error) from None
+        answer: Message = self._ask_cursor(request)
         self.position = answer["position"]
         return answer
 
-    def _come_back(self, before: Message, error: Lost) -> DebugError:
-        """Put the session back where it was before its process ended."""
+    def _come_back(self, before: Message, error: Lost) -> Lost:
+        """Put the session back where it was before its process ended.
+
+        :raises Over: that cannot be done.
+        """
         self.family.kill(self._cursor)
         index = int(before["index"])
         where = f"somewhere after event {index - 1}" if index else "at the begin"
-        try:
-            self._cursor, answer = self._at({"until": index})
-        except DebugError as again:
-            return ClientGone(f"the simulation cannot go on: {error}; nor again: {again}")
+        for is_last in (False, True):  # who kills one process may just have killed another
+            try:
+                self._cursor, answer = self._at({"until": index})
+            except ClientGone:
+                raise
+            except DebugError as again:
+                if is_last:
+                    why = f"the simulation cannot go on: {error}; nor again: {again}"
+                    raise Over(why) from None
+            else:
+                break
         self.position = answer["position"]
         return Lost(f"the simulation was lost {where}: {error}; the session is back at {index}")
 

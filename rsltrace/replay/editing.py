@@ -15,6 +15,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.middleware.events.event import OutsideEvent
 from rsltrace.model.event import NO_EVENT, EventKind
 from rsltrace.model.stamp import format_seconds
+from rsltrace.replay.edited_messages import arrived_for_action, changed_data, received
 from rsltrace.replay.edits import (
     Defer,
     Delay,
@@ -24,15 +25,13 @@ from rsltrace.replay.edits import (
     SetMessage,
     SetParameter,
     change,
-    path_text,
 )
-from rsltrace.trace.chain import hash64
 
 if TYPE_CHECKING:
     from rsltrace.run.session import Session
 
 _CAN_COME_LATER = (EventKind.SUBSCRIPTION, EventKind.TIMER, EventKind.SERVICE)
-_CAN_BE_DROPPED = (*_CAN_COME_LATER, EventKind.CLIENT, EventKind.BAG)
+_CAN_BE_DROPPED = (*_CAN_COME_LATER, EventKind.CLIENT, EventKind.ACTION, EventKind.BAG)
 FAILED = Stop("an edit could not be made", 2)
 
 
@@ -103,6 +102,8 @@ class Editing:
                 changed = self._try(edit, self._event, changed)
         if changed is not None and self.error is None:
             self._execute(*changed)
+        elif hasattr(event[0], "task"):  # a coroutine that nobody is going to begin
+            getattr(event[0].task._handler, "close", int)()
 
     def _ended(self) -> None:
         """Stand in for ``Dispatcher.end_event``: what is due before the next event is made."""
@@ -189,22 +190,13 @@ class Editing:
             for armed in self._armed.pop(topic, ()):
                 if isinstance(armed.action, Drop) or data is None:
                     return
-                data = self._try(armed, partial(self._changed_data, publisher), data)
+                data = self._try(armed, partial(changed_data, publisher), data)
                 content_hash = None
             if data is not None:
                 publisher.send(data, content_hash)
 
         for publisher in publishers:
             publisher.send = partial(send, publisher)  # type: ignore[method-assign]
-
-    def _changed_data(self, endpoint: Any, edit: Edit, data: bytes) -> bytes:
-        from rsltrace.doors.rclpy.wire.codec import codec_for
-        from rsltrace.doors.rclpy.wire.interfaces import class_of
-
-        codec = codec_for(class_of(endpoint))
-        message = codec.deserialize(data)
-        _change_message(message, edit)
-        return codec.serialize(message)
 
     # -- the event that is about to run ----------------------------------------------------------
 
@@ -214,13 +206,15 @@ class Editing:
         handle, _, node, kind = event[:4]
         action = edit.action
         if isinstance(action, SetMessage):
-            return self._received(edit, event)
+            return received(edit, event)
         name = f"{handle.describe()} ({EventKind(kind).label})"
         waits = hasattr(handle, "task")  # a coroutine
         if isinstance(action, Drop):
             if kind not in _CAN_BE_DROPPED:
                 raise EditError(f"{name} cannot be dropped")
             if waits:
+                if (part := arrived_for_action(handle, kind)) is not None:
+                    part.queue.popleft()
                 handle.task._handler.close()
                 handle.task.cancel()
                 handle.dispatch()  # which ends it
@@ -252,48 +246,6 @@ class Editing:
                     self._loop.ready.appendleft(later)
 
         self._dispatcher.end_event = ended  # type: ignore[method-assign]
-
-    def _received(self, edit: Edit, event: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Return an event with another message."""
-        from rsltrace.doors.rclpy.wire.codec import codec_for
-
-        handle, entity, node, kind, callback, args, cause, output, digest = event
-        if hasattr(handle, "task"):
-            local = getattr(handle.task._handler, "cr_frame", None)
-            args = tuple(local.f_locals.values()) if local is not None else ()
-            args = tuple(one for one in args if hasattr(one, "get_fields_and_field_types"))[:1]
-        if kind == EventKind.BAG or (args and isinstance(args[0], bytes)):
-            data = self._changed_data(handle, edit, args[0])
-            digest = hash64(data)
-            rest = (digest,) if kind == EventKind.BAG else args[1:]
-            return handle, entity, node, kind, callback, (data, *rest), cause, output, digest
-        if not args or not hasattr(args[0], "get_fields_and_field_types"):
-            raise EditError(f"{handle.describe()} ({EventKind(kind).label}) receives no message")
-        _change_message(args[0], edit)
-        message: Any = type(args[0])
-        digest = hash64(codec_for(message).serialize(args[0]))
-        if hasattr(handle, "task"):
-            args = ()
-        return handle, entity, node, kind, callback, args, cause, output, digest
-
-
-def _change_message(message: Any, edit: Edit) -> None:
-    """Change a field, with the checks that rclpy's own messages have.
-
-    :raises EditError: there is no such field, or it cannot have the value.
-    """
-    action = edit.action
-    assert isinstance(action, SetMessage)
-    try:
-        change(message, action.path, action.operator, action.value)
-    except AttributeError:
-        fields = message.get_fields_and_field_types()
-        near = did_you_mean(str(action.path[0][1]), fields)
-        listed = ", ".join(fields)
-        name = f"{path_text(action.path).removeprefix('.')}"
-        raise EditError(f"{type(message).__name__} has no {name} (it has {listed}){near}") from None
-    except AssertionError as error:
-        raise EditError(f"{path_text(action.path).removeprefix('.')}: {error}") from None
 
 
 def _set_parameter(node: Any, action: SetParameter) -> None:
