@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import reprlib
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict
+from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
 from rsltrace.debug.conditions.expressions import parse_expression
@@ -22,6 +24,9 @@ if TYPE_CHECKING:
     from rsltrace.run.session import Session
 
 _JSON_BYTES_MAX = 1 << 20
+_ATTRIBUTES_MAX = 1000
+_DEPTH_MAX = 3
+_NO_USERS = {"rclpy", "rsltrace", *sys.stdlib_module_names} - {"__main__"}
 
 _short = reprlib.Repr()
 _short.maxstring = _short.maxother = 2000
@@ -123,10 +128,35 @@ def plain(value: Any) -> Any:
 
 
 def attributes(run: Standing, name: str) -> dict[str, str]:
-    """Return a node's own attributes and parameters as Python shows them."""
+    """Return a node's own attributes and parameters as Python shows them.
+
+    Of objects that Python shows by their address only there are the attributes: ``_ekf.P``.
+    """
     from rsltrace.doors.rclpy.handles.node_state import own_attributes
 
-    return {name: text_of(value) for name, value in own_attributes(node_named(run, name)).items()}
+    own = own_attributes(node_named(run, name))
+    found = islice(_within(own, "", _DEPTH_MAX), _ATTRIBUTES_MAX)
+    return {path: text_of(value) for path, value in found}
+
+
+def _within(values: Mapping[str, Any], prefix: str, depth: int) -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        inner = _plain_parts(value) if depth else {}
+        if inner:
+            yield from _within(inner, f"{prefix}{name}.", depth - 1)
+        else:
+            yield f"{prefix}{name}", value
+
+
+def _plain_parts(value: object) -> Mapping[str, Any]:
+    """Return the attributes of an object of the user's that has no text of its own."""
+    kind = type(value)
+    of = {one.__module__.partition(".")[0] for one in kind.__mro__[:-1]}
+    if kind.__repr__ is not object.__repr__ or not of.isdisjoint(_NO_USERS):
+        return {}
+    slots = (name for one in kind.__mro__ for name in getattr(one, "__slots__", ()))
+    found = {name: getattr(value, name) for name in slots if hasattr(value, name)}
+    return {**found, **getattr(value, "__dict__", {})}
 
 
 # -- what there is ---------------------------------------------------------------------------------

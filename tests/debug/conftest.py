@@ -22,9 +22,22 @@ class Source(Node):
         self.count += 1
         self.out.publish(Float64(data=1.5 * self.count))
 
+class Model:
+    __slots__ = ('last', '__dict__')
+
+    def __init__(self, node):
+        self.last = 0.0
+        self.noise = Noise(node)
+
+class Noise:
+    def __init__(self, node):
+        self.level = 0
+        self.node = node
+
 class Filter(Node):
     def __init__(self):
         super().__init__('filter')
+        self.model = Model(self)
         self.state = 0.0
         self.warned = None
         self.out = self.create_publisher(Float64, 'smooth', 10)
@@ -32,6 +45,8 @@ class Filter(Node):
 
     def got(self, message):
         self.state = 0.75 * self.state + 0.125 * message.data
+        self.model.last = message.data
+        self.model.noise.level += 1
         if self.state > 100 and self.warned is None:
             self.warned = self.get_clock().now().nanoseconds
             self.get_logger().warn('too fast')

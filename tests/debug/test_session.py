@@ -155,7 +155,12 @@ def test_who_changed_sent_and_when_it_became_true(session: DebugSession) -> None
 def test_questions(session: DebugSession) -> None:
     session.run_to(100)
     session.next("filter")
-    assert session.node("filter")["warned"] == "None"
+    own = session.node("filter")
+    assert own["warned"] == "None"
+    assert float(own["model.last"]) == 1.5 * session.evaluate("source.count")
+    assert own["model.noise.level"] == str(session.evaluate("filter.model.noise.level"))
+    assert "Filter object" in own["model.noise.node"]
+    assert "model" not in own
     assert [node["name"] for node in session.inspect("nodes")] == ["/source", "/filter", "/watch"]
     message = session.inspect("message")
     assert message["name"] == "/speed"
