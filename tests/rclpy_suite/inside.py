@@ -70,7 +70,10 @@ def simulate(request: dict[str, Any], reporter: Reporter) -> None:
 
     folder = Path(request["folder"])
     job = Job(
-        nodes=[NodeSpec(main=partial(run_pytest, request, reporter))], base_dir=folder, start=1000.0
+        nodes=[NodeSpec(main=partial(run_pytest, request, reporter))],
+        base_dir=folder,
+        start=1000.0,
+        clocks={"source": "topic", "advances": True},
     )
     result = run(job, folder / f"{request['module']}.mcap", force=True)
     # Of interest if a test is under way: it waits for what never comes.

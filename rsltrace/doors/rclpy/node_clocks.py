@@ -14,11 +14,12 @@ from rsltrace.model.draw import encode_clock
 @dataclass(frozen=True, slots=True)
 class ClockRule:
     """What is different about the clocks of nodes (a glob). One that ``advances`` shows a
-    nanosecond more at each look at one time."""
+    nanosecond more at each look at one time. Of one that ``follows``, /clock sets ROS time."""
 
     node: str
     model: ClockModel
     advances: bool = False
+    follows: bool = False
 
 
 class NodeClocks:
@@ -38,7 +39,7 @@ class NodeClocks:
         self._rules = rules
         self._start_ns = start_ns
         self._clocks: dict[str, WrongClock | None] = {}
-        self._advancing: set[str] = set()
+        self._rule_of: dict[str, ClockRule | None] = {}
         self._ahead: dict[str, tuple[int, int]] = {}
         """Of a clock that advances: the time of the last look, and how far ahead it was."""
 
@@ -47,13 +48,11 @@ class NodeClocks:
         if node is None:
             return now_ns
         if node not in self._clocks:
-            rule = next((rule for rule in self._rules if fnmatchcase(node, rule.node)), None)
+            rule = self._rule(node)
             self._clocks[node] = None
             if rule is not None:
                 stream = Stream(self._seed, f"clock\0{node}")
                 self._clocks[node] = WrongClock(rule.model, stream, self._start_ns)
-                if rule.advances:
-                    self._advancing.add(node)
         clock = self._clocks[node]
         if clock is None:
             return now_ns
@@ -61,20 +60,33 @@ class NodeClocks:
             self._note(node, by_ns)
         return clock.shows(now_ns)
 
+    def follows(self, node: str | None) -> bool:
+        """Return whether /clock (or who sets it by hand) drives the ROS time of a node."""
+        rule = self._rule(node or "")
+        return rule is not None and rule.follows
+
     def look(self, node: str | None, now_ns: int) -> int:
         """Return what a ROS clock of ``node`` shows to who looks at it now."""
-        shown_ns = self.shows(node, now_ns)
-        if node is None or node not in self._advancing:
+        shown_ns, name = self.shows(node, now_ns), node or ""
+        rule = self._rule(name)
+        if rule is None or not rule.advances:
             return shown_ns
-        before_ns, ahead_ns = self._ahead.get(node, (-1, 0))
+        before_ns, ahead_ns = self._ahead.get(name, (-1, 0))
         if before_ns != now_ns:
             ahead_ns = 0
         else:
             next_ns = self._domain.loop.later_ns()
             if next_ns is None or now_ns + ahead_ns + 1 < next_ns:
                 ahead_ns += 1
-        self._ahead[node] = now_ns, ahead_ns
+        self._ahead[name] = now_ns, ahead_ns
         return shown_ns + ahead_ns
+
+    def _rule(self, node: str) -> ClockRule | None:
+        """Return what is different about a node's clock; "" is code of no node."""
+        if node not in self._rule_of:
+            rules = (rule for rule in self._rules if fnmatchcase(node, rule.node))
+            self._rule_of[node] = next(rules, None)
+        return self._rule_of[node]
 
     def _note(self, node: str, by_ns: int) -> None:
         for handle in self._domain.graph.nodes_named(node):

@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import re
 from fractions import Fraction
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, flag, given, parts, positive_time, text
+from rsltrace.job.values.checks import (
+    attach,
+    check,
+    flag,
+    given,
+    one_of,
+    parts,
+    positive_time,
+    text,
+)
 from rsltrace.job.values.names import check_node_glob
 from rsltrace.job.values.problem import Problem, describe
 from rsltrace.job.values.times import TIME_SCHEMA, ExactFloat, Nanoseconds, parse_time
@@ -105,6 +114,13 @@ class ClockSpec(Part):
         "it at the same time, though never the time of the next event. Otherwise ROS clocks stand "
         "still throughout a callback.",
         examples=[True],
+    )
+    source: Annotated[Literal["run", "topic"], check(one_of("run", "topic"))] = Field(
+        default="run",
+        description="What drives ROS time where `use_sim_time` is on: the `run` itself, or the "
+        "`topic` /clock (and `set_ros_time_override`), as natively: then it stands at 0 until the "
+        "first message, and timers of the ROS clock wait for it, too.",
+        examples=["topic"],
     )
     offset_ns: Annotated[int, check(parse_signed_time)] = Field(
         default=0,

@@ -23,7 +23,7 @@ def clocks_of(job: Job) -> tuple[ClockRule, ...]:
             random_every_ns=0 if random is None else random.every_ns,
             random_most_ns=0 if random is None else random.most_ns,
         )
-        found.append(ClockRule(spec.node, model, spec.advances))
+        found.append(ClockRule(spec.node, model, spec.advances, spec.source == "topic"))
     return tuple(found)
 
 

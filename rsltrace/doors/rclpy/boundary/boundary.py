@@ -25,6 +25,7 @@ from rsltrace.doors.rclpy.handles.node_state import NodeStates
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.qos_events import EventHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import profile_of
+from rsltrace.doors.rclpy.handles.ros_timers import RosTimerHandle
 from rsltrace.doors.rclpy.handles.services import (
     ClientHandle,
     ServiceHandle,
@@ -144,6 +145,11 @@ class Boundary:
             return self.now_ns()
         return world.clocks.shows(owner or self.current_node_name(), world.stacks.loop.now_ns)
 
+    def follows(self, owner: str | None) -> bool:
+        """Return whether /clock drives the ROS time of a node in the run of the moment."""
+        world = self._world
+        return world is not None and world.clocks is not None and world.clocks.follows(owner)
+
     def look_ns(self, owner: str | None) -> int:
         """Return what a ROS clock of a node shows to user code, which may advance by the look."""
         world = self._world
@@ -233,6 +239,8 @@ class Boundary:
     def Timer(  # noqa: N802
         self, clock: Any, context: ContextHandle, period_ns: int, autostart: bool = True
     ) -> TimerHandle:
+        if clock.follows:
+            return RosTimerHandle(self.real, context.stacks, clock, period_ns, autostart)
         return TimerHandle(self.real, context.stacks, period_ns, autostart)
 
     def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
