@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from types import ModuleType
+from types import CodeType, ModuleType
 
+from rsltrace.guard.callers import is_own, is_user_file
 from rsltrace.job import Job
 from rsltrace.run.process import user_modules
 
@@ -22,10 +23,31 @@ _LIBRARIES = frozenset(
 def numerical_libraries(job: Job) -> str:
     """Return the libraries with version and kernel, or an empty text if the job uses none.
 
-    The nodes' modules are imported already. What a function imports later is not seen.
+    The nodes' modules are imported already. For what a run imports later see ``LateLibraries``.
     """
-    if not any(_uses_numbers(module) for module in _modules(job)):
+    return _kernels() if any(map(_uses_numbers, _modules(job))) else ""
+
+
+class LateLibraries:
+    """Looks at the end of a run for libraries that only it has imported.
+
+    A main imports what it needs when it runs: a test suite its tests, for instance.
+    """
+
+    def __init__(self, programs: Iterable[CodeType]) -> None:
+        self._before = set(sys.modules)
+        self._programs = tuple(programs)
+
+    def find(self) -> str:
+        """Return what ``numerical_libraries`` does, of the modules that user code loaded since."""
+        loaded = [sys.modules.get(name) for name in sorted(set(sys.modules) - self._before)]
+        of_user = [one for one in loaded if one is not None and _is_of_user(one)]
+        if any(map(_uses_numbers, of_user)) or any(map(_imports_numbers, self._programs)):
+            return _kernels()
         return ""
+
+
+def _kernels() -> str:
     from threadpoolctl import threadpool_info
 
     keys = ("internal_api", "version", "architecture")
@@ -33,6 +55,18 @@ def numerical_libraries(job: Job) -> str:
         " ".join(str(pool[key]) for key in keys if pool.get(key)) for pool in threadpool_info()
     }
     return ", ".join(sorted(found))
+
+
+def _is_of_user(module: ModuleType) -> bool:
+    file = getattr(module, "__file__", None)
+    return isinstance(file, str) and not is_own(module.__name__) and is_user_file(file)
+
+
+def _imports_numbers(code: CodeType) -> bool:
+    """Whether a program, or a function in it, imports one of the libraries by name."""
+    return any(name.partition(".")[0] in _LIBRARIES for name in code.co_names) or any(
+        _imports_numbers(part) for part in code.co_consts if isinstance(part, CodeType)
+    )
 
 
 def _modules(job: Job) -> Iterable[ModuleType]:

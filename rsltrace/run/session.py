@@ -27,6 +27,7 @@ from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.inputs import check_output
+from rsltrace.run.numerical_libraries import LateLibraries
 from rsltrace.run.plans.bags import (
     BagInput,
     check_bag_types,
@@ -39,6 +40,7 @@ from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.executables import why_not
 from rsltrace.run.plans.guard import RunGuard, install_guard
+from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
@@ -149,6 +151,8 @@ class Session:
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
         self._recorded: RecordedRun | None
+        self._late: LateLibraries
+        self._numerics_known = True
 
     @property
     def has_begun(self) -> bool:
@@ -292,10 +296,14 @@ class Session:
 
     def _record_to(self, writer: TraceWriter) -> None:
         job = self.job
+        programs = (entry.make for entry in self._entries)
+        self._late = LateLibraries(one.code for one in programs if isinstance(one, MainProgram))
         recorder = Recorder(writer, keep_payload=self._payload_filter())
         self.world.domain.dispatcher.recorder = recorder
         write_job(writer, job)
-        writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
+        described = environment(job)
+        self._numerics_known = "numerics" in described
+        writer.add_metadata(METADATA_ENVIRONMENT, described)
         write_sources(writer, job)
         for name, values in self._metadata.items():
             writer.add_metadata(name, values)
@@ -430,6 +438,7 @@ class Session:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error),
+                    **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,
             )
@@ -459,6 +468,11 @@ class Session:
             at_once = sum(entry.start_after is None for entry in self._entries)
             places.insert(at_once, str(len(self._entries)))  # the player
         return {"entries": ",".join(places)}
+
+    def _late_numerics(self) -> dict[str, str]:
+        """Return which kernels numerical libraries chose that the run has imported itself."""
+        late = "" if self._numerics_known else self._late.find()
+        return {"numerics": late} if late else {}
 
 
 def _waits(error: RunError | None) -> dict[str, str]:

@@ -195,8 +195,11 @@ class Trace:
 
     @cached_property
     def environment(self) -> dict[str, str]:
-        """What the run was made with: the metadata ``rsltrace:environment``."""
-        return self.metadata(METADATA_ENVIRONMENT)
+        """What the run was made with: the metadata ``rsltrace:environment``, and what the result
+        adds to it (numerical libraries that the run has imported itself)."""
+        numerics = self.result.get("numerics")
+        late = {"numerics": numerics} if numerics else {}
+        return {**self.metadata(METADATA_ENVIRONMENT), **late}
 
     @cached_property
     def job(self) -> dict[str, str]:
