@@ -255,13 +255,25 @@ def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Pa
     assert any(f"#{diverged} " in step for step in chain)
 
 
+def test_the_distance_between_two_runs_is_that_of_their_last_values(tmp_path: Path) -> None:
+    gallery.write_gallery(tmp_path / "a.mcap", STEPS)
+    gallery.write_gallery(tmp_path / "b.mcap", STEPS, differs_from=20)
+    export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
+    both = Recording(tmp_path / "ab.rrd")
+    found = both.values("/divergence/distance/odom/pose.pose.position", "Scalars:scalars")
+    assert [apart for (apart,) in found] == pytest.approx([0.0] * 20 + [0.5] * (STEPS - 20))
+    assert "/divergence/distance/voltage" not in both.rows, "it is equal in both"
+    assert both.static["/run_b/topics/odom/track"]["LineStrips3D:labels"] == ["b"]
+
+
 def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
     for name in ("a", "b"):
         gallery.write_gallery(tmp_path / f"{name}.mcap", 3)
     export([tmp_path / "a.mcap", tmp_path / "b.mcap"], tmp_path / "ab.rrd")
     both = Recording(tmp_path / "ab.rrd")
     (text,) = both.static["/divergence"]["TextDocument:text"]
-    assert text.startswith("# Identical")
+    assert text.startswith("# The runs are identical")
+    assert not [path for path in both.rows if path.startswith("/divergence/distance")]
     assert [r["StateChange:state"] for r in both.rows["/divergence/agreement"]] == [
         ["the runs agree"]
     ]

@@ -199,6 +199,6 @@ def test_texts_of_a_trace_are_no_markdown() -> None:
     side = Side("a```.mcap", "0" * 16, 1, 2, True)
     diff = Diff(side, side, Verdict.SCHEDULE, "*bold* <b>\x1b[31m\n# title\n```", 1)
     title, _, fence, *lines, end = document(diff).splitlines()
-    assert (title, fence, end) == ("# schedule", "````text", "````")
+    assert (title, fence, end) == ("# The runs diverge", "````text", "````")
     assert "a```.mcap" in "\n".join(lines)
     assert not any(line.startswith(("#", "````")) or "\x1b" in line for line in lines)

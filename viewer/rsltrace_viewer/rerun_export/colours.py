@@ -1,4 +1,5 @@
-"""Colours: by topic in one run; by run, with shades by topic, in two.
+"""Colours: by topic in one run; by run, with shades by topic, in two; neutral for lanes, so that
+red and green are left to what differs and what agrees.
 
 Blue and orange are told apart by people who do not see all colours, and on paper.
 """
@@ -16,3 +17,11 @@ def colour(root: str, number: int) -> int:
     """Return the colour (0xRRGGBBAA) of topic or curve ``number`` in a run (``a``, ``b`` or "")."""
     shades = _BY_RUN.get(root, _BY_TOPIC)
     return shades[number % len(shades)]
+
+
+_LANES = (0x5B7083FF, 0x8296A8FF, 0x46586AFF, 0x6C7F93FF, 0x9BAAB8FF)
+
+
+def lane(number: int) -> int:
+    """Return the colour (0xRRGGBBAA) of callback ``number`` of a node."""
+    return _LANES[number % len(_LANES)]

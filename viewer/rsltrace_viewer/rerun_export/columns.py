@@ -6,13 +6,14 @@ them here keeps texts as Arrow arrays all the way, which its own column helpers 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import pyarrow as pa
+import rerun as rr
 from rerun.chunk import Chunk
 
 if TYPE_CHECKING:
@@ -67,6 +68,21 @@ def make_chunk(
     index = [name for name, _ in times] or None
     chunks: list[Chunk] = Chunk.from_record_batch(batch, index=index, entity_path=path)
     return chunks
+
+
+def lane_colours(path: str, colours: Mapping[str, int]) -> list[Chunk]:
+    """Return the chunk that gives the states of a lane their colours (0xRRGGBBAA)."""
+    one = np.array([len(colours)])
+    configuration = rr.StateConfiguration
+    paints = pa.array(colours.values(), type=pa.uint32())
+    return make_chunk(
+        path,
+        (),
+        (
+            (configuration.descriptor_values(), lists(one, pa.array(colours))),
+            (configuration.descriptor_colors(), lists(one, paints)),
+        ),
+    )
 
 
 def _field(component: ComponentDescriptor | str, values: pa.Array) -> pa.Field:

@@ -30,7 +30,7 @@ from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import event_title
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lists, make_chunk
+from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lane_colours, make_chunk
 from rsltrace_viewer.rerun_export.paths import join
 
 DOCUMENT = "/divergence"
@@ -104,19 +104,7 @@ def _agreement(
         ((SIM_TIME, clock.array(np.array(stamps))), (EVENT, pa.array(events))),
         ((state, pa.array(states)),),
     )
-    two = np.array([2])
-    configuration = rr.StateConfiguration
-    yield from make_chunk(
-        AGREEMENT,
-        (),
-        (
-            (configuration.descriptor_values(), lists(two, pa.array([_AGREE, _DIFFER]))),
-            (
-                configuration.descriptor_colors(),
-                lists(two, pa.array([_GREEN, _RED], type=pa.uint32())),
-            ),
-        ),
-    )
+    yield from lane_colours(AGREEMENT, {_AGREE: _GREEN, _DIFFER: _RED})
 
 
 def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
@@ -151,7 +139,8 @@ def document(diff: Diff) -> str:
     )
     shown = replace(diff, divergences=divergences)
     report = report_lines(shown, DiffOptions(everything=True), width=_WIDTH)
-    title = "Identical" if diff.identical else diff.verdict.value
+    verdict = "The runs diverge" if diff.diverged else diff.verdict.value
+    title = "The runs are identical" if diff.identical else verdict
     return "\n".join((f"# {title}", "", *code_block(plain_text(report)))) + "\n"
 
 

@@ -16,6 +16,7 @@ from rsltrace.errors import OutputError
 from rsltrace.model.regular_file import in_the_way
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for
+from rsltrace_viewer.rerun_export.distance import Distances, distance_chunks
 from rsltrace_viewer.rerun_export.divergence import Marks, divergence_chunks, marks_of
 from rsltrace_viewer.rerun_export.frames import joining_chunks
 from rsltrace_viewer.rerun_export.layout import blueprint
@@ -103,11 +104,13 @@ def _send(
     if len(opened) == 2:
         trees = [run.seen.frames for run in shown]
         recording.send_chunks(joining_chunks(list(labels), trees))
+    distances = Distances()
     if diff is not None:
         marks = marks_of(diff)
+        recording.send_chunks(distance_chunks(shown, clock, distances))
         start_ns = min(trace.start_ns for trace in opened)
         recording.send_chunks(divergence_chunks(diff, start_ns, clock))
-    layout = blueprint(shown, marks, timeline)
+    layout = blueprint(shown, marks, distances, timeline)
     recording.send_blueprint(layout, make_active=True, make_default=True)
     return [
         f"{trace.name}: no messages on {topic}: {why}"

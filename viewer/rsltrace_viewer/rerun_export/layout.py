@@ -10,11 +10,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, TypeAlias
 
+import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.api import Container, View
 
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
+from rsltrace_viewer.rerun_export.distance import Distances, Key, curve_keys
 from rsltrace_viewer.rerun_export.paths import NO_NODE
 from rsltrace_viewer.rerun_export.run import Shown
 
@@ -39,12 +41,15 @@ Part: TypeAlias = Container | View
 
 
 def blueprint(
-    shown: Sequence[Shown], marks: Marks | None = None, timeline: str = SIM_TIME
+    shown: Sequence[Shown],
+    marks: Marks | None = None,
+    distances: Distances | None = None,
+    timeline: str = SIM_TIME,
 ) -> rrb.Blueprint:
     """Return the layout for one run, or for two with what was found to differ; it opens on
     ``timeline``."""
     world = _world(shown)
-    plots = _plots(shown, marks)
+    plots = _plots(shown, marks, distances or Distances())
     above: list[Part] = []
     if marks is not None:
         above.append(rrb.TextDocumentView(origin=marks.document, name="What differs"))
@@ -94,6 +99,7 @@ def _world(shown: Sequence[Shown]) -> Part | None:
             contents=_only(paths),
             name=f"3D: {root}" if root else "3D",
             spatial_information=rrb.SpatialInformation(target_frame=root) if root else None,
+            eye_controls=_from_above(shown, root, paths),
         )
         for root, paths in by_root.items()
     ]
@@ -125,19 +131,45 @@ def _world(shown: Sequence[Shown]) -> Part | None:
     return parts[0] if len(parts) == 1 else rrb.Vertical(*parts, row_shares=[2, 1])
 
 
-def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
-    """The same curves of all runs in one plot; the most telling ones at once, the rest in tabs."""
-    fields: dict[tuple[str, str], list[str]] = {}
+def _from_above(
+    shown: Sequence[Shown], root: str, paths: Sequence[str]
+) -> rrb.EyeControls3D | None:
+    """Look down on the tracks that are drawn in the root frame; None if there are none."""
+    boxes = [
+        run.seen.extents[path]
+        for run in shown
+        for path in paths
+        if path in run.seen.extents and run.seen.frames.frames[path] == root
+    ]
+    corners = np.array([corner for box in boxes for corner in box if np.isfinite(corner).all()])
+    if not len(corners):
+        return None
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    centre, size = (low + high) / 2, max(float(np.max(high - low)), 1.0)
+    # A little from the south, so that north is up.
+    return rrb.EyeControls3D(
+        position=centre + np.array((0.0, -0.3, 1.2)) * size, look_target=centre, eye_up=(0, 0, 1)
+    )
+
+
+def _plots(shown: Sequence[Shown], marks: Marks | None, distances: Distances) -> Part | None:
+    """The same curves of all runs in one plot; the most telling ones at once, the rest in tabs.
+
+    Of two runs, how far they are apart comes first; what is equal in both says nothing.
+    """
+    fields: dict[Key, list[str]] = {}
     for run in shown:
-        for path in run.seen.curves:
-            topic = run.seen.topic_of.get(path, "")
-            field = path[len(run.paths.topic(topic)) :].strip("/") if topic else path
-            fields.setdefault((topic, field), []).append(path)
+        for key, path in curve_keys(run).items():
+            if key not in distances.equal and not key[0].startswith("/rsltrace/"):
+                fields.setdefault(key, []).append(path)
     first = marks.fields if marks is not None else ()
     names = {
         key: " ".join((key[1], *(n for run in shown for n in run.seen.curves.get(paths[0], ()))))
         for key, paths in fields.items()
     }
+    arrays = {key for key, name in names.items() if name.endswith("]")}
+    for key in arrays.difference(first):
+        del fields[key]
     reached = marks.topics if marks is not None else ()
     ranked = sorted(
         fields,
@@ -162,6 +194,9 @@ def _plots(shown: Sequence[Shown], marks: Marks | None) -> Part | None:
         return None
     if more:
         views[-1] = rrb.Tabs(views[-1], *more, active_tab=0)
+    apart = [distances.paths[key] for key in ranked if key in distances.paths]
+    if apart:
+        views.insert(0, _plot(("Distance between the runs", ""), apart[:_PLOTS_SHOWN]))
     return views[0] if len(views) == 1 else rrb.Vertical(*views, name="Plots")
 
 

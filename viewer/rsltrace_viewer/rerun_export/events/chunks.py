@@ -14,7 +14,15 @@ from rerun.chunk import Chunk
 from rsltrace.model.event import NO_EVENT, EventFlag
 from rsltrace.trace.format import OUTPUT_DTYPE
 from rsltrace.trace.reader import Trace
-from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, constant, make_chunk
+from rsltrace_viewer.rerun_export.colours import lane
+from rsltrace_viewer.rerun_export.columns import (
+    EVENT,
+    SIM_TIME,
+    Clock,
+    constant,
+    lane_colours,
+    make_chunk,
+)
 from rsltrace_viewer.rerun_export.events.labels import Labels, hashes
 from rsltrace_viewer.rerun_export.events.rates import Rates
 from rsltrace_viewer.rerun_export.paths import Paths
@@ -47,6 +55,7 @@ class EventRows:
         self.rates = Rates(trace.start_ns, trace.end_ns, count)
         self.active_nodes: list[str] = []
         self._active = np.zeros(len(names), dtype=np.bool_)
+        self._lane_states: dict[str, dict[str, None]] = {}
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield all chunks, the rates last. Raises TraceError where the trace is damaged."""
@@ -60,6 +69,8 @@ class EventRows:
             yield from self._lanes(events, stamps, callbacks)
             yield from self._entities(events, stamps, indexes, sent)
         self.active_nodes = [n for n, a in zip(self.node_names, self._active, strict=True) if a]
+        for path, states in self._lane_states.items():
+            yield from lane_colours(path, {text: lane(i) for i, text in enumerate(states)})
         yield from self._rates()
 
     def _batches(self) -> Iterator[Batch]:
@@ -116,6 +127,7 @@ class EventRows:
             self._active[number] = True
             path = self._paths.node(self.node_names[number])
             texts = callbacks.take(pa.array(own))
+            self._lane_states.setdefault(path, {}).update(dict.fromkeys(texts.unique().to_pylist()))
             yield from make_chunk(
                 path, ((SIM_TIME, stamps.take(pa.array(own))),), ((state, texts),)
             )

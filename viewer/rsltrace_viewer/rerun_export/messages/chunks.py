@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -75,6 +75,10 @@ _RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
 _BYTES_WAITING_MAX = 32 << 20
 
 
+Points: TypeAlias = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], pa.ListArray]
+"""Stamps in nanoseconds, events, and a list of values for each."""
+
+
 @dataclass(slots=True)
 class Seen:
     """What there is to show, gathered while the messages pass; the layout is made from it."""
@@ -86,6 +90,12 @@ class Seen:
     """By path, the names of the curves there."""
     topic_of: dict[str, str] = field(default_factory=dict)
     """By path of curves or drawings, the topic."""
+    points: dict[str, list[Points]] = field(default_factory=dict)
+    """By path, of one of two runs, what its curves show."""
+    extents: dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]] = field(
+        default_factory=dict
+    )
+    """By path of a track, the corners of the box around it."""
 
 
 class MessageRows:
@@ -224,6 +234,7 @@ class MessageRows:
             self._note_transforms(by_name)
         if "Scalars:scalars" in by_name:
             self.seen.curves.setdefault(rows.path, ())
+            self._note_points(rows.path, rows, by_name["Scalars:scalars"])
 
     # Frames.
 
@@ -306,12 +317,18 @@ class MessageRows:
             path = rows.path + (join(curve.path) if curve.path else "")
             scalars = rr.Scalars.descriptor_scalars()
             yield from make_chunk(path, rows.times, ((scalars, curve.scalars),))
+            self._note_points(path, rows, curve.scalars)
             known = self.seen.curves.get(path, ())
             if len(curve.names) > len(known):
                 names = tuple(f"{self._paths.label} {name}".strip() for name in curve.names)
                 self.seen.curves[path] = names
                 self.seen.topic_of[path] = rows.topic
                 yield from self._curve_names(path, names)
+
+    def _note_points(self, path: str, rows: Rows, values: pa.ListArray) -> None:
+        if self._paths.label:
+            points = (rows.stamps_ns, rows.events, values)
+            self.seen.points.setdefault(path, []).append(points)
 
     def _curve_names(self, path: str, names: tuple[str, ...]) -> list[Chunk]:
         one = np.array([len(names)])
@@ -326,9 +343,10 @@ class MessageRows:
 
     def _ends(self) -> Iterator[Chunk]:
         self._markers.end(self._trace.end_ns)
-        for path, frame, chunks in self._trails.poses():
+        for path, frame, points, chunks in self._trails.poses(self._paths.label):
             self.seen.frames.frames[path] = frame.removeprefix(self._prefix)
             self.seen.frames.drawn.add(path)
+            self.seen.extents[path] = (points.min(axis=0), points.max(axis=0))
             yield from chunks
         yield from self._trails.fixes()
 

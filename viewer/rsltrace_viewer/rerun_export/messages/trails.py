@@ -35,8 +35,9 @@ class Trails:
         """Add latitudes and longitudes, shape (n, 2)."""
         self._fixes.setdefault(path, (Track(), paint))[0].add(positions)
 
-    def poses(self) -> Iterator[tuple[str, str, list[Chunk]]]:
-        """Yield path, frame (with its prefix) and chunk of every track of poses."""
+    def poses(self, label: str) -> Iterator[tuple[str, str, npt.NDArray[np.float64], list[Chunk]]]:
+        """Yield path, frame (with its prefix), points and chunk of every track of poses. ``label``
+        is written beside them, if there is one."""
         for topic_path, (track, frame, paint) in self._poses.items():
             points = track.points
             if len(points):
@@ -47,8 +48,10 @@ class Trails:
                     (rr.LineStrips3D.descriptor_colors(), paint.faint.column(1)),
                     (rr.LineStrips3D.descriptor_radii(), constant(_WIDTH, 1, pa.float32())),
                     (rr.CoordinateFrame.descriptor_frame(), pa.array([frame])),
+                    (rr.LineStrips3D.descriptor_labels(), pa.array([[label]])),
+                    (rr.LineStrips3D.descriptor_show_labels(), pa.array([bool(label)])),
                 )
-                yield path, frame, make_chunk(path, (), columns)
+                yield path, frame, points, make_chunk(path, (), columns)
 
     def fixes(self) -> Iterator[Chunk]:
         """Yield the tracks on the map."""
