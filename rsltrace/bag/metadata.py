@@ -117,7 +117,8 @@ def _load(path: Path) -> Any:
 
     try:
         if path.stat().st_size > METADATA_YAML_BYTES_MAX:
-            raise BagError(f"{path}: larger than any bag's; run 'ros2 bag reindex'")
+            most = METADATA_YAML_BYTES_MAX >> 20
+            raise BagError(f"{path}: larger than any bag's ({most} MiB); run 'ros2 bag reindex'")
         text = path.read_text(encoding="utf-8")
         if nested_too_deep(text) >= 0:
             raise BagError(f"{path}: brackets are nested too deeply; run 'ros2 bag reindex'")

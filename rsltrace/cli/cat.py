@@ -180,18 +180,18 @@ def _warn_if_none(found: set[int], what: str, globs: tuple[str, ...], all_: list
 def _events(trace: Trace, choice: _Choice) -> Iterator[tuple[Event, list[Output]]]:
     """Yield the chosen events with their outputs; memory is that of one segment."""
     segments = trace.segments
-    for row in segments:
-        if row["end_stamp"] < choice.from_ns or row["start_stamp"] > choice.to_ns:
+    for segment in segments:
+        if segment["end_stamp"] < choice.from_ns or segment["start_stamp"] > choice.to_ns:
             continue
-        first = int(row["first_event"])
-        last = first + int(row["events"])
+        first = int(segment["first_event"])
+        last = first + int(segment["events"])
         events = next(trace.events(first, last))
         outputs = next(trace.outputs(first, last))
         ends = np.searchsorted(outputs["event"], events["index"], side="right").tolist()
         for position in np.flatnonzero(_mask(events, outputs, choice)).tolist():
             begin = ends[position - 1] if position else 0
-            own = [output_of(output) for output in outputs[begin : ends[position]]]
-            yield event_of(events[position]), own
+            own = [output_of(row, trace.name) for row in outputs[begin : ends[position]]]
+            yield event_of(events[position], trace.name), own
 
 
 def _mask(

@@ -290,14 +290,14 @@ class Trace:
         """Return event number ``index``. Raises IndexError if there is none."""
         segment = self._segment_of(index)
         first = int(self.segments["first_event"][segment])
-        return event_of(self._segments.cached_events(segment)[index - first])
+        return event_of(self._segments.cached_events(segment)[index - first], self.name)
 
     def outputs_of(self, index: int) -> list[Output]:
         """Return the outputs of event ``index``, in order. Raises IndexError if there is none."""
         outputs = self._segments.cached_outputs(self._segment_of(index))
         bounds = np.array([index, index + 1], dtype=np.uint64)
         low, high = np.searchsorted(outputs["event"], bounds).tolist()
-        return [output_of(row) for row in outputs[low:high]]
+        return [output_of(row, self.name) for row in outputs[low:high]]
 
     # What the guard found.
 

@@ -138,8 +138,11 @@ class SegmentReader:
         return outputs
 
 
-def event_of(row: np.void) -> Event:
-    """Return an element of an array of EVENT_DTYPE as an Event. Raises TraceError."""
+def event_of(row: np.void, name: str = "trace") -> Event:
+    """Return an element of an array of EVENT_DTYPE, from a file of that name, as an Event.
+
+    Raises TraceError.
+    """
     chain_hash, index, stamp, cause, hash_in, hash_out, state, entity, nth, outputs, kind, flags = (
         row.item()
     )
@@ -159,15 +162,20 @@ def event_of(row: np.void) -> Event:
             chain_hash=chain_hash,
         )
     except ValueError as error:
-        raise TraceError(f"event {index}: {error}; a newer rsltrace wrote this trace") from error
+        raise TraceError(
+            f"{name}: event {index}: {error}; a newer rsltrace wrote this trace"
+        ) from error
 
 
-def output_of(row: np.void) -> Output:
-    """Return an element of an array of OUTPUT_DTYPE as an Output. Raises TraceError."""
+def output_of(row: np.void, name: str = "trace") -> Output:
+    """Return an element of an array of OUTPUT_DTYPE, from a file of that name, as an Output.
+
+    Raises TraceError.
+    """
     event, content_hash, entity, kind, sequence = row.item()
     try:
         return Output(event, entity, OutputKind(kind), content_hash, sequence)
     except ValueError as error:
         raise TraceError(
-            f"an output of event {event}: {error}; a newer rsltrace wrote this trace"
+            f"{name}: an output of event {event}: {error}; a newer rsltrace wrote this trace"
         ) from error

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from mcap.opcode import Opcode
 from mcap.records import Schema
 
+from rsltrace.cli.main import cli
 from rsltrace.errors import TraceError
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.reader import Trace
@@ -159,3 +161,17 @@ def test_a_record_that_lies_about_its_length_under_right_checksums_is_found(
         pytest.raises(TraceError, match=f"record at byte {at} runs past the end"),
     ):
         trace.check()
+
+
+def test_a_kind_that_nobody_knows_is_told_with_the_file(tmp_path: Path) -> None:
+    parts = mcap_parts.take_apart(SAMPLE.read_bytes())
+    mcap_parts.change_messages(
+        parts, "/rsltrace/events", lambda data, nth: data[:-2] + b"\xff" + data[-1:]
+    )
+    path = tmp_path / "forged.mcap"
+    path.write_bytes(mcap_parts.put_together(parts))
+    with Trace.open(path) as trace, pytest.raises(TraceError, match=r"forged\.mcap: event 0: 255"):
+        trace.event(0)
+    shown = CliRunner().invoke(cli, ["cat", str(path)])
+    assert shown.exit_code == 2
+    assert "forged.mcap: event 0: 255 is not a valid EventKind" in " ".join(shown.output.split())

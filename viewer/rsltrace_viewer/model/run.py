@@ -138,7 +138,7 @@ class Run:
         damage = self._damaged.get(self.segment_of(index))
         if damage is not None:
             raise damage
-        return event_of(row)
+        return event_of(row, self.trace.name)
 
     def outputs(self, index: int) -> list[Output]:
         """Return the outputs of event ``index``, in order. Raises IndexError, TraceError."""
@@ -151,7 +151,7 @@ class Run:
             raise damage
         bounds = np.array([index, index + 1], dtype=np.uint64)
         low, high = np.searchsorted(outputs["event"], bounds).tolist()
-        return [output_of(row) for row in outputs[low:high]]
+        return [output_of(row, self.trace.name) for row in outputs[low:high]]
 
     def stamp(self, index: int) -> int:
         """Return when event ``index`` happened, in ns."""

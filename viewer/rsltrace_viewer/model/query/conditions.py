@@ -158,7 +158,7 @@ class WithOutput(_Anywhere):
         for row in of_kind:
             place = int(row["event"]) - segment.first
             if among[place] and not found[place]:
-                found[place] = self.accept(run, output_of(row))
+                found[place] = self.accept(run, output_of(row, run.trace.name))
         return found
 
 

@@ -93,7 +93,7 @@ class LogRows:
     def _exceptions(self) -> Iterator[Chunk]:
         for events, outputs in zip(self._trace.events(), self._trace.outputs(), strict=True):
             for row in outputs[outputs["kind"] == int(OutputKind.EXCEPTION)]:
-                output = output_of(row)
+                output = output_of(row, self._trace.name)
                 event = events[output.event - int(events["index"][0])]
                 entity = self._trace.entities.get(int(event["entity"]))
                 name = self._paths.node_name(entity) if entity else NO_NODE
