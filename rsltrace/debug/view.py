@@ -10,7 +10,7 @@ from rsltrace.debug.conditions.view import Sent
 from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import get_message_class
-from rsltrace.model.event import OutputKind
+from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.words.logs import parse_log
 
 if TYPE_CHECKING:
@@ -88,6 +88,10 @@ class View:
     def node(self) -> str:
         """The full name of its node, empty for the run itself."""
         node = self._event.node
+        if self._event.kind == EventKind.RESUME:  # a main is no node's, whichever it has made
+            entity = self._ledger.entities.get(self._event.entity)
+            if entity is not None and not entity.node:
+                return ""
         return "" if node is None else str(node.fully_qualified_name)
 
     @property
