@@ -146,3 +146,16 @@ def test_what_cannot_be(
     with pytest.raises(EditError, match=why):
         rsltrace.replay(folder / "run.mcap", edits=f"{at}: {edit}", trust=True)
     assert not [one for one in recwarn if "never awaited" in str(one.message)]
+
+
+@pytest.mark.long
+def test_in_a_session(folder: Path) -> None:
+    at = event(folder / "run.mcap", EventKind.ACTION, SERVER, "/fibonacci/_action/send_goal", 1)
+    with rsltrace.DebugSession(folder / "run.mcap", job_folder=folder, trust=True) as session:
+        session.go_to(at)
+        assert session.edit("message.goal.order = 3").index == at
+        session.go_on()
+        assert session.reverse_step().position.index == session.events - 1  # type: ignore[operator]
+        session.branch(folder / "kept.mcap", force=True)
+    assert "5: succeeded [0, 1, 1, 2]" in said(folder / "kept.mcap")
+    assert rsltrace.replay(folder / "kept.mcap", job_folder=folder, trust=True).is_whole
