@@ -15,7 +15,7 @@ import pytest
 pytest.importorskip("textual", reason="needs textual: pip install 'rsltrace[view]'")
 
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.terminal import screenshot
+from rsltrace_viewer.terminal import screenshot, shell
 from rsltrace_viewer.terminal.app import ViewerApp, open_session
 from rsltrace_viewer.terminal.screenshot import settle, text_of
 from textual.pilot import Pilot
@@ -31,6 +31,8 @@ if "trace_maker" not in sys.modules:
     _spec.loader.exec_module(_module)
 
 screenshot._SETTLE_S = 600.0  # settling ends with the work; on a loaded machine that takes its time
+
+shell._VALUES_S = 0.001  # a test stops at every event
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 GOLDEN = Path(__file__).parent / "golden"

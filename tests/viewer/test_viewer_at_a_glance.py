@@ -62,7 +62,7 @@ def test_the_overview_leads_to_events(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("O")
         assert isinstance(viewer.app.screen, OverviewScreen)
-        for words in ("exceptions", "/talker", "/count", "exit code 3", "50 Hz"):
+        for words in ("exceptions", "/talker", "/count", "exit code 3", "on the way"):
             assert words in viewer.text
         await viewer.press("j", "enter")
         assert viewer.app.session.current()[1] == 602

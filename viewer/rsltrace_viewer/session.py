@@ -187,8 +187,7 @@ class Session:
         return event, self.view.sign(place), place in self.marks, self._relation(place)
 
     def _with_values(self, name: str, index: int) -> EventText:
-        event, known = self._texts[name].of(index), self.values[name].known(index)
-        return replace(event, outputs=known) if known else event
+        return self.values[name].known(self._texts[name].of(index))
 
     def _with_other(self, event: EventText, index: int, index_b: int) -> EventText:
         """Return an event of run a with what is to be said of that of run b beside it."""

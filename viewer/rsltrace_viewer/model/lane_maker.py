@@ -91,9 +91,9 @@ class LaneMaker:
         since = (segment.events["stamp"] - np.uint64(start)).astype(np.float64)
         pieces = np.minimum(since * self._pieces / (end - start + 1), self._pieces - 1)
         flat = slots * self._pieces + pieces.astype(np.int64)
-        keys, first, counts = np.unique(flat, return_index=True, return_counts=True)
-        self._starts[number].reshape(-1)[keys] = since[first]
-        self._counts[number].reshape(-1)[keys] = np.minimum(counts, 65535)
+        counts = np.bincount(flat, minlength=self._counts[number].size)
+        self._counts[number] = np.minimum(counts, 65535).reshape(self._counts[number].shape)
+        self._starts[number].reshape(-1)[flat[::-1]] = since[::-1]  # the first of each one stays
         raised = (segment.events["flags"] & int(EventFlag.RAISED)) != 0
         if raised.any():
             rows = self._row_of_slot[slots[raised]]

@@ -31,6 +31,8 @@ from rsltrace_viewer.terminal.widgets.source import SourceView
 from rsltrace_viewer.terminal.widgets.timeline import Row, Timeline
 
 WIDE = 110
+_VALUES_S = 0.12
+"""Messages are decoded, and files read, when one has stopped for this long."""
 SHARES = 12
 _REPORT_S = 0.25
 _EFFECTS_AT_ONCE_S = 0.004
@@ -341,6 +343,10 @@ class Shell(App[None]):
         # Whatever is selected now: the comparison may have given the event another place.
         if self.screen_stack:
             self._show_inspector()
+            self._soon = self.set_timer(_VALUES_S, self._complete)
+
+    def _complete(self) -> None:
+        if self.screen_stack:
             self._show_values()
             self._show_source()
             self.busy = False

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.events import outputs_text
+from rsltrace_viewer.model.timeline.events import EventText, outputs_text
 from rsltrace_viewer.model.timeline.message_values import message_values
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
@@ -24,10 +25,17 @@ class RowValues:
     def __init__(self, run: Run) -> None:
         self._run = run
         self._texts: OrderedDict[int, str] = OrderedDict()
+        self._events: dict[int, EventText] = {}
 
-    def known(self, index: int) -> str | None:
-        """Return what an event did, with values; None if that has not been read."""
-        return self._texts.get(index)
+    def known(self, event: EventText) -> EventText:
+        """Return an event with the values of what it did, if these have been read."""
+        text = self._texts.get(event.index)
+        if not text:
+            return event
+        found = self._events.get(event.index)
+        if found is None:
+            found = self._events[event.index] = replace(event, outputs=text)
+        return found
 
     def read(self, indexes: Sequence[int]) -> Iterator[int]:
         """Read events, one at a time; yields how many are done."""
@@ -35,7 +43,7 @@ class RowValues:
             if index not in self._texts:
                 self._texts[index] = self._text(index)
                 while len(self._texts) > _KEPT:
-                    self._texts.popitem(last=False)
+                    self._events.pop(self._texts.popitem(last=False)[0], None)
             yield count
 
     def _text(self, index: int) -> str:

@@ -32,7 +32,8 @@ from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
 from rsltrace_viewer.terminal.widgets.prompt import Prompt, Question
 
 _WIDE = 110
-_TIME = 13
+_WIDE_OF_TWO = 170
+_TIME = 12
 _STYLES = {
     Sign.MATCH: "muted",
     Sign.DIFFERS: "error",
@@ -56,7 +57,7 @@ class RecordingApp(App[None]):
     .wide #body { layout: grid; grid-size: 2 2; grid-columns: 3fr 5fr; grid-rows: 1fr 1fr; }
     .wide #topics { row-span: 2; height: 1fr; }
     .wide #messages, .wide #message { height: 1fr; border-left: solid $panel; }
-    .wide.two #body { grid-columns: 1fr 1fr; }
+    .wide.two #body { grid-columns: 1fr 2fr; }
     #messages:focus, #message:focus { border-top: solid $accent; }
     """
     BINDINGS: ClassVar = [
@@ -127,7 +128,8 @@ class RecordingApp(App[None]):
     # Drawing.
 
     def _fit(self, width: int) -> None:
-        self.screen_stack[0].set_class(width >= _WIDE, "wide")
+        wide = _WIDE_OF_TWO if self.session.two else _WIDE
+        self.screen_stack[0].set_class(width >= wide, "wide")
         self.screen_stack[0].set_class(self.session.two, "two")
 
     def on_resize(self, event: events.Resize) -> None:

@@ -30,6 +30,8 @@ from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
 
 _BAR = 12
 _CALLBACKS_MAX = 12
+_NUMBERS = 19
+_WAITS = 24
 Choice = tuple[str, str]
 """What was chosen: ``filter`` with its text, or ``event`` with a number."""
 _Make = Callable[[Run, Overview], Sequence[Part]]
@@ -85,8 +87,10 @@ class OverviewScreen(Screen[Choice | None]):
         self._lines = [*self._troubles(), ((), None)]
         self._lines += self._table("nodes", nodes_of, "node")
         self._lines += [((), None), *self._table("topics", topics_of, "topic")]
-        title = "where the callbacks go, and how long messages take to get there"
-        self._lines += [((), None), *self._table(title, callbacks_of, "entity", _CALLBACKS_MAX)]
+        self._lines += [
+            ((), None),
+            *self._table("callbacks", callbacks_of, "entity", _CALLBACKS_MAX),
+        ]
         self.query_one(ListView).show(lambda line: self._lines[line][0], len(self._lines))
 
     def _troubles(self) -> list[tuple[Pieces, Choice | None]]:
@@ -133,8 +137,16 @@ class OverviewScreen(Screen[Choice | None]):
         known = [{(part.node, part.kind, part.name): part for part in parts} for parts in made]
         keys = list(dict.fromkeys(key for one in known for key in one))
         width = max(min(self.app.size.width - 4, 140), 40)
-        names = max(width - _BAR - 2 - 19 * len(made) - (22 if field == "entity" else 0), 12)
-        lines: list[tuple[Pieces, Choice | None]] = [(((f"{title}  {len(keys)}", "title"),), None)]
+        bars = _BAR if width >= 100 else _BAR // 3
+        waits = any(part.wait_ns is not None for parts in made for part in parts)
+        names = max(width - bars - 2 - _NUMBERS * len(made) - (_WAITS if waits else 0), 12)
+        heads: list[tuple[str, str]] = [(fit(f"{title}  {len(keys)}", names + bars + 2), "title")]
+        what = "sent" if field == "topic" else "events"
+        for name in ("a", "b")[: len(made)] if len(made) > 1 else ("",):
+            heads.append((f"{f'{what} {name}'.strip():>10}{'Hz':>9}", "muted"))
+        if waits:
+            heads.append(("  on the way: mean, max", "muted"))
+        lines: list[tuple[Pieces, Choice | None]] = [(heads, None)]
         for key in keys[:most]:
             parts = [one.get(key) for one in known]
             some = next(part for part in parts if part is not None)
@@ -143,14 +155,14 @@ class OverviewScreen(Screen[Choice | None]):
                 text = f"{some.node} {some.kind} {some.name}"
             elif field == "topic":
                 text = f"{some.name}  {some.kind}"
-            bar = "█" * max(round(some.share * _BAR), 0) or "▏"
-            pieces = [(fit(printable(text), names) + " ", "plain"), (fit(bar, _BAR) + " ", "bar")]
+            bar = "█" * round(some.share * bars) or "▏"
+            pieces = [(fit(printable(text), names) + " ", "plain"), (fit(bar, bars) + " ", "bar")]
             differ = len({part.count if part else 0 for part in parts}) > 1
             for part in parts:
                 pieces.append((_numbers(part), "error" if differ else "plain"))
             if some.wait_ns is not None:
                 mean, longest = some.wait_ns
-                wait = f"  {format_duration(mean)}, ≤{format_duration(longest)}"
+                wait = f"  {_short(mean)}, {_short(longest)}"
                 pieces.append((wait, "muted"))
             name = some.name if field != "node" else some.node
             lines.append((pieces, ("filter", _filter_of(field, some, name))))
@@ -168,7 +180,7 @@ class OverviewScreen(Screen[Choice | None]):
 def _numbers(part: Part | None) -> str:
     if part is None:
         return f"{'-':>10}{'':9}"
-    rate = "" if part.rate_hz is None else f"{part.rate_hz:.4g} Hz"
+    rate = "" if part.rate_hz is None else f"{part.rate_hz:.4g}"
     return f"{part.count:>10,}{rate:>9}"
 
 
@@ -176,3 +188,7 @@ def _filter_of(field: str, part: Part, name: str) -> str:
     if field == "entity":
         return f'node:"{part.node}" entity:"{name}"'
     return f'{field}:"{name}"'
+
+
+def _short(duration_ns: int) -> str:
+    return format_duration(round(float(f"{duration_ns:.3g}")))
