@@ -15,10 +15,11 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.truth import faults
+from tests.truth import faults, recordings
+from tests.truth.complaint import Complaint
 from tests.truth.graph import HIDDEN, World
 from tests.truth.known import item_of
-from tests.truth.oracle import Complaint, complaints
+from tests.truth.oracle import complaints
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Outcome:
 def try_case(name: str, seed: int, folder: Path) -> Outcome:
     """Plant one fault and check the diff; the traces stay in ``folder``."""
     planted = faults.FAULTS[name](random.Random(f"{name} {seed}"))
+    if planted.recordings is not None:
+        return Outcome(name, seed, tuple(recordings.complaints(planted.recordings, folder)))
     for world, trace in ((planted.a, "a.mcap"), (planted.b, "b.mcap")):
         _record(world, folder / world.folder, folder / trace)
     wrong = complaints(folder / "a.mcap", folder / "b.mcap", planted.truth)

@@ -20,6 +20,7 @@ HIDDEN = "truth_hidden"
 
 HEADER = """\
 import builtins
+import math
 import os
 import pathlib
 import random
@@ -28,8 +29,11 @@ import time
 import rclpy
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from std_msgs.msg import Float64, Float64MultiArray
-from std_srvs.srv import Trigger
+from geometry_msgs.msg import PoseStamped
+from std_msgs.msg import (
+    Bool, Float32, Float64, Float64MultiArray, Int64, String, UInt8MultiArray
+)
+from std_srvs.srv import SetBool, Trigger
 
 
 def hidden():
@@ -65,6 +69,8 @@ class NodePlan:
     callbacks: list[Callback]
     parameters: dict[str, float] = field(default_factory=dict)
     hears: tuple[str, ...] = ()
+    top: list[str] = field(default_factory=list)
+    """Lines of the module in front of the class."""
 
     @property
     def module(self) -> str:
@@ -80,7 +86,11 @@ class NodePlan:
 
     def source(self) -> str:
         """Return the module."""
-        text = HEADER + f"class {self.class_name}(Node):\n    def __init__(self):\n"
+        text = (
+            HEADER
+            + "".join(f"{line}\n" for line in self.top)
+            + f"class {self.class_name}(Node):\n    def __init__(self):\n"
+        )
         body = [f"super().__init__({self.name!r})", "self.n = 0", *self.setup]
         text += "".join(f"        {line}\n" for line in body)
         for callback in self.callbacks:
@@ -98,6 +108,7 @@ class World:
     nodes: list[NodePlan]
     job: dict[str, Any]
     bag: list[tuple[int, str, float]] = field(default_factory=list)
+    bag_options: dict[str, Any] = field(default_factory=dict)
     environment: dict[str, str] = field(default_factory=dict)
     files: dict[str, str] = field(default_factory=dict)
     hidden: str = ""
@@ -125,7 +136,7 @@ class World:
         job = dict(self.job)
         if self.bag:
             write_bag(folder / "bag.mcap", self.bag)
-            job["bags"] = ["bag.mcap"]
+            job["bags"] = [{"path": "bag.mcap", **self.bag_options}]
         path = folder / "job.yaml"
         path.write_text(f"{self.comment}{_yaml(job)}", encoding="utf-8")
         return path

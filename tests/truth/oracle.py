@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace import Diff, diff
@@ -12,6 +11,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
 from rsltrace.diff.result.divergence import Divergence
 from tests.truth import traces
+from tests.truth.complaint import Complaint
 from tests.truth.faults.planting import Truth
 
 _MIRRORED = {
@@ -21,14 +21,6 @@ _MIRRORED = {
     "ran-longer": "ended-early",
 }
 _SAME_WORDS = {"earlier": "later", "fewer": "more", "a": "", "b": ""}
-
-
-@dataclass(frozen=True)
-class Complaint:
-    """Something that ``diff`` says and that is not so. ``what`` is one of few words."""
-
-    what: str
-    text: str
 
 
 def complaints(a: Path, b: Path, truth: Truth) -> list[Complaint]:

@@ -242,13 +242,15 @@ def _one_sided(case: Case) -> Judgement:
         elif case.lost.startswith(GONE):
             root_sentence += f"; {one.entity.node} is not deterministic"
     elif one.kind is EventKind.BAG:
-        root_sentence = f"only the bag of {has} has this message"
+        root_sentence = case.because() or f"only the bag of {has} has this message"
     elif one.kind is EventKind.OUTSIDE:
         root_sentence = f"whoever drove the simulation did this only in {has}"
     else:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
         if because := case.because():
             root_sentence = f"nothing before it differs, but {because}"
+        elif one.entity.node:
+            root_sentence += f": {one.entity.node} is not deterministic"
     return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
 
 
@@ -316,7 +318,8 @@ def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
         values = next((field_text(m.fields, m.more_fields) for m in case.messages), "")
         told = f" ({values})" if values else ""
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one{told}"
-        root, why = Root.EXTERNAL_INPUT, "the bags that were played differ in this message"
+        root = Root.EXTERNAL_INPUT
+        why = case.because() or "the bags that were played differ in this message"
     elif a.kind is EventKind.OUTSIDE:
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} is another one"
         root, why = Root.EXTERNAL_INPUT, _DRIVEN_DIFFERENTLY

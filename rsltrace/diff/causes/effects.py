@@ -21,7 +21,7 @@ PARAMETER_EVENTS = "/parameter_events"
 def is_effect(block: AlignedBlock, item: EventPair) -> bool:
     """Whether an item is more than a node that was set up otherwise.
 
-    Other values on ``/parameter_events``, what a constructor logs and the state of a node are not.
+    What a constructor logs or says on ``/parameter_events``, and the state of a node, are not.
     """
     if item.plain or item.beyond:
         return False
@@ -36,9 +36,10 @@ def is_effect(block: AlignedBlock, item: EventPair) -> bool:
     i, j = item.a - a.first, item.b - b.first
     if (a.stamp[i], a.input[i], a.flags[i]) != (b.stamp[j], b.input[j], b.flags[j]):
         return True
-    quiet = {OutputKind.LOG} if rows.kind[place] == CONSTRUCT else set()
+    if rows.kind[place] != CONSTRUCT:
+        return bool(outputs_of_one(block, item))
     return any(
-        kind not in quiet and keys[number].name != PARAMETER_EVENTS
+        kind != OutputKind.LOG and keys[number].name != PARAMETER_EVENTS
         for kind, number, _, _ in outputs_of_one(block, item)
     )
 

@@ -141,9 +141,11 @@ class _Evidence:
             if value is None:
                 return replace(base, reason=self._not_recorded(run, output, topic))
             values.append(value)
-        if len(values) == 1 and kind == OutputKind.EXCEPTION:
-            lines = str(values[0]).strip().splitlines() or [""]
-            return replace(base, preview=shortened(printable(lines[-1]), _EXCEPTION_MAX))
+        if kind == OutputKind.EXCEPTION:
+            raised = [_last_line(value) for value in values]
+            if len(raised) == 1:
+                return replace(base, preview=raised[0])
+            return replace(base, fields=(FieldDifference("raised", *raised),))
         if len(values) == 1:
             note = parameters_text(values[0]) if topic == PARAMETER_EVENTS else ""
             return replace(base, preview=preview(values[0]), note=note)
@@ -179,6 +181,11 @@ class _Evidence:
             f"only its hash was recorded in {where}; to see its fields, record with payloads: true "
             f"and a topic glob that matches {topic} (record: in the job)"
         )
+
+
+def _last_line(traceback: object) -> str:
+    lines = str(traceback).strip().splitlines() or [""]
+    return shortened(printable(lines[-1]), _EXCEPTION_MAX)
 
 
 def _topic(kind: int, key: EntityKey) -> str:

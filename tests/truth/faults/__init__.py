@@ -16,9 +16,18 @@ def load() -> None:
         endings,
         equal,
         graphs,
+        messages,
+        origins,
         outside,
+        pairs,
+        recordings,
+        rules,
         settings,
+        waiting,
     )
 
-    families = (bags, behaviour, delivery, endings, equal, graphs, outside, settings)
+    families = (
+        *(bags, behaviour, delivery, endings, equal, graphs, messages, origins, outside, pairs),
+        *(recordings, rules, settings, waiting),
+    )
     assert all(families)

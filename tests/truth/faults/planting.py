@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from tests.truth.graph import Callback, NodePlan, World
+from tests.truth.recordings import Recordings
 
 ALWAYS_FALSE = (
     r"different number of times",
@@ -45,11 +46,12 @@ class Truth:
 
 @dataclass(frozen=True)
 class Planted:
-    """Two worlds and the truth about them."""
+    """Two worlds and the truth about them; or two recordings, and the truth about these."""
 
     a: World
     b: World
     truth: Truth
+    recordings: Recordings | None = None
 
 
 Planter = Callable[[random.Random], Planted]
