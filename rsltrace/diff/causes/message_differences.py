@@ -145,7 +145,7 @@ class _Evidence:
             raised = [_last_line(value) for value in values]
             if len(raised) == 1:
                 return replace(base, preview=raised[0])
-            return replace(base, fields=(FieldDifference("raised", *raised),))
+            return replace(base, fields=(FieldDifference("raised", raised[0], raised[1]),))
         if len(values) == 1:
             note = parameters_text(values[0]) if topic == PARAMETER_EVENTS else ""
             return replace(base, preview=preview(values[0]), note=note)
