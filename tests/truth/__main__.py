@@ -12,7 +12,7 @@ from rsltrace import diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
 from tests.truth import faults
-from tests.truth.campaign import Outcome, cases, keep_case, table, try_cases
+from tests.truth.campaign import Outcome, cases, families, keep_case, table, try_cases
 
 _AT_ONCE = 20
 
@@ -38,6 +38,7 @@ def main() -> int:
                 _tell(outcome)
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / "table.md").write_text(table(outcomes), encoding="utf-8")
+    (options.out / "families.md").write_text(families(outcomes), encoding="utf-8")
     print(table(outcomes))
     unknown = [key for outcome in outcomes for key in outcome.unknown]
     print(f"{len(outcomes)} faults, {sum(not o.wrong for o in outcomes)} reports right")

@@ -125,3 +125,38 @@ def table(outcomes: list[Outcome]) -> str:
         rows.append(f"| {name} | {planted[name]} | {right[name]} | {told} |")
     rows.append(f"| all {len(planted)} | {len(outcomes)} | {right.total()} | |")
     return "\n".join(rows) + "\n"
+
+
+FAMILIES = {
+    "behaviour": "what a callback does",
+    "waiting": "what a callback waits for, makes, destroys, fails in",
+    "messages": "what is in a message",
+    "settings": "settings and code",
+    "rules": "links, drawn orders, clocks, bags and parameters of the job",
+    "delivery": "queues and QoS",
+    "bags": "messages of bags that are played",
+    "recordings": "recordings beside recordings",
+    "graphs": "graphs",
+    "outside": "what comes from outside",
+    "origins": "where the cause lies: on import, in helpers, in another node",
+    "endings": "how runs end",
+    "equal": "what changes nothing, alone and beside a fault",
+    "pairs": "two faults at once",
+}
+_TWICE = (", in code", ", hidden")
+
+
+def families(outcomes: list[Outcome]) -> str:
+    """Return the families of classes with how many of their cases are right, as Markdown."""
+    rows = ["| family | classes | planted | right |", "|---|---|---|---|"]
+    for module, title in FAMILIES.items():
+        names = [name for name, family in faults.FAMILIES.items() if family == module]
+        of_it = [outcome for outcome in outcomes if outcome.name in names]
+        short = [name.removesuffix(_TWICE[0]) for name in names if not name.endswith(_TWICE[1])]
+        both = ", each in its code and hidden" if len(short) * 2 == len(names) else ""
+        right = sum(not outcome.wrong for outcome in of_it)
+        listed = "; ".join(short)
+        rows.append(f"| {title}{both} | {len(names)}: {listed} | {len(of_it)} | {right} |")
+    right = sum(not outcome.wrong for outcome in outcomes)
+    rows.append(f"| all | {len(faults.FAMILIES)} | {len(outcomes)} | {right} |")
+    return "\n".join(rows) + "\n"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from tests.truth.faults.planting import FAULTS, Planted, Truth
+from tests.truth.faults.planting import FAMILIES, FAULTS, Planted, Truth
 
-__all__ = ["FAULTS", "Planted", "Truth", "load"]
+__all__ = ["FAMILIES", "FAULTS", "Planted", "Truth", "load"]
 
 
 def load() -> None:

@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from tests.truth.faults.planting import (
-    FAULTS,
     NOT_DETERMINISTIC,
     STATE_HINT,
     Planted,
     Truth,
+    add,
     in_code,
     in_hiding,
     module_of,
@@ -58,8 +58,8 @@ def behaviour(name: str, **kinds: bool) -> Callable[[Behaviour], Behaviour]:
                 says = (*says, STATE_HINT)
             return Planted(a, b, replace(truth, says=says))
 
-        FAULTS[f"{name}, in code"] = code
-        FAULTS[f"{name}, hidden"] = hidden
+        add(f"{name}, in code", code, make)
+        add(f"{name}, hidden", hidden, make)
         return make
 
     return register

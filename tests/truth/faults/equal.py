@@ -7,10 +7,10 @@ from collections.abc import Callable
 
 from tests.truth.faults.planting import (
     ALWAYS_FALSE,
-    FAULTS,
     NOT_DETERMINISTIC,
     Planted,
     Truth,
+    add,
     in_hiding,
     one_of,
 )
@@ -45,8 +45,8 @@ def irrelevant(name: str) -> Callable[[Change], Change]:
             )
             return Planted(a, b, truth)
 
-        FAULTS[f"no effect: {name}"] = alone
-        FAULTS[f"fault beside {name}"] = beside
+        add(f"no effect: {name}", alone, change)
+        add(f"fault beside {name}", beside, change)
         return change
 
     return register

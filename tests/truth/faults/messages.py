@@ -20,7 +20,6 @@ def message(
     """Register two classes: a source publishes ``made`` on /typed, and at one call ``change`` is
     done to it first."""
 
-    @behaviour(name)
     def make(rng: random.Random, world: World) -> Change:
         node = one_of(rng, world, "source")
         kind = made.partition("(")[0]
@@ -32,6 +31,8 @@ def message(
             world.job["record"] = {"exclude": ["/typed"]}
         truth = truth_of(node, first=(r"/typed", *first), shows=shows)
         return Change(node, [change], truth, at=rng.randint(1, 6))
+
+    behaviour(name)(make)
 
 
 message("text", 'String(data="ready")', 'typed.data = "steady"', 'data "ready" → "steady"')

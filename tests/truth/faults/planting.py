@@ -56,17 +56,25 @@ class Planted:
 
 Planter = Callable[[random.Random], Planted]
 FAULTS: dict[str, Planter] = {}
+FAMILIES: dict[str, str] = {}
+"""The module of each class, by name."""
 
 
 def fault(name: str) -> Callable[[Planter], Planter]:
     """Register a class of faults."""
 
     def register(planter: Planter) -> Planter:
-        assert name not in FAULTS
-        FAULTS[name] = planter
+        add(name, planter, planter)
         return planter
 
     return register
+
+
+def add(name: str, planter: Planter, made_by: Callable[..., object]) -> None:
+    """Register a class of faults in the family of the module that ``made_by`` is of."""
+    assert name not in FAULTS
+    FAULTS[name] = planter
+    FAMILIES[name] = made_by.__module__.rpartition(".")[2]
 
 
 def insert(callback: Callback, mark: str, lines: list[str]) -> None:
