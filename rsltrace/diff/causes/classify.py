@@ -108,6 +108,8 @@ class Judgement:
     a: EventView | None
     b: EventView | None
     settings: tuple[Setting, ...] = ()
+    likely_cause: str = ""
+    """What came from outside and explains it, where that is known."""
 
 
 ROOT_OF = {

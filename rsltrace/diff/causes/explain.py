@@ -268,6 +268,7 @@ class Explainer:
             b=judgement.b,
             root=judgement.root,
             root_sentence=judgement.root_sentence,
+            likely_cause=judgement.likely_cause,
             chain=self._chain(found),
             messages=messages,
             calls=calls,

@@ -38,7 +38,8 @@ def headline(first: Divergence, effect: Divergence | None, *, in_vain: str | Non
     setup = effect is not None or in_vain is not None
     lead = _lead(tuple(dict.fromkeys(settings)), setup=setup)
     if effect is not None:
-        return f"{lead or first.sentence}; first effect: {effect_text(effect)}"
+        lead = lead or first.likely_cause or first.sentence
+        return f"{lead}; first effect: {effect_text(effect)}"
     if not lead:
         return first.sentence
     one = first.a or first.b

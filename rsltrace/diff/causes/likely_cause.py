@@ -11,7 +11,7 @@ from rsltrace.diff.causes.classify import Judgement
 from rsltrace.diff.causes.event_views import node_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.set_order import set_behind
-from rsltrace.diff.causes.wording import MADE_DIFFERENTLY
+from rsltrace.diff.causes.wording import MADE_DIFFERENTLY, NAMED_MAX
 from rsltrace.diff.result.divergence import CallDifference, MessageDifference
 from rsltrace.diff.result.verdicts import Root
 from rsltrace.model.finding import Source
@@ -19,7 +19,7 @@ from rsltrace.model.printable import printable, shortened
 
 _ANSWER_MAX = 60
 _VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
-_FILE = re.compile(r"\w[\w.]*\((['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
+_FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
 _CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
 _VERBS = {
     Source.ENVIRONMENT: "read",
@@ -50,7 +50,7 @@ def with_likely_cause(
     if judgement.root not in _OPEN_TO_IT or not judgement.root_sentence or view is None:
         return judgement
     if calls and calls[0].a != calls[0].b:
-        text = call_sentence(calls[0], node_of(view))
+        text = calls_sentence(calls, node_of(view), messages)
     else:
         text = set_behind(run, view, messages, calls, relevance)
     if not text:
@@ -58,7 +58,34 @@ def with_likely_cause(
     _, made_differently, others = judgement.root_sentence.partition(MADE_DIFFERENTLY)
     why = f"{text}; and {made_differently}{others}" if made_differently else text
     sentence = f"{judgement.sentence}; likely cause: {text}"
-    return replace(judgement, sentence=sentence, root_sentence=why)
+    return replace(judgement, sentence=sentence, root_sentence=why, likely_cause=text)
+
+
+def calls_sentence(
+    calls: Sequence[CallDifference], node: str, messages: Sequence[MessageDifference]
+) -> str:
+    """Return the calls with different answers as a sentence. Of several those whose answers show in
+    what differs, if there are such; else all may be the cause."""
+    differing = list({(c.call, c.where): c for c in reversed(calls) if c.a != c.b}.values())[::-1]
+    if len(differing) > 1:
+        shown = _shown(messages)
+        telling = [c for c in differing if {_unquoted(v) for v in (c.a, c.b) if v} & shown]
+        differing = telling or differing
+    told = list(dict.fromkeys(call_sentence(call, node) for call in differing))
+    first, *others = told[:NAMED_MAX]
+    more = len(told) - NAMED_MAX
+    text = "; ".join([first, *(other.removeprefix(f"{node} ") for other in others)])
+    return f"{text}; and {more} more" if more > 0 else text
+
+
+def _shown(messages: Sequence[MessageDifference]) -> set[str]:
+    texts = {word for message in messages for word in message.topic.split()}
+    return texts | {
+        _unquoted(value, '"')
+        for m in messages
+        for field in m.fields
+        for value in (field.a, field.b)
+    }
 
 
 def call_sentence(call: CallDifference, node: str) -> str:
@@ -92,7 +119,7 @@ def _answers(source: Source, a: str, b: str) -> tuple[str, str]:
     return a, b
 
 
-def _unquoted(text: str) -> str:
+def _unquoted(text: str, quote: str = "'") -> str:
     inner = text[1:-1]
-    quoted = len(text) > 2 and text[0] == text[-1] == "'"
+    quoted = len(text) > 2 and text[0] == text[-1] == quote
     return inner if quoted and re.fullmatch(r"[\w./:+-]+", inner) else text

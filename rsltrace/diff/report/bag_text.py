@@ -89,7 +89,7 @@ def _message(found: MessageDivergence, width: int) -> Section:
     only = None if found.presence is Presence.BOTH else found.a or found.b
     if found.note:
         only = found.a
-        rows.append(line(f"    {printable(found.note)}: the same message"))
+        rows.append(line(f"    {printable(found.note)}"))
     preview = only.preview if only is not None else ""
     rows += payload_lines(found.fields, found.more_fields, preview, found.reason, width)
     return Section(line((title, Style.TITLE)), rows, 14, "lines", least=6)

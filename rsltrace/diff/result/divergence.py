@@ -110,7 +110,8 @@ class Divergence:
     did first: two events, not one. ``root`` and ``root_sentence`` say where it comes from; for most
     verdicts that is the diverging event itself. ``before_a``/``before_b``
     are the last events before it in each run, ``same_node_*`` the last ones in the same node.
-    ``settings`` are those of the settings that differ which can be the cause.
+    ``settings`` are those of the settings that differ which can be the cause, ``likely_cause`` what
+    came from outside and explains it ("" if nothing is known).
     """
 
     verdict: Verdict
@@ -130,3 +131,4 @@ class Divergence:
     calls: tuple[CallDifference, ...] = ()
     state: tuple[StateDifference, ...] = ()
     settings: tuple[Setting, ...] = ()
+    likely_cause: str = ""

@@ -94,10 +94,56 @@ def beside(rng: random.Random) -> Planted:
     return Planted(a, b, replace(truth, never=(*ALWAYS_FALSE, "TRUTH_SAME")))
 
 
+@fault("environment variable that decides on a topic")
+def decides_on_topic(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    node = one_of(rng, a, "source")
+    node.setup.append(f"self.unused = {READ}")
+    topic = 'os.environ["TRUTH_TOPIC"]'
+    node.setup.append(f"self.more = self.create_publisher(Float64, {topic}, 10)")
+    b, _ = _another_environment(a, rng)
+    a.environment["TRUTH_TOPIC"] = "/one"
+    b.environment["TRUTH_TOPIC"] = "/other"
+    truth = Truth(
+        ("graph",),
+        node.full_name,
+        first=(rf"{LIKELY}{node.full_name} read TRUTH_TOPIC, /one in a and /other in b",),
+        never=(*ALWAYS_FALSE, "TRUTH_VALUE"),
+        independent=None,
+    )
+    return Planted(a, b, truth)
+
+
+@fault("environment variable that decides on a parameter")
+def decides_on_parameter(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    node = one_of(rng, a, "source")
+    node.setup.append(f'self.more = self.declare_parameter("more", {READ}).value')
+    node.callbacks[0].lines.insert(1, "value = value + self.more")
+    b, value = _another_environment(a, rng)
+    words = rf"{node.full_name} read TRUTH_VALUE, 4 in a and {value} in b, at .*; first effect: "
+    truth = Truth((), node.full_name, first=(words, node.callbacks[0].publishes))
+    return Planted(a, b, truth)
+
+
+@fault("two environment variables that differ")
+def both(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    node = one_of(rng, a, "source")
+    node.setup.append('self.unused = os.environ["TRUTH_UNUSED"]')
+    node.setup.append(f"self.read = {READ}")
+    node.callbacks[0].lines.insert(1, "value = value + self.read")
+    b, value = _another_environment(a, rng)
+    a.environment["TRUTH_UNUSED"] = "here"
+    b.environment["TRUTH_UNUSED"] = "there"
+    truth = _truth(node)
+    return Planted(a, b, replace(truth, first=(rf"TRUTH_VALUE, 4 in a and {value} in b",)))
+
+
 @fault("file that is missing")
 def missing_file(rng: random.Random) -> Planted:
     path = 'pathlib.Path(__file__).with_name("truth.txt")'
-    line = f"len({path}.read_bytes()) if {path}.exists() else 0"
+    line = f"(float(len({path}.read_bytes())) if {path}.exists() else 0.0)"
     a, node = _reads(rng, line, in_constructor=False)
     b = a.copy()
     b.files["truth.txt"] = "1.5\n"

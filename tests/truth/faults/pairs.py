@@ -82,9 +82,10 @@ def ends_earlier(rng: random.Random) -> Planted:
 def delay_later(rng: random.Random) -> Planted:
     a, twin = _two_sources(rng)
     relay = one_of(rng, a, "relay")
+    a.job["delay"] = {"default": 0}
     b = in_hiding(a, twin.name, ["value = value + 1.0"], at=1)
-    at = "200ms"
-    b = changed(b, "delay", {"outages": [{"node": relay.full_name, "from": at, "to": "300ms"}]})
+    outage = {"node": relay.full_name, "from": "200ms", "to": "300ms"}
+    b = changed(b, "delay", {"default": 0, "outages": [outage]})
     topic = twin.callbacks[0].publishes
     truth = truth_of(a.node("twin"), first=(topic,), says=(NOT_DETERMINISTIC,), values=topic)
     never = (*truth.never, r"outage")
