@@ -238,8 +238,15 @@ def test_an_empty_file(text: str) -> None:
 
 
 def test_a_file_too_large_to_be_a_job() -> None:
-    Path("job.yaml").write_bytes(b" " * ((4 << 20) + 1))
-    with pytest.raises(JobError, match="larger than 4 MiB: this is not a job file"):
+    Path("job.yaml").write_bytes(b" " * ((1 << 20) + 1))
+    with pytest.raises(JobError, match="larger than 1 MiB: this is not a job file"):
+        load_job("job.yaml")
+
+
+def test_a_line_too_long_for_a_job() -> None:
+    """A comment of 3 MB kept the parser busy for more than twenty seconds."""
+    Path("job.yaml").write_bytes(b"nodes: []\n#" + b"x" * (256 << 10))
+    with pytest.raises(JobError, match=r"job\.yaml:2: a line of more than 256 KiB: this is not"):
         load_job("job.yaml")
 
 
