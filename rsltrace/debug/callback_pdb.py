@@ -93,6 +93,16 @@ class CallbackPdb(pdb.Pdb):
         self._has_begun = True
         super().user_line(frame)
 
+    def user_return(self, frame: FrameType, return_value: Any) -> None:
+        """Stop where a function returns, once there was a line of the user's."""
+        if self._has_begun:
+            super().user_return(frame, return_value)
+
+    def user_exception(self, frame: FrameType, exc_info: Any) -> None:
+        """Stop where something is raised, once there was a line of the user's."""
+        if self._has_begun:
+            super().user_exception(frame, exc_info)
+
     def interaction(self, *where: Any) -> None:
         """Talk; what is evaluated is nobody's callback."""
         with engage(None):

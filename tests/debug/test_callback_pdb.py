@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import json
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
 
 import pytest
 
@@ -23,8 +26,15 @@ def helper(value: int) -> int:
     return value + 1
 
 
+def default(value: object) -> str:
+    return type(value).__name__
+
+
 def conversation(
-    lines: Sequence[str], message: int, capsys: pytest.CaptureFixture[str]
+    lines: Sequence[str],
+    message: object,
+    capsys: pytest.CaptureFixture[str],
+    called: Callable[..., Any] = callback,
 ) -> tuple[str, list[str], str]:
     """Return what the callback raised, the prompts at which lines were read, what was shown."""
     left, prompts = list(lines), []
@@ -33,7 +43,7 @@ def conversation(
         prompts.append(prompt)
         return left.pop(0) if left else None
 
-    raised = talk(lambda address: call_under_pdb(callback, (message,), address), read)
+    raised = talk(lambda address: call_under_pdb(called, (message,), address), read)
     return raised, prompts, capsys.readouterr().out
 
 
@@ -48,6 +58,14 @@ def test_it_stops_in_the_first_line_and_steps(capsys: pytest.CaptureFixture[str]
     assert begin[2] == "21"
     assert "42" in begin
     assert "-> return value + 1" in begin
+
+
+def test_it_stops_in_the_first_line_of_the_users(capsys: pytest.CaptureFixture[str]) -> None:
+    """As that of a coroutine, which Python's own modules are asked about before it runs."""
+    dumps = partial(json.dumps, default=default)
+    shown = conversation(["p value", "c"], {1, 2}, capsys, dumps)[2].splitlines()
+    assert shown[0].endswith("default()")
+    assert shown[1:3] == ["-> return type(value).__name__", "{1, 2}"]
 
 
 @pytest.mark.parametrize("line", ["q", "exit", "EOF"])
