@@ -14,6 +14,7 @@ import numpy as np
 from rsltrace.loop.stop import Stop, StopCondition, stop_at
 from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import edits_of
+from rsltrace.trace.format import REPLAY_DIVERGED
 
 if TYPE_CHECKING:
     from rsltrace.run.session import RunResult, Session
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from rsltrace.trace.recorder import Recorder
 
 AddEvent = Callable[[bytes, int], None]
-DIVERGED = Stop("the replay stopped at the first event that differs", 1)
+DIVERGED = Stop(REPLAY_DIVERGED, 1)
 _INTERRUPTIONS = {129: "hung up", 130: "interrupted", 143: "terminated"}
 BRANCH_END = "as far as the run that it branches off"
 _BY_DRIVER = "the driver of the simulation"

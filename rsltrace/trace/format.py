@@ -180,3 +180,7 @@ those of the Chunk records in the file (0 and 0: no outputs in this segment)."""
 def begins_a_trace(header: Header) -> bool:
     """Whether a file with nothing whole after this header is a trace: its run was killed then."""
     return header.profile == PROFILE and header.library.split(" ")[0] == LIBRARY
+
+
+REPLAY_DIVERGED = "the replay stopped at the first event that differs"
+"""The stop reason of a replay that was compared with its trace."""

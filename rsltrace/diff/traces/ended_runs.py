@@ -12,6 +12,7 @@ from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION, Root, Verdict
 from rsltrace.diff.traces.sides import stop_reason
 from rsltrace.model.event import Event, EventFlag, EventKind
 from rsltrace.model.printable import printable, shortened
+from rsltrace.trace.format import REPLAY_DIVERGED
 from rsltrace.trace.reader import Trace
 from rsltrace.words.phrases import at_time, seconds_text
 
@@ -87,6 +88,8 @@ def failure_text(a: Trace, b: Trace) -> str:
     if bool(exit_code(a)) == bool(exit_code(b)):
         return ""
     name, trace = ("a", a) if exit_code(a) else ("b", b)
+    if stop_reason(trace) == REPLAY_DIVERGED:
+        return ""
     why = error_text(trace) or stop_reason(trace)
     return f"{name} then failed (exit code {exit_code(trace)}): {why}"
 
