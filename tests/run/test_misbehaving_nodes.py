@@ -340,3 +340,45 @@ def test_a_child_that_a_node_has_forked_ends_when_it_is_told_to(
     done = rsltrace("record", "job.yaml", "-o", "run.mcap")
     assert "ended by -15" in done.stderr, done.stderr
     assert done.returncode == 0, done.stderr
+
+
+_LOCKS_AT_EXIT = """
+import atexit, logging, threading
+
+class Kept:
+    def __init__(self):
+        self.locks = [threading.Lock(), threading.RLock(), threading.Condition()]
+        self.held = threading.RLock()
+        threading.Thread(target=self.hold, daemon=True).start()
+    def hold(self):
+        with self.held:
+            threading.Event().wait()
+    def close(self):
+        for lock in [*self.locks, self.held]:
+            with lock:
+                pass
+        with self.locks[2]:
+            self.locks[2].notify_all()
+    def __del__(self):
+        self.close()
+
+kept = Kept.__new__(Kept)
+
+class Locks(Node):
+    def __init__(self):
+        super().__init__('locks')
+        kept.__init__()
+        logging.getLogger('kept').addHandler(logging.StreamHandler())
+        logging.getLogger('kept').warning('said')
+"""
+
+
+def test_locks_of_a_run_are_free_when_python_ends(
+    rsltrace: Callable[..., Any], job_file: Callable[..., Path]
+) -> None:
+    path = job_file("nodes: [{node: 'nodes_under_test:Locks'}]\nstop: {time: 1s}", _LOCKS_AT_EXIT)
+    done = rsltrace("record", path, stdin=subprocess.DEVNULL)
+    assert done.returncode == 0
+    assert "said" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert "final" not in done.stderr

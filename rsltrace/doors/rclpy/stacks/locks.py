@@ -8,6 +8,7 @@ of a run, and in real threads, real locks are made.
 from __future__ import annotations
 
 import _thread
+import atexit
 import os
 import sys
 import threading
@@ -25,6 +26,21 @@ from rsltrace.errors import UnsupportedError
 
 _NS_PER_S = 1_000_000_000
 _real_rlock = _thread.RLock
+
+
+_LAST: Any = object()
+
+
+def _no_stack() -> Any:
+    """Stand in for ``getcurrent`` while Python ends: greenlet is over by then, but objects of nodes
+    may still lock something when they go (``__del__``, handlers of ``logging``)."""
+    return _LAST
+
+
+@atexit.register
+def _forget_stacks() -> None:
+    global getcurrent
+    getcurrent = _no_stack
 
 
 class SimLock:
@@ -56,6 +72,8 @@ class SimLock:
 
     def _wait(self, timeout: float) -> bool:
         stacks = simulated_stacks()
+        if stacks is None and getcurrent is _no_stack:
+            return True  # nobody else is left who could have it
         if stacks is None:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
