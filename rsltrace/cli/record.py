@@ -23,6 +23,7 @@ from rsltrace.model.finding import READ_BY, Source
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
+from rsltrace.words.silent_topics import silent_topics
 
 if TYPE_CHECKING:
     from rsltrace.job import Job
@@ -191,7 +192,6 @@ def _silent_topics(result: RunResult) -> list[str]:
     if result.path is None or result.error is not None or not result.path.is_file():
         return []
     from rsltrace.trace.reader import Trace
-    from rsltrace.words.silent_topics import silent_topics
 
     try:
         with Trace.open(result.path) as trace:
