@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
+from mcap.writer import CompressionType, Writer
 from rsltrace_viewer.model.plots.data import difference
 from rsltrace_viewer.model.plots.series import Series
 from rsltrace_viewer.model.recordings.pairs import Pairs
@@ -22,6 +23,7 @@ from rsltrace_viewer.terminal.screens.help import KeysScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen
 from rsltrace_viewer.terminal.screens.report import ReportScreen
 from rsltrace_viewer.terminal.screenshot import settle, text_of
+from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
 
@@ -169,6 +171,30 @@ def test_recordings_that_cannot_be_opened(tmp_path: Path, bags: tuple[Path, Path
         assert done.exit_code == 2
         assert words in done.output
         assert "Traceback" not in done.output
+
+
+def test_a_damaged_bag_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
+    path = tmp_path / "damaged.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=8192, compression=CompressionType.NONE)
+        writer.start(profile="ros2")
+        schema = writer.register_schema("std_msgs/msg/UInt64", "ros2msg", b"uint64 data\n")
+        channel = writer.register_channel("/count", "cdr", schema)
+        for stamp in range(3000):
+            writer.add_message(channel, stamp * 10**6, uint64_message(stamp), stamp * 10**6)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    place = len(data) // 2
+    data[place : place + 12_000] = b"\x55" * 12_000
+    path.write_bytes(data)
+
+    async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
+        assert not app.busy
+        assert 1000 < app.session.recordings[0].count < 2000
+        assert "damaged.mcap" in app.session.damage
+        assert "message 2" in await press("enter", "down", "down")
+
+    drive((path,), steps)
 
 
 def test_the_difference_of_two_curves() -> None:

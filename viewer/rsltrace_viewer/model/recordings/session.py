@@ -37,6 +37,7 @@ class RecordingSession:
         self.row = 0
         self.openness = Openness()
         self.diff: BagDiff | None = None
+        self.damage = ""
         self._pairs: dict[tuple[Key, int], Pairs] = {}
 
     @property
@@ -45,18 +46,21 @@ class RecordingSession:
         return len(self.recordings) > 1
 
     def read(self) -> Iterator[int]:
-        """Read the recordings, and compare them. Raises BagError, TraceError."""
-        for recording in self.recordings:
-            yield from recording.read()
-        if self.two:
-            a, b = self.recordings
-            self.diff = diff_bags(a.path, b.path)
-            yield a.count + b.count
+        """Read the recordings, and compare them. Damage ends it, and ``damage`` says where."""
+        try:
+            for recording in self.recordings:
+                yield from recording.read()
+            if self.two:
+                a, b = self.recordings
+                self.diff = diff_bags(a.path, b.path)
+        except RsltraceError as error:
+            self.damage = printable(str(error))
+        yield sum(recording.count for recording in self.recordings)
 
     @property
     def done(self) -> bool:
-        """Whether all is read."""
-        return all(recording.done for recording in self.recordings)
+        """Whether all is read, or cannot be."""
+        return bool(self.damage) or all(recording.done for recording in self.recordings)
 
     def topics(self, key: Key) -> list[Topic | None]:
         """Return a topic in each recording."""
@@ -197,6 +201,8 @@ class RecordingSession:
 
     def verdict(self) -> tuple[str, bool]:
         """Return how two recordings compare, and whether they differ."""
+        if self.damage:
+            return self.damage, True
         if not self.two:
             notes = [note for recording in self.recordings for note in recording.notes]
             return (notes[0] if notes else ""), bool(notes)
