@@ -10,7 +10,8 @@ _TEXT = """# rclpy's own tests on rsltrace
 
 Made by `python tests/rclpy_suite --rclpy PATH --baseline LIST --document VERSION`, which runs
 rclpy's test suite on rsltrace's middleware, from a checkout of rclpy (none of its code is kept
-here). Each test module is the `main:` of a job; wherever a test spins, sleeps, waits or starts a
+here). Each test module is the `main:` of a job with
+`clocks: {{source: topic, advances: true}}`; wherever a test spins, sleeps, waits or starts a
 thread, simulated time passes. `make rclpy-tests RCLPY=PATH` does it without the document.
 
 | rclpy {version} | tests |
