@@ -96,7 +96,7 @@ def test_a_changed_output(tmp_path: Path) -> None:
     assert [(r.topic, r.after_ns) for r in first.reaches] == [("/l", 0), ("/s", 0)]
     # The job is not here: only what reads the trace is offered.
     assert first.next_step.startswith("rsltrace cat ")
-    assert "--from 0.200000000 --to 0.200000000" in first.next_step
+    assert "--from 0.2 --to 0.2" in first.next_step
 
 
 def test_counts_per_entity(tmp_path: Path) -> None:

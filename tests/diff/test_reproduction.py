@@ -59,7 +59,7 @@ def test_the_next_step_is_not_fooled_by_its_own_until(
 ) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
     report = rsltrace_command("diff", "a.mcap", "b.mcap").stdout.splitlines()[-1]
-    assert "--until 2.100000000 -o again.mcap" in report
+    assert "--until 2.1 -o again.mcap" in report
     assert report.endswith("rsltrace diff a.mcap b.mcap --again again.mcap")
     again = str(tmp_path / "again.mcap")
     made = rsltrace_command("record", "job.yaml", "--until", until, "-o", again, hash_seed=seed)
