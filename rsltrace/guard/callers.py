@@ -24,8 +24,11 @@ _DOOR = os.path.join(_HERE, "doors", "rclpy")
 _CALLS_BACK = os.path.join(_HERE, "middleware", "events", "dispatcher.py")
 """The one of our files that calls callbacks; rclpy's own do, too."""
 _THREADS = os.path.join(_DOOR, "stacks", "threads.py")
-_STANDS_IN = os.path.join(_DOOR, "stacks", "asyncio_loops.py")
-"""A part of asyncio, as far as it matters who called whom."""
+_STANDS_IN = (
+    os.path.join(_DOOR, "stacks", "asyncio_loops.py"),
+    os.path.join(_DOOR, "terminals", "calls.py"),
+)
+"""Parts of asyncio, os and select, as far as it matters who called whom."""
 _kinds: dict[str, int] = {}
 
 
@@ -34,7 +37,7 @@ def _kind_of(file: str) -> int:
     if kind is None:
         if file.startswith("<frozen importlib"):
             kind = _IMPORT
-        elif file.startswith(_GUARD) or file == _STANDS_IN:
+        elif file.startswith(_GUARD) or file in _STANDS_IN:
             kind = _STANDARD  # a redirected function: its caller counts
         elif file.startswith(_HERE) or any(
             f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
