@@ -110,9 +110,10 @@ def test_every_callback_has_its_place_and_a_diff_points_to_it(
     assert found["/numbers"] in CliRunner().invoke(cli, ["cat", "--code", "a.mcap"]).output
 
     report = CliRunner().invoke(cli, ["diff", "a.mcap", "b.mcap", "--all"])
-    assert f"({found['/odd']})" in report.output, report.output
+    assert f"({found['/numbers']})" in report.output, report.output
     notes = CliRunner().invoke(cli, ["diff", "a.mcap", "b.mcap", "--format", "github"]).output
-    assert f"::error file=nodes_under_test.py,line={line_of(code, 'constructor')}," in notes
+    line = found["/numbers"].rpartition(":")[2]
+    assert f"::error file=nodes_under_test.py,line={line}," in notes
     Path("nodes_under_test.py").unlink()
     notes = CliRunner().invoke(cli, ["diff", "a.mcap", "b.mcap", "--format", "github"]).output
     assert "::error file=a.mcap," in notes

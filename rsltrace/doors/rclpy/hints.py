@@ -15,6 +15,7 @@ from types import TracebackType
 
 from rsltrace.doors.rclpy.unmade_node import constructor_of, is_unmade
 from rsltrace.guard.virtual import set_order
+from rsltrace.middleware.events.failure import text_of
 
 _WHEELS = frozenset(
     """
@@ -106,7 +107,7 @@ def hint_for(error: BaseException) -> str:
 
 def _is_of_order(error: BaseException) -> bool:
     """Whether an error names a call with which the guard puts sets in order, or is raised by it."""
-    if "__rsltrace_" in str(error):
+    if "__rsltrace_" in text_of(error):
         return True
     traceback, last = error.__traceback__, None
     while traceback is not None:
