@@ -120,6 +120,7 @@ def fusion(folder: Path, module: str, node: str) -> Campaign:
     return Campaign(job, folder / "job/fusion_demo" / module, [node], root=True)
 
 
+@pytest.mark.long
 def test_of_a_pipeline(tmp_path: Path) -> None:
     (tmp_path / "nodes_of_replay.py").write_text(NODES)
     (tmp_path / "job.yaml").write_text(JOB.replace("3s", "1s"))
