@@ -19,7 +19,7 @@ from rsltrace import Job, NodeSpec, Simulation, StopSpec
 
 pytestmark = pytest.mark.ros
 
-SIZES = (50, 150, 350)
+SIZES = (30, 90, 210)
 """The second step is twice as large as the first."""
 
 

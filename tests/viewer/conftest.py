@@ -32,6 +32,7 @@ if "trace_maker" not in sys.modules:
 
 screenshot._SETTLE_S = 600.0  # settling ends with the work; on a loaded machine that takes its time
 shell._VALUES_S = 0.0  # nobody is kept waiting by what a key shows a moment later
+screenshot._PAUSE_S = 0.01
 
 shell._VALUES_S = 0.001  # a test stops at every event
 

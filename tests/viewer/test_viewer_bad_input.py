@@ -54,7 +54,7 @@ def test_one_event(tmp_path: Path, drive: Drive) -> None:
         )
         await viewer.press(*EVERY_KEY)
         assert viewer.place == 0
-        await viewer.press(*["plus"] * 50)
+        await viewer.press(*["plus"] * 20)
         assert viewer.app.session.lane_window.window.order
 
     drive(path, steps)
