@@ -45,7 +45,7 @@ class Terminal:
         self._stacks = stacks
         self._typed = deque(typed)
         self._start_ns = start_ns
-        self._keyboard, self.fd = _openpty()
+        self._keyboard, self.fd = map(_above_standard, _openpty())
         os.set_blocking(self._keyboard, False)
         fcntl.ioctl(self.fd, termios.TIOCSWINSZ, struct.pack("HHHH", *_SIZE, 0, 0))
         self.has_screen = False
@@ -146,6 +146,15 @@ class Terminal:
             self.offer()
         found: bytes = _read(self.fd, size)
         return found
+
+
+def _above_standard(fd: int) -> int:
+    """Return a descriptor that is no standard stream: where rsltrace has none, it would be."""
+    if fd > 2:
+        return fd
+    moved: int = fcntl.fcntl(fd, fcntl.F_DUPFD_CLOEXEC, 3)
+    _close(fd)
+    return moved
 
 
 class _Input(io.RawIOBase):
