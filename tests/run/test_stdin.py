@@ -247,6 +247,20 @@ def test_what_is_typed_reaches_its_main_at_its_time(recorded: Any) -> None:
     assert rsltrace.replay(result.path, node="keyboard", trust=True).same
 
 
+def test_without_a_standard_input_of_its_own(recorded: Any, tmp_path: Path) -> None:
+    result = recorded(entry("keyboard"))
+    done = subprocess.run(
+        ["bash", "-c", 'exec "$0" -m rsltrace record job.yaml -o closed.mcap <&-', sys.executable],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert f"digest {result.digest}" in done.stdout
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("name", list(TYPED))
 def test_programs_read_as_they_do_natively(name: str, recorded: Any, tmp_path: Path) -> None:
