@@ -122,13 +122,19 @@ def test_nobody_answers_a_goal(folder: Path) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(
-    "edit", ["message.transition.id = 99", "drop()", "delay('5ms')", "defer()"]
-)
+@pytest.mark.parametrize("edit", ["message.transition.id = 99", "drop()"])
 def test_a_transition_of_a_lifecycle(edit: str, folder: Path) -> None:
     at = event(folder / "run.mcap", EventKind.SERVICE, SERVER, "/camera/change_state")
     result = branch(folder, f"{at}: {edit}")
     assert result.verified == at
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("edit", ["delay('5ms')", "defer()"])
+def test_what_the_executor_of_a_main_runs_cannot_be_late(edit: str, folder: Path) -> None:
+    at = event(folder / "run.mcap", EventKind.SERVICE, SERVER, "/camera/change_state")
+    with pytest.raises(EditError, match="an executor of its program runs it"):
+        branch(folder, f"{at}: {edit}")
 
 
 @pytest.mark.parametrize(
