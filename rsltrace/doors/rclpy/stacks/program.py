@@ -58,8 +58,8 @@ class Programs:
         self.listeners: list[Callable[[str, str], None]] = []
         self.stdin_of: Callable[[Program], Any] = lambda program: sys.stdin
         """Returns the ``sys.stdin`` that a program begins with."""
-        self.on_enter: Callable[[Program], None] = lambda program: None
-        """Told which program's code is going to run."""
+        self.on_enter: Callable[[Program], None] | None = None
+        """Told which program's code is going to run, if somebody has to know."""
 
     def tell(self, what: str, key: str) -> None:
         """Say in the event under way that an entry has "started" or "ended"."""
@@ -120,7 +120,8 @@ class Program:
             self._kept[:4] = self._first_values()
         for (names, name, _), value in zip(places, self._kept, strict=True):
             names[name] = value
-        self._programs.on_enter(self)
+        if self._programs.on_enter is not None:
+            self._programs.on_enter(self)
 
     def _first_values(self) -> tuple[object, ...]:
         """Return what a process begins with: arguments, ``__main__``, where it imports, stdin."""

@@ -37,7 +37,6 @@ class Terminals:
         self._at: dict[int, Terminal | None] = {}
         self._all: dict[Program, Terminal] = {}
         stacks.programs.stdin_of = self.stdin_of
-        stacks.programs.on_enter = self._enter
 
     @property
     def present(self) -> Terminal | None:
@@ -50,6 +49,7 @@ class Terminals:
             assert program.entry is not None
             if program.entry.stdin is not None:
                 self._all[program] = Terminal(self._stacks, program.entry.stdin, start_ns)
+                self._stacks.programs.on_enter = self._enter
 
     def stdin_of(self, program: Program) -> Any:
         """Return the ``sys.stdin`` of a main."""
