@@ -8,7 +8,7 @@ heap; it exists to compare runs with RSLCPP, and is part of no other promise.
 from __future__ import annotations
 
 from heapq import heapify, heappop, heappush, heapreplace
-from typing import Protocol
+from typing import Any, Protocol
 
 from rsltrace.loop.timer import TimerState
 
@@ -60,6 +60,9 @@ class CreationOrderQueue:
         self.next_ns = NEVER_NS
 
     def add(self, timer: TimerState) -> None:
+        before: Any = timer.ticket
+        if before is not None and before[0] == timer.deadline_ns:
+            return  # it is in its place
         entry = (timer.deadline_ns, timer.order, timer)
         timer.ticket = entry
         heap = self._heap

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rsltrace.doors.rclpy.executors.standby import Standby, standby_of
 from rsltrace.doors.rclpy.handles.waitables import activate_node
 from rsltrace.doors.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
 from rsltrace.doors.rclpy.stacks.callback_groups import begin, is_busy, is_custom
@@ -36,7 +37,11 @@ class Pump:
         self.nodes: dict[Any, Mailbox] = {}
         self.tasks = Mailbox(stacks.loop)
         self.tasks.pump = self
-        self._waits: list[Wait] = []
+        self.waits: list[Wait] = []
+        self.standby: Standby | None = None
+        """The stack that spins, while it can be given what is ready."""
+        self.woken = False
+        """Whether there has been a reason to look again."""
         self._looked_ns = -1
 
     def add(self, node: Any) -> None:
@@ -67,7 +72,11 @@ class Pump:
 
     def wake(self) -> None:
         """Let who waits look again: something has come, or changed."""
-        waits, self._waits = self._waits, []
+        self.woken = True
+        standby, self.standby = self.standby, None
+        if standby is not None:
+            standby.blocked.release()
+        waits, self.waits = self.waits, []
         for blocked in waits:
             blocked.release()
 
@@ -105,7 +114,10 @@ class Pump:
                     if _is_always(condition)
                     else _Awaited(self.stacks.domain.graph, condition)
                 )
-                self._wait(None, what=what, patient=patient)
+                standby = standby_of(self.stacks, self, nodes, condition)
+                self._wait(None, what=what, patient=patient, standby=standby)
+                if standby is not None and standby.is_over:
+                    return self._rclpy.Task(_go_on, (standby.failure,)), None, None
             elif loop.now_ns < until_ns:
                 self._wait(until_ns - loop.now_ns, what=_WORK)
             elif timeout_ns or looked:
@@ -120,11 +132,22 @@ class Pump:
         again, self._looked_ns = self._looked_ns == now_ns, now_ns
         return POLL_NS if again else 0
 
-    def _wait(self, for_ns: int | None, *, what: object, patient: bool = False) -> None:
-        wait(
-            self.stacks, what, until=self._waits.append, for_ns=for_ns, quiet=True, patient=patient
-        )
-        self._waits = [blocked for blocked in self._waits if blocked in self.stacks.runners.blocked]
+    def _wait(
+        self,
+        for_ns: int | None,
+        *,
+        what: object,
+        patient: bool = False,
+        standby: Standby | None = None,
+    ) -> None:
+        self.woken = True
+        until = self.waits.append if standby is None else standby.begin
+        serve = None if standby is None else standby.serve
+        stacks = self.stacks
+        wait(stacks, what, until=until, for_ns=for_ns, quiet=True, patient=patient, serve=serve)
+        if standby is not None and self.standby is standby:
+            self.standby = None
+        self.waits = [blocked for blocked in self.waits if blocked in self.stacks.runners.blocked]
 
     def _take(self, nodes: list[Any] | None) -> tuple[Any, Mailbox, Dispatchable] | None:
         """Take out what is next: tasks first, as in rclpy, then in the order of arrival."""
@@ -187,6 +210,12 @@ class Pump:
         finally:
             if held:
                 self.stacks.groups.end(group, wrapper)
+
+
+def _go_on(failure: BaseException | None) -> None:
+    """Be the last thing that ran, for the spin that goes on."""
+    if failure is not None:
+        raise failure
 
 
 class _Awaited:

@@ -44,8 +44,7 @@ class TimerHandle(EntityHandle, Timer):
         state = self.state
         mailbox = self.node.mailbox
         if mailbox is not None:
-            if mailbox.keeps(self):
-                loop.timers.remove(state)
+            if mailbox.keeps(self, self._leave):
                 return
             if wrapper is None or state.canceled or state.deadline_ns > loop.now_ns:
                 return
@@ -75,6 +74,9 @@ class TimerHandle(EntityHandle, Timer):
             dispatcher.execute(
                 self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
             )
+
+    def _leave(self) -> None:
+        self.dispatcher.loop.timers.remove(self.state)
 
     def _timer_info(self) -> Any:
         from rclpy.timer import TimerInfo

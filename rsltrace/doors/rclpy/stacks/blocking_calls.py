@@ -44,12 +44,14 @@ def wait(
     for_ns: int | None = None,
     quiet: bool = False,
     patient: Patience = False,
+    serve: Callable[..., bool] | None = None,
 ) -> bool:
     """Block the present callback in simulated time; return whether it was woken (not timed out).
 
     ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
     wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
-    something comes of it. A ``patient`` one may last for ever.
+    something comes of it. A ``patient`` one may last for ever. ``serve`` runs on this stack what is
+    given to it meanwhile; where it returns False the wait is over.
 
     :raises RunEnded: when the run ends before the wait does.
     :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
@@ -69,7 +71,16 @@ def wait(
     running = _get_running_loop()
     if running is not None:  # asyncio keeps one per thread, here each stack has its own
         _set_running_loop(None)
-    stacks.runners.next().switch()
+    runners = stacks.runners
+    given = runners.next().switch()
+    while given and serve is not None:
+        del runners.blocked[blocked]
+        if not serve(*given):
+            blocked.stop_waiting()
+            blocked.resumed()
+            return True
+        runners.blocked[blocked] = None
+        given = runners.next().switch()
     if running is not None:
         _set_running_loop(running)
     stacks.runners.blocked.pop(blocked, None)

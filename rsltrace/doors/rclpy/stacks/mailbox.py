@@ -8,15 +8,27 @@ hands what is ready over to the node's mailbox, and the executor takes it from t
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from rsltrace.loop.loop import Dispatchable, EventLoop
+
+
+class Runs(Protocol):
+    """A stack that spins."""
+
+    def runs(self, mailbox: Mailbox, item: Dispatchable) -> bool:
+        """Run what is ready at once, if that is possible."""
 
 
 class Spinner(Protocol):
     """The executor that empties a mailbox while it spins."""
 
     executor: Any
+
+    @property
+    def standby(self) -> Runs | None:
+        """The stack that spins, if it can be given what is ready."""
 
     def wake(self) -> None:
         """Look again: something has come."""
@@ -36,15 +48,21 @@ class Mailbox:
         """What has come out of the callback that the executor runs, which raises it."""
         self._admitted: Dispatchable | None = None
 
-    def keeps(self, item: Dispatchable) -> bool:
-        """Keep what the loop dispatches; False if the executor has taken it out and runs it."""
+    def keeps(self, item: Dispatchable, leave: Callable[[], None] | None = None) -> bool:
+        """Keep what the loop dispatches, or have the executor run it at once; False if that has
+        taken it out and runs it now. ``leave`` is called if it is kept."""
         if self._admitted is item:
             self._admitted = None
             return False
+        pump = self.pump
+        if pump is not None and pump.standby is not None and pump.standby.runs(self, item):
+            return True
+        if leave is not None:
+            leave()
         if not self.closed:
             self.entries.append((self._next_place(), item))
-            if self.pump is not None:
-                self.pump.wake()
+            if pump is not None:
+                pump.wake()
         return True
 
     def run(self, item: Dispatchable) -> None:

@@ -106,29 +106,46 @@ class Program:
         """Whether an executor of this program has looked for work."""
         self.ended = False
         self.exit_code = 0
-        self._kept: list[object] | None = None
+        self._kept: tuple[Any, ...] | None = None
 
     # -- what a process has of its own -----------------------------------------------------------
 
     def enter(self) -> None:
         """Make this the program that runs: whoever ran before puts its things away."""
-        before, self._programs.present = self._programs.present, self
-        places = _places()
-        before._kept = [names[name] for names, name, _ in places]
-        if self._kept is None:
-            self._kept = [first for _, _, first in places]
-            self._kept[:4] = self._first_values()
-        for (names, name, _), value in zip(places, self._kept, strict=True):
-            names[name] = value
-        if self._programs.on_enter is not None:
-            self._programs.on_enter(self)
+        programs = self._programs
+        before, programs.present = programs.present, self
+        kept = self._kept
+        if kept is None:
+            kept = self._first_values()
+        system, modules, rclpy, utilities, context = _places()
+        # Every callback of a main comes by here twice, so there is no loop.
+        before._kept = (
+            system["argv"],
+            system["path"],
+            system["stdin"],
+            modules["__main__"],
+            rclpy["__executor"],
+            utilities["g_default_context"],
+            context["g_logging_ref_count"],
+        )
+        (
+            system["argv"],
+            system["path"],
+            system["stdin"],
+            modules["__main__"],
+            rclpy["__executor"],
+            utilities["g_default_context"],
+            context["g_logging_ref_count"],
+        ) = kept
+        if programs.on_enter is not None:
+            programs.on_enter(self)
 
-    def _first_values(self) -> tuple[object, ...]:
-        """Return what a process begins with: arguments, ``__main__``, where it imports, stdin."""
+    def _first_values(self) -> tuple[Any, ...]:
+        """Return what a process begins with."""
         argv = None if self.entry is None else self.entry.argv
         main = ModuleType("__main__")
         vars(main).update(__builtins__=builtins, __annotations__={})
-        return argv, main, list(sys.path), self._programs.stdin_of(self)
+        return argv, list(sys.path), self._programs.stdin_of(self), main, None, None, 0
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -153,18 +170,11 @@ class Program:
 
 
 @lru_cache(maxsize=1)
-def _places() -> list[tuple[dict[str, Any], str, object]]:
-    """Return where process-wide values are kept, and their first values (None: a program's own)."""
+def _places() -> tuple[dict[str, Any], ...]:
+    """Return where process-wide values are kept."""
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
-    return [
-        (vars(sys), "argv", None),
-        (sys.modules, "__main__", None),
-        (vars(sys), "path", None),
-        (vars(sys), "stdin", None),
-        (vars(rclpy), "__executor", None),
-        (vars(rclpy.utilities), "g_default_context", None),
-        (vars(rclpy.context), "g_logging_ref_count", 0),
-    ]
+    modules: dict[str, Any] = sys.modules
+    return vars(sys), modules, vars(rclpy), vars(rclpy.utilities), vars(rclpy.context)

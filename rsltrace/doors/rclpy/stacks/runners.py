@@ -106,7 +106,8 @@ class Wait:
         self.timed_out = False
         self._woken = False
         self._event = (event.handle, event.entity, event.node)
-        self._constructing = programs.constructing
+        self.constructing = programs.constructing
+        """The entry under construction where it waits."""
         self._end_group = event.on_end
         self._cause = (NO_EVENT, 0)
         self._input_hash = 0
@@ -176,7 +177,7 @@ class Wait:
         event.kind = _RESUME
         event.cause_event, event.cause_output = self._cause
         event.input_hash = self._input_hash
-        programs.constructing = self._constructing
+        programs.constructing = self.constructing
         event.on_end = self._end_group
         event.quiet = self.quiet
         event.busy_ns = self._busy_ns
@@ -184,6 +185,19 @@ class Wait:
             self.program.enter()
         if dispatcher.on_resume is not None:
             dispatcher.on_resume()
+
+    def stay(self) -> None:
+        """Go on to wait: something else has run on the stack meanwhile, as events of its own."""
+        dispatcher = self._runners.domain.dispatcher
+        event = dispatcher.event
+        event.handle, event.entity, event.node = self._event
+        if dispatcher.on_node is not None:
+            dispatcher.on_node(event.node)
+        self._runners.programs.leave()
+
+    def follow(self, event: int) -> None:
+        """Go on after ``event``, which has run on the stack meanwhile."""
+        self._cause = (event, 0)
 
     def runnable(self) -> Runnable:
         """Describe it to a policy: a callback under way goes on, and has its worker."""
