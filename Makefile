@@ -104,6 +104,7 @@ samples: $(INSTALLED)
 
 bench: $(INSTALLED)
 	$(BIN)/python benchmarks/throughput.py
+	$(BIN)/python benchmarks/usual.py
 
 # The pictures of the documentation, drawn from the sample traces without a screen. That of Rerun
 # needs a graphics driver; one in software will do (Debian: mesa-vulkan-drivers).

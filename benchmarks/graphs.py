@@ -168,8 +168,16 @@ GRAPHS = {
 EXECUTORS = ("single_threaded", "multi_threaded", "events_executor")
 
 
-def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, Any]:
+def run_native(
+    graph: Graph,
+    executor_name: str,
+    seconds: float,
+    *,
+    count: Callable[[Any], int] = lambda node: int(node.callbacks),
+) -> dict[str, Any]:
     """Spin ``graph`` over DDS and count its callbacks for ``seconds`` of wall time.
+
+    ``count`` says what to count of a node instead.
 
     Returns ``{"callbacks": n, "wall_s": s, "cpu_s": s}``, CPU time being that of all threads.
     Raises RuntimeError if the graph does not come alive.
@@ -198,8 +206,8 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
     enough: Any = rclpy.Future()
     left = threading.Event()
 
-    def count() -> int:
-        return sum(node.callbacks for node in nodes)
+    def counted() -> int:
+        return sum(map(count, nodes))
 
     def measure() -> None:
         # Sampling from a thread that sleeps leaves the executor alone.
@@ -207,9 +215,9 @@ def run_native(graph: Graph, executor_name: str, seconds: float) -> dict[str, An
         while not all(node.callbacks for node in nodes) and perf_counter() < given_up:
             sleep(0.05)
         sleep(WARM_UP_S)
-        first, start, cpu_start = count(), perf_counter(), process_time()
+        first, start, cpu_start = counted(), perf_counter(), process_time()
         sleep(seconds)
-        measured["callbacks"], measured["wall_s"] = count() - first, perf_counter() - start
+        measured["callbacks"], measured["wall_s"] = counted() - first, perf_counter() - start
         measured["cpu_s"] = process_time() - cpu_start
         measured["idle"] = [node.get_name() for node in nodes if not node.callbacks]
         enough.set_result(None)

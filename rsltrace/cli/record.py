@@ -93,7 +93,6 @@ def record(
     The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
     130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
-    from rsltrace.bag.export import check_bag_folder, export_bag
     from rsltrace.run import Observer, run
 
     changes = _all_overrides(overrides, seed, until)
@@ -108,6 +107,8 @@ def record(
         return
     path = output or default_output(named)
     if bag is not None:
+        from rsltrace.bag.export import check_bag_folder, export_bag
+
         check_bag_folder(bag, force=force)
     told: list[str] = []
 

@@ -86,6 +86,17 @@ def quiet_gc() -> Iterator[None]:
             gc.enable()
 
 
+@contextmanager
+def frozen_heap() -> Iterator[None]:
+    """Keep what there was before the run out of all garbage collection in it: it takes longer to
+    look at than what the run makes."""
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
 def keep_heap() -> None:
     """Have the C library keep the memory that is freed for what comes next.
 

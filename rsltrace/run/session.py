@@ -46,7 +46,14 @@ from rsltrace.run.plans.recorded_order import keep_choices, note_choices, record
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
-from rsltrace.run.process import Observer, housekeeping, keep_heap, quiet_gc, search_path
+from rsltrace.run.process import (
+    Observer,
+    frozen_heap,
+    housekeeping,
+    keep_heap,
+    quiet_gc,
+    search_path,
+)
 from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
 from rsltrace.run.unused_rules import (
     has_rules,
@@ -202,6 +209,7 @@ class Session:
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))
         self._guarded = install_guard(stack, self.job)
+        stack.enter_context(frozen_heap())  # the guard has looked at what there is
         self._make_world(stack, World)
         self._guarded.begin(self.world, self._replay)
         with self._guarded.engaged():

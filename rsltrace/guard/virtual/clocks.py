@@ -270,9 +270,10 @@ def _exchange(
 def _bound_before(*names: str) -> dict[str, list[BuiltinFunctionType]]:
     """Return the bound class methods that somebody keeps (``now = datetime.now``), by name."""
     found: dict[str, list[BuiltinFunctionType]] = {name: [] for name in names}
-    for thing in gc.get_objects():
+    owners = [datetime]
+    for owner in owners:
+        owners += type.__subclasses__(owner)
+    for thing in gc.get_referrers(*owners):
         if type(thing) is BuiltinFunctionType and thing.__name__ in found:
-            owner = thing.__self__
-            if isinstance(owner, type) and issubclass(owner, datetime):
-                found[thing.__name__].append(thing)
+            found[thing.__name__].append(thing)
     return found

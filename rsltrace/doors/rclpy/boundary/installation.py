@@ -6,9 +6,10 @@ The reference ``_rclpy`` is exchanged in every loaded rclpy module and in
 
 from __future__ import annotations
 
+import importlib
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -73,11 +74,21 @@ def boundary() -> Boundary:
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
                 f"({error})"
             ) from error
+        _load_type_support()
         real = singleton.rclpy_implementation
         ours = Boundary(real)
         check_release(real, ours, _HANDLES, Path(singleton.__file__).parents[1])
         _installed = ours
     return _installed
+
+
+def _load_type_support() -> None:
+    """Load what messages load when their type is first used.
+
+    It drags a template engine in, which in a run would be compiled as if it were a node's library.
+    """
+    with suppress(ImportError):
+        importlib.import_module("rosidl_generator_py")
 
 
 def check_free() -> None:
