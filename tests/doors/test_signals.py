@@ -125,3 +125,57 @@ def test_mistakes_are_those_that_python_reports(simulate: Any) -> None:
         "signal number out of range",
         "signal only works in main thread of the main interpreter",
     ]
+
+
+def sends_itself(number: int, seen: list[Any], *, thread: bool = False) -> NodeSpec:
+    def send() -> None:
+        os.kill(os.getpid(), number)
+        seen.append("went on")
+
+    def main() -> None:
+        rclpy.init()
+        node = Node("node")
+        node.create_timer(0.5, threading.Thread(target=send).start if thread else send)
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt as error:
+            seen.append(type(error))
+        seen.append(rclpy.ok())
+        if number == signal.SIGINT and not thread:
+            raise KeyboardInterrupt
+
+    return NodeSpec(main=main)
+
+
+class Other(Node):
+    def __init__(self) -> None:
+        super().__init__("other")
+        self.create_timer(1.0, lambda: None)
+
+
+@pytest.mark.parametrize("thread", [False, True], ids=["callback", "thread"])
+def test_ctrl_c_from_a_main_for_itself_interrupts_that_main(simulate: Any, thread: bool) -> None:
+    """As key_teleop ends: SIGINT to its own process, with nobody's handler but Python's."""
+    seen: list[Any] = []
+    recorded = simulate(sends_itself(signal.SIGINT, seen, thread=thread), Other, duration=3)
+    assert seen == [*(["went on"] if thread else []), KeyboardInterrupt, False]
+    assert recorded.result.end_ns == 3_000_000_000  # the run goes on without it
+    assert recorded.result.exit_code == (0 if thread else 130)
+    assert any("exited with 130 at 0.5" in note for note in recorded.result.notes) is not thread
+
+
+def test_sigterm_from_a_main_for_itself_shuts_rclpy_down(simulate: Any) -> None:
+    seen: list[Any] = []
+    recorded = simulate(sends_itself(signal.SIGTERM, seen), Other, duration=3)
+    assert seen == ["went on", False]  # spin returns: the context is no longer valid
+    assert recorded.result.end_ns == 3_000_000_000
+    assert recorded.result.exit_code == 0
+
+
+def test_sigterm_ends_a_main_without_rclpy(simulate: Any) -> None:
+    def main() -> None:
+        signal.raise_signal(signal.SIGTERM)
+        raise AssertionError("it is dead")
+
+    recorded = simulate(NodeSpec(main=main), Other, duration=1)
+    assert recorded.result.exit_code == 128 + signal.SIGTERM

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import re
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -54,6 +57,11 @@ class Entry:
     """What is typed at its terminal, None if it has none."""
 
 
+_PART = "[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*"
+_FITS_A_RULE = re.compile(rf"{_PART}([./]{_PART})*").fullmatch
+"""Whether a parameter's name is one that rcl's grammar of ``-p name:=value`` knows."""
+
+
 def ros_arguments(
     *,
     name: str | None,
@@ -83,13 +91,36 @@ def ros_arguments(
     for path in parameter_files:
         arguments += ["--params-file", str(path)]
     own: list[str] = []
+    odd: dict[str, str] = {}
     for key, value in parameters.items():
-        own += ["-p", f"{key}:={_yaml_value(value, where)}"]
+        text = _yaml_value(value, where)
+        if _FITS_A_RULE(key):
+            own += ["-p", f"{key}:={text}"]
+        else:
+            odd[key] = text
     try:
-        lists = (arguments, own, for_all) if for_all else (arguments, own)
-        return [RosArguments(["--ros-args", *part]) for part in lists]
+        with _parameter_file(odd, where) as file:
+            own += file
+            lists = (arguments, own, for_all) if for_all else (arguments, own)
+            return [RosArguments(["--ros-args", *part]) for part in lists]
     except InvalidArgumentsError as error:
         raise JobError(str(error), where=where) from error
+
+
+@contextmanager
+def _parameter_file(parameters: dict[str, str], where: str) -> Iterator[list[str]]:
+    """Yield the words for parameters that ``-p`` has no way to name, as ``ros2 launch`` gives all.
+
+    rcl reads the file at once.
+    """
+    if not parameters:
+        yield []
+        return
+    lines = [f"    {_yaml_value(key, where)}: {text}" for key, text in parameters.items()]
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
+        file.write("\n".join(("/**:", "  ros__parameters:", *lines, "")))
+        file.flush()
+        yield ["--params-file", file.name]
 
 
 def _yaml_value(value: Any, where: str) -> str:

@@ -25,6 +25,8 @@ from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.stamp import format_seconds
 
 _EVERY_MAIN_ENDED = "every main has ended"
+_INTERRUPTED = 130
+"""What a shell shows of a process that SIGINT, and so ``KeyboardInterrupt``, has ended."""
 
 
 def begin_program(stacks: Stacks, program: Program, cause: tuple[int, int] = (NO_EVENT, 0)) -> None:
@@ -143,11 +145,12 @@ def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> boo
         return False
     notes = stacks.domain.outcome.notes
     over = stacks.ending.closing or stacks.ending.unwinding
-    if isinstance(error, SystemExit):
-        program.exit_code = exit_status(error)
+    if isinstance(error, SystemExit) or (isinstance(error, KeyboardInterrupt) and not over):
+        program.exit_code = exit_status(error) if isinstance(error, SystemExit) else _INTERRUPTED
         stacks.dispatcher.note(OutputKind.SHUTDOWN, 0, 1, program.exit_code)
         if program.exit_code:
-            said = "" if isinstance(error.code, int) else f": {text_of(error)}"
+            said = text_of(error) if not isinstance(getattr(error, "code", 0), int) else ""
+            said = f": {said}" if said else ""
             at = format_seconds(stacks.loop.now_ns)
             notes.append(f"{program.name} exited with {program.exit_code} at {at} s{said}")
         return False
@@ -189,17 +192,24 @@ def end_programs(stacks: Stacks) -> None:
     stacks.loop.halt()
     for program in stacks.programs.all:
         if not program.ended and program.begun_ns is not None:
-            _interrupt(stacks, program)
+            interrupt(stacks, program)
             _let_run(stacks, program)
 
 
-def _interrupt(stacks: Stacks, program: Program) -> None:
-    for context in program.contexts:
-        context.end()
+def interrupt(stacks: Stacks, program: Program) -> None:
+    """Do what SIGINT does to a process; the call that its main is in raises ``KeyboardInterrupt``
+    (who is in no call has to raise it)."""
+    shut_down(stacks, program)
     blocked = next((one for one in stacks.runners.blocked if one.stack is program.stack), None)
     if blocked is not None:
         blocked.error = KeyboardInterrupt()
         blocked.release()
+
+
+def shut_down(stacks: Stacks, program: Program) -> None:
+    """Shut a process's contexts down from outside, as rclpy's handler of signals does."""
+    for context in program.contexts:
+        context.end()
     for other in list(stacks.runners.blocked):
         if other.program is program and other.quiet:
             other.release()

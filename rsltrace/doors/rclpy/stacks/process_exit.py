@@ -19,7 +19,7 @@ from typing import Any, NoReturn
 from greenlet import getcurrent
 
 from rsltrace.doors.rclpy.stacks.blocking_calls import abandon, getpid
-from rsltrace.doors.rclpy.stacks.mains import end_program
+from rsltrace.doors.rclpy.stacks.mains import end_program, interrupt, shut_down
 from rsltrace.doors.rclpy.stacks.runners import RunEnded
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
@@ -29,6 +29,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
 
 _DEADLY = (signal.SIGKILL, signal.SIGABRT)
+_ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 _real: dict[str, Callable[..., Any]] = {}
 """What the functions did before the run, which may be the guard's doing."""
 
@@ -89,9 +90,25 @@ def _signalled(stacks: Stacks, number: int, call: str) -> bool:
     if number in _DEADLY or handler == signal.SIG_DFL:
         _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     if handler is None:
-        return False
+        return _signalled_by_default(stacks, number, call)
     if callable(handler):
         handler(number, sys._getframe(2))
+    return True
+
+
+def _signalled_by_default(stacks: Stacks, number: int, call: str) -> bool:
+    """Do what Python and rclpy do about a signal for which a main has set no handler."""
+    program = stacks.programs.present
+    if program is stacks.programs.host or number not in _ENDING:
+        return False
+    if number == signal.SIGINT:
+        interrupt(stacks, program)
+        if getcurrent() is program.stack:
+            raise KeyboardInterrupt
+    elif number == signal.SIGTERM and any(context.ok() for context in program.contexts):
+        shut_down(stacks, program)
+    else:
+        _leave(stacks, f"{call} with {signal.Signals(number).name} for itself", 128 + number)
     return True
 
 

@@ -32,6 +32,9 @@ Handler = tuple[Callable[..., object], tuple[Any, ...], dict[str, Any]]
 class Context(Protocol):
     """A context that a program has initialized."""
 
+    def ok(self) -> bool:
+        """Return whether it has not been shut down."""
+
     def end(self) -> None:
         """Shut down from outside, as a signal does."""
 

@@ -1,0 +1,60 @@
+"""Names of parameters: a job may give all that a parameter file may."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rclpy.node import Node
+
+from rsltrace import NodeSpec
+from rsltrace.doors.rclpy.entry import ros_arguments
+
+pytestmark = pytest.mark.ros
+
+VALUES = {
+    "walk.axis_mappings.linear-x.axis": 1,  # as joy_teleop's parameter files have it
+    "a b.c": [0.5, 2.0],
+    "7th": 'quo"ted\\: {text}',
+    "größe": True,
+    "plain.name": "x",
+}
+
+
+def test_names_that_no_rule_can_have(simulate: Any) -> None:
+    seen: dict[str, Any] = {}
+
+    class Reads(Node):
+        def __init__(self) -> None:
+            super().__init__("reads", automatically_declare_parameters_from_overrides=True)
+            seen.update({name: self.get_parameter(name).value for name in VALUES})
+
+    simulate(NodeSpec(node=Reads, parameters=VALUES), duration=0.1)
+    assert {name: list(v) if isinstance(VALUES[name], list) else v for name, v in seen.items()} == (
+        VALUES
+    )
+
+
+@settings(max_examples=50, deadline=None)
+@given(
+    st.dictionaries(
+        st.text("abz_-7 ü:#\"'", min_size=1).filter(lambda name: name.strip()),
+        st.integers(-5, 5),
+        max_size=4,
+    )
+)
+def test_any_name_keeps_its_value(parameters: dict[str, int]) -> None:
+    lists = ros_arguments(
+        name=None,
+        namespace=None,
+        parameters=parameters,
+        parameter_files=(),
+        remappings={},
+        where="job",
+    )
+    found: dict[str, Any] = {}
+    for one in lists:
+        found.update(one.parameters("/node"))
+    assert found == parameters
