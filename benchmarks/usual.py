@@ -280,10 +280,7 @@ def bare_images(scale: float, folder: Path) -> Figures:
 
 
 def file_bytes(graph: Graph, scale: float, folder: Path) -> Figures:
-    """Return the bytes of a trace beyond those of its payloads, as the mcap package writes these.
-
-    Payloads are the messages of ROS topics, written without indexes in one compressed file.
-    """
+    """Return the bytes of a trace beyond what its messages take in a bag of the mcap package."""
     events = max(5_000, int(SMALL_EVENTS * scale))
     found = run_rsltrace(graph, events, folder, record=True)
     payloads = payload_bytes(folder / "run.mcap", folder / "payloads.mcap")
@@ -293,10 +290,10 @@ def file_bytes(graph: Graph, scale: float, folder: Path) -> Figures:
 def payload_bytes(trace: Path, output: Path) -> int:
     """Write the messages of ROS topics of a trace to a file of their own; return its size."""
     from mcap.reader import make_reader
-    from mcap.writer import CompressionType, IndexType, Writer
+    from mcap.writer import CompressionType, Writer
 
     with trace.open("rb") as stream, output.open("wb") as target:
-        writer = Writer(target, compression=CompressionType.ZSTD, index_types=IndexType.NONE)
+        writer = Writer(target, compression=CompressionType.ZSTD)
         writer.start()
         ids: dict[int, int] = {}
         for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
@@ -466,7 +463,7 @@ def all_cases() -> list[Case]:
         *commands(),
         Case(
             "files",
-            "file of small messages, beyond payloads",
+            "file of small messages, beyond a bag's",
             "bytes of an event",
             {"recorded": partial(file_bytes, here["small"])},
             35,

@@ -99,11 +99,13 @@ def _joined(pieces: list[bytes]) -> tuple[bytes, ...]:
 
 
 def rows_chunk(messages: npt.NDArray[np.void], channel_id: int) -> ChunkBody:
-    """Return the chunk of messages of one size: an array of them, header and all."""
-    size = messages.dtype.itemsize
+    """Return the chunk of messages of one size: an array of them, header and all.
+
+    Each lies where its number says, so its message index has no entries. The record is there all
+    the same: Foxglove's reader refuses a file with a chunk that has none.
+    """
     times = messages["log_time"]
-    offsets = np.arange(0, len(messages) * size, size, dtype=np.uint64)
-    index = _message_index(channel_id, times, offsets)
+    index = (channel_id, len(messages), _index_record(channel_id, b""))
     return ChunkBody((messages.tobytes(),), int(times.min()), int(times.max()), (index,), rows=True)
 
 
@@ -113,5 +115,9 @@ def _message_index(
     entries = np.empty(len(times), dtype=_INDEX_ENTRY_DTYPE)
     entries["log_time"] = times
     entries["offset"] = offsets
-    head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + entries.nbytes, channel_id, entries.nbytes)
-    return channel_id, len(times), head + entries.tobytes()
+    return channel_id, len(times), _index_record(channel_id, entries.tobytes())
+
+
+def _index_record(channel_id: int, entries: bytes) -> bytes:
+    head = _INDEX_HEAD.pack(Opcode.MESSAGE_INDEX, 6 + len(entries), channel_id, len(entries))
+    return head + entries

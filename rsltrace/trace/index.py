@@ -26,7 +26,7 @@ from rsltrace.trace.format import (
 )
 from rsltrace.trace.pieces import damaged, read_attachment, read_metadata
 
-_MESSAGE_INDEX_FIXED = 15
+MESSAGE_INDEX_FIXED = 15
 """Bytes of a message index around its entries: head of the record, channel, length."""
 _INDEX_ENTRY_BYTES = 16
 _NO_SCHEMA = Schema(0, "", "", "")
@@ -47,7 +47,8 @@ class ChannelInfo:
 class ChunkEntry(NamedTuple):
     """A chunk: where it is, how many messages of each channel it holds, where their indexes are.
 
-    A channel without an index (the file was cut off behind the chunk) is found by walking.
+    A channel without an index (the file was cut off behind the chunk), or with one that has no
+    entries (events and outputs), is found by walking; its count is then 0.
     """
 
     span: Span
@@ -143,7 +144,7 @@ def _chunk_entry(chunk: ChunkIndex) -> ChunkEntry:
     for position, (at, channel_id) in enumerate(starts):
         end = starts[position + 1][0] if position + 1 < len(starts) else chunk.end
         indexes[channel_id] = Span(at, end - at)
-        counts[channel_id] = (end - at - _MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
+        counts[channel_id] = (end - at - MESSAGE_INDEX_FIXED) // _INDEX_ENTRY_BYTES
     return ChunkEntry(chunk.span, counts, indexes)
 
 

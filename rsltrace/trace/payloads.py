@@ -18,7 +18,7 @@ from rsltrace.errors import TraceError
 from rsltrace.mcap.chunk import message_at
 from rsltrace.mcap.records import Damaged, Fields, Span
 from rsltrace.mcap.source import ByteSource
-from rsltrace.trace.index import ChunkEntry, TraceIndex
+from rsltrace.trace.index import MESSAGE_INDEX_FIXED, ChunkEntry, TraceIndex
 from rsltrace.trace.pieces import damaged, messages_in, read_body, read_chunk
 
 _CHUNKS_CACHED = 4
@@ -103,7 +103,7 @@ class PayloadReader:
 
     def _read_offsets(self, span: Span, index_span: Span | None, channel_id: int) -> list[int]:
         """Return where in the records of a chunk the messages of a channel are."""
-        if index_span is None:
+        if index_span is None or index_span.length <= MESSAGE_INDEX_FIXED:
             try:
                 walked = messages_in(self._records(span))
                 return [offset for channel, offset in walked if channel == channel_id]
