@@ -21,13 +21,18 @@ from rsltrace.launch.values import typed
 class Evaluation:
     """Evaluates attributes in the scope of the innermost group of the file being read.
 
-    ``delay_ns`` is when what is being read happens, after the launch file has been started.
+    ``delay_ns`` is when what is being read happens, after the launch file has been started; or
+    after the node with a ``number`` has ``started`` or ``ended``, if there is an ``after``.
+    ``kept`` keeps alive what the numbers are those of.
     """
 
     def __init__(self, arguments: dict[str, str]) -> None:
         self.launched = Launched()
         self.scope = Scope(configurations=arguments)
         self.delay_ns = 0
+        self.after: tuple[str, int] | None = None
+        self.kept: list[object] = []
+        self._environment = dict(self.scope.environment)
         self._substitutions = Substitutions(self.scope, Path())
 
     @property
@@ -54,6 +59,18 @@ class Evaluation:
         if isinstance(value, bool):
             value = str(value).lower()
         return self.replaced(str(value), attribute.place)
+
+    def anonymous(self, name: str) -> str:
+        """Return a name that begins with ``name`` and that nobody else has."""
+        return self._substitutions.anonymous(name)
+
+    def first_environment(self) -> dict[str, str]:
+        """Return the environment that the launch file found."""
+        return dict(self._environment)
+
+    def replaced_text(self, written: str) -> str:
+        """Return a text with its substitutions replaced. Raises ``ValueError``."""
+        return self._substitutions.text(written)
 
     def optional(self, element: Element, name: str) -> str | None:
         """Return an attribute as text, or None if it is not given."""

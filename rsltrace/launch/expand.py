@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
 from rsltrace.launch import ros_launch
+from rsltrace.launch.apart import read_apart
 from rsltrace.launch.model import Argument, Launched
-from rsltrace.launch.reader import read_launch_file
+from rsltrace.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.launch.specs import node_specs
 
 
@@ -21,11 +22,13 @@ class Expanded:
     notes: tuple[str, ...] = ()
 
 
-def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
+def expand(
+    job: Job, *, why_not: Callable[[str, str], str | None], programs: bool = True
+) -> Expanded:
     """Return a job whose launch files have become nodes.
 
-    A Python launch file is a program, and is run to do so. ``why_not(package, executable)`` says
-    why an executable cannot be simulated, if it cannot.
+    A Python launch file is a program, and is run to do so, unless ``programs`` is False.
+    ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot.
 
     :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
     """
@@ -34,8 +37,13 @@ def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
     nodes: list[NodeSpec] = list(job.nodes)
     notes: list[str] = []
     for index, spec in enumerate(job.launch):
-        launched = _read(job, index)
-        nodes += node_specs(launched, skip_unsupported=spec.skip_unsupported, why_not=why_not)
+        launched = _read(job, index, programs)
+        nodes += node_specs(
+            launched,
+            skip_unsupported=spec.skip_unsupported,
+            why_not=why_not,
+            first=len(nodes),
+        )
         notes += [f"left out: {item}" for item in launched.unsupported]
         notes += launched.ignored
     if not nodes and not job.bags:
@@ -44,11 +52,16 @@ def expand(job: Job, *, why_not: Callable[[str, str], str | None]) -> Expanded:
     return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 
-def _read(job: Job, index: int) -> Launched:
+def _read(job: Job, index: int, programs: bool) -> Launched:
     spec = job.launch[index]
     path = job.resolve(spec.file)
-    read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
-    launched = read(path, spec.arguments)
+    try:
+        read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
+        launched = read(path, spec.arguments)
+    except ProgramNeededError:
+        if not programs:
+            raise JobError("a Python launch file is a program", where=spec.file) from None
+        launched = read_apart(path, spec.arguments, [job.resolve(f) for f in job.search_path])
     _check_known(job, index, launched.arguments)
     return launched
 

@@ -19,7 +19,8 @@ class LaunchedNode:
     ``executable`` is that of ``package``; a component has a ``plugin`` instead. ``name`` and
     ``namespace`` are None where the launch file leaves them to the node. ``where`` is
     ``file:line:column``, as far as it is known. It starts ``delay_ns`` after the launch file
-    (``<timer>``).
+    (``<timer>``); or, if there is an ``after``, after the node with that ``number`` has ``started``
+    or ``ended``. ``fault`` is what is wrong with it, should it not be left out.
     """
 
     where: str
@@ -33,6 +34,9 @@ class LaunchedNode:
     arguments: tuple[str, ...] = ()
     ros_arguments: tuple[str, ...] = ()
     delay_ns: int = 0
+    after: tuple[str, int] | None = None
+    number: int = 0
+    fault: str = ""
 
     @property
     def title(self) -> str:

@@ -10,7 +10,7 @@ from rsltrace.launch.element import Element
 from rsltrace.launch.evaluation import Evaluation
 from rsltrace.launch.model import LaunchedNode
 from rsltrace.launch.parameter_files import substituted_parameters
-from rsltrace.launch.scope import ParameterFile, Parameters, joined_namespace
+from rsltrace.launch.scope import ParameterFile, Parameters, absolute_namespace
 
 _WITHOUT_MEANING = (
     "output",
@@ -105,21 +105,20 @@ class Nodes:
     def _common(self, element: Element) -> dict[str, Any]:
         evaluation = self._evaluation
         scope = evaluation.scope
-        namespace = joined_namespace(scope.namespace, evaluation.optional(element, "namespace"))
-        if namespace and not namespace.startswith("/"):
-            namespace = f"/{namespace}"
+        namespace = absolute_namespace(scope.namespace, evaluation.optional(element, "namespace"))
         name = evaluation.optional(element, "name") or evaluation.optional(element, "node-name")
         remappings = []
         for remap in element.named("remap"):
             remap.check(["from", "to"])
             remappings.append((evaluation.needed(remap, "from"), evaluation.needed(remap, "to")))
-        full_name = None if name is None else f"{namespace.rstrip('/')}/{name}"
+        full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
         return {
             "name": name,
-            "namespace": namespace or None,
+            "namespace": namespace,
             "parameters": scope.parameters + self._parameters(element, full_name),
             "remappings": scope.remappings + tuple(remappings),
             "delay_ns": evaluation.delay_ns,
+            "after": evaluation.after,
         }
 
     def _words(self, element: Element, name: str) -> tuple[str, ...]:

@@ -23,10 +23,6 @@ from rsltrace.model.regular_file import read_regular
 
 SIZE_MAX = 16 << 20
 _INCLUDES_MAX = 50
-_PYTHON = (
-    "a Python launch file is a program of ROS's launch: source a ROS 2 installation "
-    "(packages launch and launch_ros), or name the nodes in the job"
-)
 
 
 def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
@@ -40,11 +36,16 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
 
 
 class ActionReader(Evaluation):
-    """Does the actions of launch files one by one; ``_files`` are those that are open."""
+    """Does the actions of launch files one by one; ``_files`` are those that are open.
 
-    def __init__(self, arguments: dict[str, str]) -> None:
+    ``run`` does what a Python launch file says.
+    """
+
+    def __init__(
+        self, arguments: dict[str, str], run: Callable[[Path], None] | None = None
+    ) -> None:
         super().__init__(arguments)
-        self._environment = dict(self.scope.environment)
+        self._run = run
         self._files: list[Path] = []
         nodes = Nodes(self)
         self._actions: dict[str, Callable[[Element], None]] = {
@@ -83,13 +84,24 @@ class ActionReader(Evaluation):
         path = Path(os.path.abspath(path))
         if len(self._files) >= _INCLUDES_MAX:
             raise _at(place, path, f"launch files include each other: {self._files[-1].name}")
-        root = _parse(path, place)
-        self._note_arguments(root)
+        if path.suffix == ".py":
+            if self._run is None:
+                raise ProgramNeededError
+            _read(path, place)
+            root = None
+        else:
+            root = _parse(path, place)
+            self._note_arguments(root)
+            root.check(["version"], None)
         self._files.append(path)
-        root.check(["version"], None)
-        with self.within(file=path):
-            self._children(root)
-        self._files.pop()
+        try:
+            with self.within(file=path):
+                if root is not None:
+                    self._children(root)
+                elif self._run is not None:
+                    self._run(path)
+        finally:
+            self._files.pop()
 
     def _note_arguments(self, element: Element) -> None:
         for child in element.children:
@@ -134,11 +146,7 @@ class ActionReader(Evaluation):
             child.check(["name", "value"])
             name = self.needed(child, "name")
             self.scope.configurations[name] = self.needed(child, "value")
-        path = self.file.parent / file
-        if path.suffix == ".py":
-            self.refuse(element, f"include of {path.name}", _PYTHON)
-            return
-        self.include(path, element.need("file").place)
+        self.include(self.file.parent / file, element.need("file").place)
 
     def _timer(self, element: Element) -> None:
         element.check(["period"], None)
@@ -256,7 +264,19 @@ class ActionReader(Evaluation):
         self.refuse(element, what, "other programs do not run in a simulation")
 
 
+class ProgramNeededError(Exception):
+    """There is a Python launch file, and nobody to run it."""
+
+
 def _parse(path: Path, place: Place | None) -> Element:
+    name, text = _read(path, place)
+    if path.suffix == ".xml" or text.lstrip().startswith("<"):
+        return parse_xml(text, name, str(path.parent))
+    return parse_launch_yaml(text, name, str(path.parent))
+
+
+def _read(path: Path, place: Place | None) -> tuple[str, str]:
+    """Return how to call a launch file in messages, and its text."""
     name = os.path.relpath(path) if path.is_relative_to(Path.cwd()) else str(path)
     try:
         data = read_regular(path, SIZE_MAX + 1)
@@ -270,11 +290,7 @@ def _parse(path: Path, place: Place | None) -> Element:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
         raise _at(place, path, f"{name} is not UTF-8 text") from None
-    if path.suffix == ".py":
-        raise _at(place, path, _PYTHON)
-    if path.suffix == ".xml" or text.lstrip().startswith("<"):
-        return parse_xml(text, name, str(path.parent))
-    return parse_launch_yaml(text, name, str(path.parent))
+    return name, text
 
 
 def _at(place: Place | None, path: Path, message: str) -> JobError:

@@ -35,6 +35,14 @@ class Scope:
         )
 
 
+def absolute_namespace(base: str, own: str | None) -> str | None:
+    """Return the namespace of a node below another one; None if there is neither."""
+    namespace = joined_namespace(base, own)
+    if namespace and not namespace.startswith("/"):
+        namespace = f"/{namespace}"
+    return namespace or None
+
+
 def joined_namespace(base: str, own: str | None) -> str:
     """Return a namespace below another one, as launch joins them; absolute ones stand alone."""
     if own is None or own == "":

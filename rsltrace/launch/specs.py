@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from rsltrace.errors import JobError
@@ -23,20 +23,27 @@ def node_specs(
     *,
     skip_unsupported: bool,
     why_not: Callable[[str, str], str | None],
+    first: int = 0,
 ) -> list[NodeSpec]:
     """Return the nodes as entries of a job; ``launched.unsupported`` grows by what is left out.
 
-    ``why_not(package, executable)`` says why an executable cannot be simulated.
+    ``why_not(package, executable)`` says why an executable cannot be simulated. ``first`` is the
+    number that the first of them will have in the job.
 
     :raises JobError: with everything that cannot be simulated, unless that is to be skipped.
     """
-    specs = []
+    runs: list[LaunchedNode] = []
     for node in launched.nodes:
         why = _why_not(node, why_not)
         if why is not None:
             launched.unsupported.append(Unsupported(node.where, node.title, why))
         else:
-            specs.append(_spec(node))
+            runs.append(node)
+    runs = _without_orphans(runs, launched)
+    numbers: dict[int, int] = {}
+    for position, node in enumerate(runs, first):
+        numbers.setdefault(node.number, position)
+    specs = [_spec(node, numbers) for node in runs]
     launched.unsupported.sort(key=_position)
     if launched.unsupported and not skip_unsupported:
         listed = launched.unsupported[:_LISTED_MAX]
@@ -54,6 +61,20 @@ def _position(item: Unsupported) -> tuple[str, list[int]]:
     return file, [int(number) for number in numbers if number.isdigit()]
 
 
+def _without_orphans(nodes: list[LaunchedNode], launched: Launched) -> list[LaunchedNode]:
+    """Return the nodes but those that wait for one that is left out, which are left out, too."""
+    while True:
+        there = {node.number for node in nodes}
+        kept = [node for node in nodes if node.after is None or node.after[1] in there]
+        if len(kept) == len(nodes):
+            return nodes
+        for node in nodes:
+            if node not in kept and node.after is not None:
+                why = f"it starts when something has {node.after[0]} that is left out itself"
+                launched.unsupported.append(Unsupported(node.where, node.title, why))
+        nodes = kept
+
+
 def _why_not(node: LaunchedNode, of_executable: Callable[[str, str], str | None]) -> str | None:
     if not node.plugin:
         return of_executable(node.package, node.executable)
@@ -64,7 +85,9 @@ def _why_not(node: LaunchedNode, of_executable: Callable[[str, str], str | None]
     return None
 
 
-def _spec(node: LaunchedNode) -> NodeSpec:
+def _spec(node: LaunchedNode, numbers: Mapping[int, int]) -> NodeSpec:
+    if node.fault:
+        raise JobError(node.fault)
     words, ros_words = split_ros_arguments(node.arguments)
     given = _RosWords([*node.ros_arguments, *ros_words], node.where)
     name = given.name or node.name
@@ -80,7 +103,11 @@ def _spec(node: LaunchedNode) -> NodeSpec:
         "remappings": dict(reversed(remappings.items())),
         "origin": node.where,
     }
-    if node.delay_ns:
+    if node.after is not None:
+        moment, number = node.after
+        rule: dict[str, Any] = {"delay": f"{node.delay_ns}ns", moment: numbers[number]}
+        values["start_after"] = StartAfterSpec(**rule)
+    elif node.delay_ns:
         values["start_after"] = StartAfterSpec.after(node.delay_ns)
     try:
         if node.plugin:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Callable
@@ -55,15 +56,15 @@ class Substitutions:
             "exec-in-pkg": (2, 2, _executable_in_package),
             "find-exec": (1, 1, _find_executable),
             "file-content": (1, 1, _file_content),
-            "anon": (1, 1, self._anon),
+            "anon": (1, 1, self.anonymous),
             "eval": (1, 99, lambda *words: str(evaluate(" ".join(words)))),
             "not": (1, 1, lambda a: _word(not truth(a))),
             "and": (2, 2, lambda a, b: _word(truth(a) and truth(b))),
             "or": (2, 2, lambda a, b: _word(truth(a) or truth(b))),
             "any": (0, 99, lambda *words: _word(any(map(truth, words)))),
             "all": (0, 99, lambda *words: _word(all(map(truth, words)))),
-            "equals": (2, 2, lambda a, b: _word(_equal(a, b))),
-            "not-equals": (2, 2, lambda a, b: _word(not _equal(a, b))),
+            "equals": (2, 2, lambda a, b: _word(equal_texts(a, b))),
+            "not-equals": (2, 2, lambda a, b: _word(not equal_texts(a, b))),
             "if": (2, 3, lambda a, yes, no="": yes if truth(a) else no),
         }
 
@@ -117,7 +118,8 @@ class Substitutions:
             )
         return value
 
-    def _anon(self, name: str) -> str:
+    def anonymous(self, name: str) -> str:
+        """Return a name that nobody else has."""
         # ROS appends host, process and a random number; here runs must not differ.
         return self._anonymous.setdefault(name, f"{name}_{len(self._anonymous) + 1}")
 
@@ -126,16 +128,15 @@ def _word(value: bool) -> str:
     return str(value).lower()
 
 
-def _equal(a: str, b: str) -> bool:
-    def plain(text: str) -> str | float:
-        if text.lower() in ("true", "false"):
-            return text.lower()
-        try:
-            return float(text)
-        except ValueError:
-            return text
-
-    return plain(a) == plain(b)
+def equal_texts(a: str, b: str) -> bool:
+    """Return whether two texts are equal as launch compares them: truth values, numbers, text."""
+    words = a.lower(), b.lower()
+    if all(word in (*_TRUE, *_FALSE) for word in words):
+        return (words[0] in _TRUE) == (words[1] in _TRUE)
+    try:
+        return math.isclose(float(a), float(b))
+    except ValueError:
+        return a == b
 
 
 def _prefix(package: str) -> Path:

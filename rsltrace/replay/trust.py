@@ -81,7 +81,7 @@ def _own_job(file: Path, *, bags: bool) -> Job | None:
         # ROS's own launch runs what a launch file tells it to.
         if not launch.file.endswith(_LAUNCH) or ros_launch.can_read(job.resolve(launch.file)):
             return None
-    return expand(job, why_not=why_not).job
+    return expand(job, why_not=why_not, programs=False).job
 
 
 def _differing(own: Job, job: Job) -> list[str]:

@@ -35,7 +35,7 @@ class LaunchSpec(Part):
     """A launch file; a path stands for ``{file: ...}``."""
 
     file: Annotated[str, check(check_path)] = Field(
-        description="Launch file (XML, YAML, or Python with ROS's launch installed).",
+        description="Launch file (XML, YAML, or Python, which is run in a process of its own).",
         examples=["launch/robot.launch.xml"],
     )
     arguments: Annotated[dict[str, str], check(_check_arguments)] = Field(
