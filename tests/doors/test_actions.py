@@ -273,3 +273,23 @@ def test_goal_ids_come_from_the_seed(simulate: Any) -> None:
     assert all(text[12] == "4" for text in first)  # UUIDs of version 4
     assert goal_ids(1) == first
     assert not set(goal_ids(2)) & set(first)
+
+
+def test_statuses_are_the_bytes_that_the_codec_makes_of_them(simulate: Any) -> None:
+    from action_msgs.msg import GoalStatusArray
+
+    from rsltrace.doors.rclpy.wire.codec import codec_for
+
+    log: list[Any] = []
+    clients = [type(f"Client{n}", (Client,), {}) for n in range(4)]
+    nodes = [lambda n=n: clients[n](2 + n, log) for n in range(4)]
+    recorded = simulate(lambda: Server(result_timeout=2.0), *nodes, duration=12)
+    codec = codec_for(GoalStatusArray)
+    seen = set()
+    with recorded.trace() as trace:
+        for _, _, data in trace.messages("/fibonacci/_action/status"):
+            message = codec.deserialize(bytes(data))
+            seen.add(tuple(goal.status for goal in message.status_list))
+            assert codec.serialize(message) == bytes(data)
+    assert {len(statuses) for statuses in seen} == {1, 2, 3, 4}
+    assert {status for statuses in seen for status in statuses} == {1, 2, 4}

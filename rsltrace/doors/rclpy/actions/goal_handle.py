@@ -36,6 +36,8 @@ class GoalHandle(Handle):
         self.status = ACCEPTED
         self.accepted_ns = info.stamp.sec * 1_000_000_000 + info.stamp.nanosec
         self.done_ns: int | None = None
+        self.status_bytes = b""
+        """What a message of its status says of it, but for the status, once there has been one."""
         goals[goal_id] = self
 
     def get_status(self) -> int:

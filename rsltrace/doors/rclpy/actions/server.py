@@ -12,12 +12,19 @@ from rsltrace.doors.rclpy.actions.parts import ACTION, ActionHandle, GoalService
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
 from rsltrace.doors.rclpy.stacks.tasks import start_coroutine
+from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.middleware.services import RequestId
 from rsltrace.model.event import NO_EVENT
 
 # Return codes of action_msgs/srv/CancelGoal.
 _ERROR_NONE, _ERROR_UNKNOWN_GOAL_ID, _ERROR_GOAL_TERMINATED = 0, 2, 3
+
+# In the CDR of action_msgs/msg/GoalStatusArray the number of goals comes after the header; each of
+# them is an id (octets), a stamp and a status (an octet). The stamp is at a multiple of 4, so there
+# is padding before it in all but the first.
+_NUMBER_AT = 4
+_ID, _STAMP_AT = 16, 19
 
 
 class ActionServerHandle(ActionHandle):
@@ -55,6 +62,7 @@ class ActionServerHandle(ActionHandle):
             node, impl.GoalStatusMessage, self.path("status"), status_qos
         )
         self._status_type = impl.GoalStatusMessage
+        self._no_goals: bytes = codec_for(self._status_type).serialize(self._status_type())
         self.publishers = [self._feedback, self._status]
         self._expiry = _Expiry(self)
 
@@ -107,12 +115,26 @@ class ActionServerHandle(ActionHandle):
         self._feedback.publish(message)
 
     def publish_status(self) -> None:
-        """Publish the status of every goal that is known."""
+        """Publish the status of every goal that is known.
+
+        All of them are in each message, so the part of a goal that never changes is kept as bytes.
+        """
+        parts = [
+            (goal.status_bytes or self._keep_bytes(goal)) + goal.status.to_bytes(1, "little")
+            for goal in self.goals.values()
+        ]
+        number = len(parts).to_bytes(4, "little")
+        if parts:
+            parts[0] = parts[0][:_ID] + parts[0][_STAMP_AT:]
+        self._status.send(b"".join((self._no_goals[:_NUMBER_AT], number, *parts)))
+
+    def _keep_bytes(self, goal: GoalHandle) -> bytes:
         from action_msgs.msg import GoalStatus
 
-        goals = self.goals.values()
-        statuses = [GoalStatus(goal_info=goal.info, status=goal.status) for goal in goals]
-        self._status.publish(self._status_type(status_list=statuses))
+        alone = self._status_type(status_list=[GoalStatus(goal_info=goal.info)])
+        data = codec_for(self._status_type).serialize(alone)[len(self._no_goals) : -1]
+        goal.status_bytes = data[:_ID] + bytes(_STAMP_AT - _ID) + data[_ID:]
+        return goal.status_bytes
 
     # -- goals -----------------------------------------------------------------------------------
 

@@ -18,6 +18,7 @@ from rsltrace.doors.rclpy.actions.goal_handle import GoalHandle
 from rsltrace.doors.rclpy.actions.server import ActionServerHandle
 from rsltrace.doors.rclpy.boundary.boundary import Boundary
 from rsltrace.doors.rclpy.boundary.log_callers import quick_log_callers
+from rsltrace.doors.rclpy.boundary.quick_id_texts import quick_id_texts
 from rsltrace.doors.rclpy.boundary.release import check_release
 from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.doors.rclpy.handles.context import ContextHandle
@@ -109,7 +110,7 @@ def installed() -> Iterator[Boundary]:
     ours = boundary()
     _exchange(ours.real, ours)
     try:
-        with quick_log_callers():
+        with quick_log_callers(), quick_id_texts():
             yield ours
     finally:
         _exchange(ours, ours.real)

@@ -45,7 +45,9 @@ class Standby:
         self._dispatcher = stacks.dispatcher
         self._event = stacks.event
         self._programs = stacks.programs
+        self._runners = stacks.runners
         self._waiting = stacks.runners.waiting
+        self._all_blocked = stacks.runners.blocked
         self._pump = pump
         self._context = pump.executor.context.handle
         self._future = future
@@ -67,50 +69,85 @@ class Standby:
         Called on the stack that runs the loop.
         """
         blocked = self.blocked
-        if self._loop.tasks or not blocked.waiting or self._dispatcher.has_outputs():
-            return False
-        wrapper = getattr(item, "wrapper", None)
-        group = getattr(wrapper, "callback_group", None)
-        if group is not None:
-            own = getattr(item, "own_group", None)
-            if is_custom(group) if own is None else own:
-                return False
-            if getattr(group, "_active_entity", group) is not None and is_busy(group, wrapper):
-                return False
-        if getattr(item, "destroyed", False):
+        dispatcher = self._dispatcher
+        recorder = dispatcher.recorder
+        if (
+            self._loop.tasks
+            or blocked.woken
+            or dispatcher.entities.pending
+            or (dispatcher.unrecorded if recorder is None else recorder.outputs)
+            or not _is_free(item)
+        ):
             return False
         self._waiting.append(getcurrent())
         blocked.stack.switch(mailbox, item)
         return True
 
     def serve(self, mailbox: Mailbox, item: Dispatchable) -> bool:
-        """Run one callback; False if the spin has to go on itself. Called on its stack."""
-        pump, programs, blocked = self._pump, self._programs, self.blocked
-        pump.standby = None
-        pump.woken = False
-        if blocked.program is not programs.present:
-            blocked.program.enter()
-        programs.constructing = blocked.constructing
-        failure: BaseException | None = None
-        try:
-            mailbox.run(item)
-            failure, mailbox.raised = mailbox.raised, None
-        except BaseException as error:
-            failure = error
-        if (
-            failure is None
-            and not pump.woken
-            and self._context.ok()
-            and not self._dispatcher.has_outputs()
-            and (self._future is None or not (self._future.done() or self._future.cancelled()))
-        ):
-            blocked.stay()
+        """Run what is given to the stack, one callback after the other, and wait in between.
+
+        Returns whether the spin has to go on itself (see ``is_over``); else the wait was ended.
+        """
+        pump, programs, dispatcher, event = (
+            self._pump,
+            self._programs,
+            self._dispatcher,
+            self._event,
+        )
+        blocked, future, context, waiting = self.blocked, self._future, self._context, self._waiting
+        all_blocked, host, program = self._all_blocked, programs.host, blocked.program
+        while True:
+            del all_blocked[blocked]
+            pump.standby = None
+            pump.woken = False
+            if programs.present is not program:
+                program.enter()
+            programs.constructing = blocked.constructing
+            try:
+                mailbox.admitted = item  # what ``Mailbox.run`` does
+                item.dispatch()
+                mailbox.admitted = None
+                failure, mailbox.raised = mailbox.raised, None
+            except BaseException as error:
+                failure = error
+            if (
+                failure is not None
+                or pump.woken
+                or not context.is_up
+                or dispatcher.has_outputs()
+                or (future is not None and (future.done() or future.cancelled()))
+            ):
+                break
+            event.handle, event.entity, event.node = blocked.event
+            if dispatcher.on_node is not None:
+                dispatcher.on_node(event.node)
+            if programs.present is not host:
+                host.enter()
             pump.standby = self
-            return True
+            all_blocked[blocked] = None
+            given = (waiting.pop() if waiting else self._runners.next()).switch()
+            if not given:
+                return False
+            mailbox, item = given
         blocked.follow(self._loop.events - 1)
         self.failure = failure
         self.is_over = True
+        return True
+
+
+def _is_free(item: Any) -> bool:
+    """Say whether nothing keeps a callback from running now, and nobody has to be asked."""
+    try:
+        group, own = item.wrapper.callback_group, item.own_group
+    except AttributeError:  # no entity of rclpy's, or one that nobody runs any more
+        wrapper = getattr(item, "wrapper", None)
+        group = getattr(wrapper, "callback_group", None)
+        return group is None or not (is_custom(group) or is_busy(group, wrapper))
+    if own or item.destroyed:
         return False
+    if getattr(group, "_active_entity", group) is None:  # nearly always
+        return True
+    return not is_busy(group, item.wrapper)
 
 
 def standby_of(

@@ -28,11 +28,11 @@ class ContextHandle(Handle):
         self.program.contexts.append(self)
         self.arguments = RosArguments([*_only_ros(arguments), *self.program.ros_words])
         self._domain_id = 0 if domain_id == DEFAULT_DOMAIN else domain_id
-        self._ok = True
+        self.is_up = True
 
     def ok(self) -> bool:
         """Return whether the context has not been shut down."""
-        return self._ok
+        return self.is_up
 
     def get_domain_id(self) -> int:
         """Return the domain id; nothing in a simulation depends on it."""
@@ -40,9 +40,9 @@ class ContextHandle(Handle):
 
     def shutdown(self) -> None:
         """Shut down. Within an event this ends the run once the event is over."""
-        if not self._ok:
+        if not self.is_up:
             raise RuntimeError("context has already been shut down")
-        self._ok = False
+        self.is_up = False
         stacks = self.stacks
         if self.program is not stacks.programs.host:
             stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
@@ -54,7 +54,7 @@ class ContextHandle(Handle):
 
     def end(self) -> None:
         """Shut down from outside, as a signal does."""
-        self._ok = False
+        self.is_up = False
 
 
 def _only_ros(arguments: Sequence[str]) -> list[str]:

@@ -51,7 +51,7 @@ def wait(
     ``until`` is given the Wait and arranges for its ``wake`` to be called; ``for_ns`` limits the
     wait. ``what`` completes "… waits for". After a ``quiet`` wait there is only a RESUME event if
     something comes of it. A ``patient`` one may last for ever. ``serve`` runs on this stack what is
-    given to it meanwhile; where it returns False the wait is over.
+    given to it meanwhile, and returns whether the wait is over by that.
 
     :raises RunEnded: when the run ends before the wait does.
     :raises UnsupportedError: in a real thread, another process, or outside of all callbacks.
@@ -71,16 +71,11 @@ def wait(
     running = _get_running_loop()
     if running is not None:  # asyncio keeps one per thread, here each stack has its own
         _set_running_loop(None)
-    runners = stacks.runners
-    given = runners.next().switch()
-    while given and serve is not None:
-        del runners.blocked[blocked]
-        if not serve(*given):
-            blocked.stop_waiting()
-            blocked.resumed()
-            return True
-        runners.blocked[blocked] = None
-        given = runners.next().switch()
+    given = stacks.runners.next().switch()
+    if given and serve is not None and serve(*given):
+        blocked.stop_waiting()
+        blocked.resumed()
+        return True
     if running is not None:
         _set_running_loop(running)
     stacks.runners.blocked.pop(blocked, None)

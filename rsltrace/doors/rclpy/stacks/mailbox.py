@@ -46,13 +46,14 @@ class Mailbox:
         self.entries: deque[tuple[int, Dispatchable]] = deque()
         self.raised: BaseException | None = None
         """What has come out of the callback that the executor runs, which raises it."""
-        self._admitted: Dispatchable | None = None
+        self.admitted: Dispatchable | None = None
+        """What was taken out and runs now."""
 
     def keeps(self, item: Dispatchable, leave: Callable[[], None] | None = None) -> bool:
         """Keep what the loop dispatches, or have the executor run it at once; False if that has
         taken it out and runs it now. ``leave`` is called if it is kept."""
-        if self._admitted is item:
-            self._admitted = None
+        if self.admitted is item:
+            self.admitted = None
             return False
         pump = self.pump
         if pump is not None and pump.standby is not None and pump.standby.runs(self, item):
@@ -67,9 +68,9 @@ class Mailbox:
 
     def run(self, item: Dispatchable) -> None:
         """Run what was taken out, on the stack of whoever calls this."""
-        self._admitted = item
+        self.admitted = item
         item.dispatch()
-        self._admitted = None
+        self.admitted = None
 
     def close(self) -> None:
         """Run nothing any more."""

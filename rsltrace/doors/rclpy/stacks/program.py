@@ -50,6 +50,7 @@ class Programs:
     """
 
     def __init__(self) -> None:
+        self.places = _places()
         self.host = Program(self)
         self.present = self.host
         self.all: list[Program] = []
@@ -120,7 +121,7 @@ class Program:
         kept = self._kept
         if kept is None:
             kept = self._first_values()
-        system, modules, rclpy, utilities, context = _places()
+        system, modules, rclpy, utilities, context = programs.places
         # Every callback of a main comes by here twice, so there is no loop.
         before._kept = (
             system["argv"],

@@ -104,8 +104,10 @@ class Wait:
         self._group = group
         self.stack = getcurrent()
         self.timed_out = False
-        self._woken = False
-        self._event = (event.handle, event.entity, event.node)
+        self.woken = False
+        """Whether anything lets the call return."""
+        self.event = (event.handle, event.entity, event.node)
+        """Whose event it is that waits: handle, entity and node."""
         self.constructing = programs.constructing
         """The entry under construction where it waits."""
         self._end_group = event.on_end
@@ -116,7 +118,7 @@ class Wait:
     @property
     def entity_id(self) -> int:
         """The entity whose callback waits."""
-        return self._event[1]
+        return self.event[1]
 
     @property
     def group(self) -> object:
@@ -126,11 +128,11 @@ class Wait:
     @property
     def waiting(self) -> bool:
         """Whether nothing has let the call return yet."""
-        return not self._woken
+        return not self.woken
 
     def stop_waiting(self) -> None:
         """Take no more notice of what the call waited for."""
-        self._woken = True
+        self.woken = True
 
     def is_patient(self) -> bool:
         """Return whether it is in order to wait for ever: for more work, say."""
@@ -142,24 +144,24 @@ class Wait:
 
     def wake(self) -> None:
         """Let the call return: because of the event under way."""
-        if not self._woken:
-            self._woken = True
+        if not self.woken:
+            self.woken = True
             domain = self._runners.domain
-            position = domain.dispatcher.note(OutputKind.TASK, self._event[1], 2)
+            position = domain.dispatcher.note(OutputKind.TASK, self.event[1], 2)
             self._cause = (domain.loop.events, position)
             self._input_hash = domain.event.input_hash
             domain.loop.tasks.append(self)
 
     def release(self) -> None:
         """Let the call return, because of nothing that has an event."""
-        if not self._woken:
-            self._woken = True
+        if not self.woken:
+            self.woken = True
             self._runners.domain.loop.tasks.append(self)
 
     def time_out(self) -> None:
         """Let the call return: because its time is up."""
-        if not self._woken:
-            self._woken = self.timed_out = True
+        if not self.woken:
+            self.woken = self.timed_out = True
             self._runners.domain.loop.ready.append(self)
 
     def dispatch(self) -> None:
@@ -171,7 +173,7 @@ class Wait:
         """Begin the RESUME event (called on the blocked call's own stack)."""
         dispatcher, programs = self._runners.domain.dispatcher, self._runners.programs
         event = dispatcher.event
-        event.handle, event.entity, event.node = self._event
+        event.handle, event.entity, event.node = self.event
         if dispatcher.on_node is not None:
             dispatcher.on_node(event.node)
         event.kind = _RESUME
@@ -186,15 +188,6 @@ class Wait:
         if dispatcher.on_resume is not None:
             dispatcher.on_resume()
 
-    def stay(self) -> None:
-        """Go on to wait: something else has run on the stack meanwhile, as events of its own."""
-        dispatcher = self._runners.domain.dispatcher
-        event = dispatcher.event
-        event.handle, event.entity, event.node = self._event
-        if dispatcher.on_node is not None:
-            dispatcher.on_node(event.node)
-        self._runners.programs.leave()
-
     def follow(self, event: int) -> None:
         """Go on after ``event``, which has run on the stack meanwhile."""
         self._cause = (event, 0)
@@ -205,7 +198,7 @@ class Wait:
 
     def describe(self) -> str:
         """Name the callback that waits."""
-        return self._event[0].describe() if self._event[0] is not None else "the run"
+        return self.event[0].describe() if self.event[0] is not None else "the run"
 
     def waits_for(self) -> str:
         """Say who waits for what, with the lines of user code that led there."""
