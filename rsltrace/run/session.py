@@ -14,6 +14,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from rsltrace.doors.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
 from rsltrace.launch import expand
@@ -42,6 +43,7 @@ from rsltrace.run.plans.executables import why_not
 from rsltrace.run.plans.guard import RunGuard, install_guard
 from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
+from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.starts import missed_starts
@@ -159,6 +161,7 @@ class Session:
         self._plan: NetworkPlan | None
         self._recorded: RecordedRun | None
         self._late: LateLibraries
+        self._processes: ProcessDoor
         self._numerics_known = True
 
     @property
@@ -255,6 +258,8 @@ class Session:
         self.world = world = stack.enter_context(
             kind(loop, base_dir=job.base_dir, seed=job.seed, echo=self._echo)
         )
+        self._processes = process_door(job, world)
+        stack.callback(self._processes.close)
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
@@ -283,7 +288,7 @@ class Session:
         with world.importing():
             self._entries = [
                 *hook_entries(job, "before", job.hooks.before, lambda: job),
-                *node_entries(job),
+                *node_entries(job, told=self._observer.note or (lambda text: None)),
                 *hook_entries(job, "after", job.hooks.after, world.all_nodes),
             ]
 
@@ -431,9 +436,11 @@ class Session:
         if self._recorded is not None and self.world.error is None:
             unused = (*self._recorded.notes(), *unused)
         with self._engaged():
+            outcome.note_end(loop.events)
+            self._processes.end()
             self.world.destroy()
         error = self.world.error
-        exit_code = error.exit_code if error else stop.exit_code or self.world.exit_code
+        exit_code = error.exit_code if error else self._exit_code(stop)
         if self._writer is not None:
             self._guarded.write(self._writer)
             keep_choices(self._writer, loop)
@@ -466,6 +473,9 @@ class Session:
             guarded=self._guarded.counts,
             kept="" if self._writer is None else self._writer.kept,
         )
+
+    def _exit_code(self, stop: Stop) -> int:
+        return stop.exit_code or self.world.exit_code or self._processes.exit_code
 
     def _order_of_starts(self) -> dict[str, str]:
         """Return what a trace keeps of the order of its constructions where it is not the job's."""

@@ -55,6 +55,8 @@ class Entry:
     """When it starts, None for those that start with the run."""
     stdin: Sequence[Typed] | None = None
     """What is typed at its terminal, None if it has none."""
+    program: object | None = None
+    """What runs as a process of its own, if it does: ``World.start_process`` knows how."""
 
 
 _PART = "[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*"

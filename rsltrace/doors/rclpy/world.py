@@ -77,6 +77,8 @@ class World:
         self.constructed: list[Entry] = []
         """The entries in the order in which they have been constructed."""
         self.starts = Starts(self.stacks, self.construct)
+        self.start_process: Callable[[Entry, tuple[int, int]], None]
+        """Starts an entry that runs as a process of its own, as one event."""
 
     def __enter__(self) -> World:
         stacks = self.stacks
@@ -141,7 +143,11 @@ class World:
         """Say what will be constructed, and when the run starts: a main that ends must know of
         those that begin later."""
         programs = self.stacks.programs
-        programs.all = [Program(programs, entry) for entry in entries if entry.argv is not None]
+        programs.all = [
+            Program(programs, entry)
+            for entry in entries
+            if entry.argv is not None and entry.program is None
+        ]
         self._terminals.make(programs.all, start_ns)
 
     @contextmanager
@@ -167,6 +173,10 @@ class World:
             # What a callback sends leaves when it is over: that takes links.
             self.use_network(NetworkPlan())
 
+    def show_log(self, severity: int, name: str, text: str) -> None:
+        """Print a log record of a node that publishes its records itself, if they are printed."""
+        self._logs.show(severity, name, text)
+
     def echo_logs(self, echo: bool) -> None:
         """Print log records on stderr from now on, or no longer."""
         self._logs.echo = echo
@@ -180,6 +190,9 @@ class World:
         """
         stacks = self.stacks
         self.constructed.append(entry)
+        if entry.program is not None:
+            self.start_process(entry, cause)
+            return stacks.loop.stopped is None
         if entry.argv is not None:
             program = next(one for one in stacks.programs.all if one.entry is entry)
             begin_program(stacks, program, cause)

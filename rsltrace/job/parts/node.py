@@ -13,7 +13,7 @@ from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.part import Part
 from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.job.parts.stdin import InputSpec, inputs
-from rsltrace.job.values.checks import attach, check, items, one_of, part, text
+from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
 from rsltrace.job.values.names import (
     check_executable,
     check_module,
@@ -111,10 +111,31 @@ def _plain_floats(value: object) -> object:
     return value
 
 
-_KINDS = ("node", "main", "executable", "script", "module")
+_KINDS = ("node", "main", "executable", "script", "module", "program")
 """What an entry may be."""
 _ONE_OF = f"{', '.join(map(repr, _KINDS[:-1]))} and {_KINDS[-1]!r}"
 _WITH_WORDS = ", ".join(f"'{kind}'" for kind in _KINDS[1:])
+
+
+def _check_environment(value: object) -> dict[str, str]:
+    if not isinstance(value, dict):
+        raise Problem(f"expected a mapping of names to texts, got {describe(value)}")
+    problems = Collected()
+    for name, content in value.items():
+        with problems.at(str(name), at_key=True):
+            if not isinstance(name, str) or not name or "=" in name or "\0" in name:
+                raise Problem(f"{name!r} cannot be the name of an environment variable")
+        with problems.at(str(name)):
+            if isinstance(content, bool) or not isinstance(content, (str, int, float)):
+                raise Problem(f"expected a text, got {describe(content)}")
+    problems.check()
+    return {name: str(getattr(content, "text", content)) for name, content in value.items()}
+
+
+attach(
+    _check_environment,
+    schema={"type": "object", "additionalProperties": {"type": ["string", "number"]}},
+)
 
 _NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
 attach(
@@ -136,14 +157,15 @@ attach(
 
 
 class NodeSpec(Part):
-    """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``.
+    """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``,
+    ``program``.
 
     ``node`` is a Node subclass or a function returning a node or a list of nodes, ``main`` a
     function that initializes rclpy, makes nodes and spins, ``executable`` (``package/name``) an
     installed one, ``script`` a file to run as ``python script.py`` does, ``module`` one to run as
-    ``python -m module`` does. ``arguments`` are keyword arguments of a ``node``, and command-line
-    words (a list) of the others. ``parameters`` are flat (dotted names); paths are relative to the
-    job's folder.
+    ``python -m module`` does, ``program`` a file to run as a process. ``arguments`` are keyword
+    arguments of a ``node``, and command-line words (a list) of the others. ``parameters`` are flat
+    (dotted names); paths are relative to the job's folder.
     """
 
     ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
@@ -169,8 +191,8 @@ class NodeSpec(Part):
     )
     executable: Annotated[str | None, check(_check_executable, optional=True)] = Field(
         default=None,
-        description="Instead of `node`: an installed Python executable, as `ros2 run` would start "
-        "it, as `package/name`.",
+        description="Instead of `node`: an installed executable, as `ros2 run` would start it, as "
+        "`package/name`. A compiled one runs as a process of its own.",
         examples=["demo_nodes_py/talker"],
     )
     script: Annotated[str | None, check(check_path, optional=True)] = Field(
@@ -183,6 +205,23 @@ class NodeSpec(Part):
         description="Instead of `node`: a module (or package), run as `python -m module` runs it. "
         "Looked for in `search_path`.",
         examples=["my_robot.talker"],
+    )
+    program: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a file that uses rcl and can be executed (C, C++), run as "
+        "a process of its own.",
+        examples=["build/talker"],
+    )
+    isolated: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether Python code runs as a process of its own, like a `program`, and not "
+        "in the process of the run. For `executable`, `script` and `module`.",
+        examples=[True],
+    )
+    environment: Annotated[dict[str, str], check(_check_environment)] = Field(
+        default_factory=dict,
+        description="Environment variables of a process, beside those that rsltrace has itself.",
+        examples=[{"RCUTILS_LOGGING_USE_STDOUT": "1"}],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
         default=None,
@@ -254,6 +293,9 @@ class NodeSpec(Part):
             executable: str | None = None,
             script: str | os.PathLike[str] | None = None,
             module: str | None = None,
+            program: str | os.PathLike[str] | None = None,
+            isolated: bool = False,
+            environment: dict[str, str] = ...,
             name: str | None = None,
             namespace: str | None = None,
             parameters: dict[str, Any] = ...,
@@ -296,6 +338,7 @@ class NodeSpec(Part):
                 ("stdin",),
                 at_key=True,
             )
+        self._check_process(kinds[0])
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
             raise Problem(
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
@@ -303,16 +346,42 @@ class NodeSpec(Part):
             )
         return self
 
+    def _check_process(self, kind: str) -> None:
+        if self.isolated and kind in ("node", "main"):
+            raise Problem(
+                f"a '{kind}' is a part of a program: name what runs it as 'script', 'module' or "
+                "'executable' to have it in a process of its own",
+                ("isolated",),
+            )
+        if self.is_process and self.stdin is not None:
+            raise Problem("a process has no terminal in a run", ("stdin",), at_key=True)
+        if self.is_process and self.guard is not None:
+            raise Problem(
+                "the guard is for Python code in the process of the run", ("guard",), at_key=True
+            )
+        if self.environment and not (self.is_process or kind == "executable"):
+            raise Problem(
+                "only a process has an environment of its own: 'program', or 'isolated: true'",
+                ("environment",),
+                at_key=True,
+            )
+
+    @property
+    def is_process(self) -> bool:
+        """Whether the entry says that it is a process (a compiled ``executable`` is one, too)."""
+        return self.isolated or self.program is not None
+
     @property
     def kind(self) -> str:
-        """Which of ``node``, ``main``, ``executable``, ``script`` and ``module`` the entry is."""
+        """Which of ``node``, ``main``, ``executable`` and so on the entry is."""
         return next(name for name in _KINDS if getattr(self, name) is not None)
 
     @property
     def absent(self) -> tuple[str, ...]:
         """The keys that stand for other kinds of entries, and those that only some entries have."""
         not_given = [name for name in ("start_after", "stdin") if getattr(self, name) is None]
-        return (*(name for name in _KINDS if name != self.kind), *not_given)
+        unused = [name for name in ("isolated", "environment") if not getattr(self, name)]
+        return (*(name for name in _KINDS if name != self.kind), *not_given, *unused)
 
     @property
     def target(self) -> str:
@@ -321,5 +390,5 @@ class NodeSpec(Part):
 
     @property
     def package(self) -> str:
-        """The package that the entry names (or the module that is in none), "" for a script."""
-        return "" if self.script is not None else re.split("[:./]", self.target)[0]
+        """The package that the entry names (or the module that is in none), "" for a file."""
+        return "" if self.script or self.program else re.split("[:./]", self.target)[0]

@@ -19,19 +19,26 @@ from rsltrace.job.values.problem import Loc
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.executables import Mains
+from rsltrace.run.plans.processes import Processes
 from rsltrace.run.plans.target import load_target
 from rsltrace.run.plans.typed import typed_at
 
 _BY_NAME = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
 
-def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
+def node_entries(
+    job: Job,
+    only: Container[int] | None = None,
+    told: Callable[[str], None] = lambda text: None,
+) -> list[Entry]:
     """Import what the job names and let rcl parse the arguments, before anything is constructed.
 
-    ``only`` are the places in ``nodes:`` of those that are wanted (None: all).
+    ``only`` are the places in ``nodes:`` of those that are wanted (None: all); ``told`` is given
+    a line if something takes long.
     """
     entries = []
     mains = Mains(job)
+    processes = Processes(job, told)
     for_all = _arguments_for_all(job)
     keys = entry_keys(job.nodes)
     for index, (spec, key) in enumerate(zip(job.nodes, keys, strict=True)):
@@ -39,7 +46,7 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
             continue
         loc = ("nodes", index, spec.kind)
         where = spec.origin or locate(job, loc)
-        argv = None
+        argv = program = None
         make: Any
         with showing_line(job, loc):
             _check_parameter_files(job, index)
@@ -52,7 +59,11 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
                 where=where,
                 for_all=for_all,
             )
-            if isinstance(spec.arguments, tuple) or spec.node is None:
+            if spec.node is None:
+                program = processes.find(spec, arguments, where=where)
+            if program is not None:
+                argv, make = list(program.argv), _never
+            elif isinstance(spec.arguments, tuple) or spec.node is None:
                 name, make = mains.find(spec, where=where)
                 argv = [name, *spec.arguments]
             else:
@@ -71,9 +82,14 @@ def node_entries(job: Job, only: Container[int] | None = None) -> list[Entry]:
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
                 start_after=_start_rule(job, spec, keys),
                 stdin=typed_at(job, index),
+                program=program,
             )
         )
     return entries
+
+
+def _never() -> object:
+    raise AssertionError("a process is started, not called")
 
 
 def _start_rule(job: Job, spec: NodeSpec, keys: Sequence[str]) -> StartRule | None:

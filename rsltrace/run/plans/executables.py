@@ -104,6 +104,8 @@ def _own_copy(package: str) -> Iterator[None]:
 
 def why_not(package: str, name: str) -> str | None:
     """Return why an executable cannot run here, or None if it can; nothing is imported."""
+    if compiled_file(f"{package}/{name}") is not None:
+        return None
     try:
         find_executable(f"{package}/{name}", where="")
     except JobError as error:
@@ -146,6 +148,31 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         f"package {package!r} has no executable {name!r}{_near(name, available)}: {has}",
         where=where,
     )
+
+
+def compiled_file(target: str) -> Path | None:
+    """Return the file of ``package/name`` if that is a compiled program, else None."""
+    package, _, name = target.partition("/")
+    path = None if name in _console_scripts(package) else _installed_files(package).get(name)
+    if path is None:
+        return None
+    with path.open("rb") as file:
+        return path if file.read(len(_ELF)) == _ELF else None
+
+
+def installed_file(target: str, *, where: str) -> Path:
+    """Return the file that starts ``package/name``: a ROS package's, or that of a console script.
+
+    :raises JobError: if there is none.
+    """
+    package, _, name = target.partition("/")
+    found = _installed_files(package).get(name)
+    if found is None and name in _console_scripts(package):
+        found = Path(sys.executable).parent / name
+    if found is None or not found.is_file():
+        find_executable(target, where=where)  # says what is wrong, if it is not the file
+        raise JobError(f"{target} has no file that could be started as a process", where=where)
+    return found
 
 
 def _same(name: str) -> str:
@@ -216,4 +243,4 @@ def _python_script(path: Path, target: str, where: str) -> MainProgram:
     )
 
 
-__all__ = ["Mains", "find_executable", "source_of"]
+__all__ = ["Mains", "compiled_file", "find_executable", "installed_file", "source_of"]

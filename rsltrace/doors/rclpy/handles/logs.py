@@ -130,6 +130,11 @@ class Logs:
         data = rosout._serialize(record)
         rosout.send(data, hash64(log_content(data)))
 
+    def show(self, severity: int, name: str, message: str) -> None:
+        """Print a record, if records are printed."""
+        if self.echo:
+            self._print(severity, self._domain.loop.now_ns, name, message)
+
     def _print(self, severity: int, now_ns: int, name: str, message: str) -> None:
         """Show a record; who cannot be told any more (``2>&1 | head``) changes nothing in a run."""
         label = _SEVERITY.get(severity, str(severity))

@@ -1,0 +1,167 @@
+"""A child process and the socket to it: starting, talking, reaping, and leaving none behind."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import signal
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.doors.processes.wire import HEAD, RECORD, Told
+from rsltrace.errors import JobError
+
+_ROOM = 1 << 16
+_LOOK_S = 0.2
+_GRACE_S = 2.0
+_NO_RANDOM_ADDRESSES = 0x0040000
+_PRESENT = 0xFFFFFFFF
+
+
+@dataclass(frozen=True, slots=True)
+class Ended:
+    """How a process ended: its exit status (negative: the signal that killed it), in words."""
+
+    status: int
+    closed_link: bool = False
+
+    @property
+    def failed(self) -> bool:
+        """Whether that was no orderly end."""
+        return self.status != 0 or self.closed_link
+
+    @property
+    def said(self) -> str:
+        """What happened, as the end of a sentence."""
+        if self.closed_link:
+            return "closed the descriptor by which rsltrace runs it, and was killed"
+        if self.status >= 0:
+            return f"ended with exit status {self.status}"
+        with suppress(ValueError):
+            return f"was killed by {signal.Signals(-self.status).name}"
+        return f"was killed by signal {-self.status}"
+
+
+class Child:
+    """A running executable with the library in it, in a process group of its own.
+
+    :raises JobError: if it cannot be started.
+    """
+
+    def __init__(
+        self,
+        argv: Sequence[str],
+        environment: Mapping[str, str],
+        folder: Path | None,
+        name: str,
+    ) -> None:
+        self._name = name
+        here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        with there:
+            # A reader that looks up now and then sees the end of a child whose own children live.
+            here.setsockopt(
+                socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, int(_LOOK_S * 1e6))
+            )
+            link = f"{there.fileno()}:{os.getpid()}"
+            try:
+                with _addresses_as_they_are():
+                    self._process = subprocess.Popen(
+                        list(argv),
+                        env={**environment, "RSLTRACE_LINK": link},
+                        cwd=folder,
+                        stdin=subprocess.DEVNULL,
+                        pass_fds=(there.fileno(),),
+                        start_new_session=True,
+                    )
+            except OSError as error:
+                here.close()
+                raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
+        self._socket = here
+        self._there = b""
+
+    @property
+    def pid(self) -> int:
+        """The number of the process."""
+        return self._process.pid
+
+    def send(self, data: bytes) -> None:
+        """Send to the process; one that is gone is noticed by ``receive``."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self._socket.sendall(data)
+
+    def receive(self) -> memoryview | None:
+        """Return the next batch, None if the process has ended."""
+        data = self._there or self._read(_ROOM)
+        if not data:
+            return None
+        size = HEAD.size
+        while len(data) < size:
+            more = self._read(_ROOM)
+            if not more:
+                return None
+            data += more
+        size += HEAD.unpack_from(data)[0]
+        if len(data) < size:
+            parts, count = [data], len(data)
+            while count < size:
+                more = self._read(max(_ROOM, size - count))
+                if not more:
+                    return None
+                parts.append(more)
+                count += len(more)
+            data = b"".join(parts)
+        self._there = data[size:]
+        return memoryview(data)[HEAD.size : size]
+
+    def _read(self, size: int) -> bytes:
+        while True:
+            try:
+                return self._socket.recv(size)
+            except BlockingIOError:
+                if self._process.poll() is not None:
+                    with suppress(BlockingIOError):  # what it said before
+                        return self._socket.recv(size, socket.MSG_DONTWAIT)
+                    return b""
+            except ConnectionResetError:
+                return b""
+
+    def reap(self) -> Ended:
+        """Wait for the end of a process that says no more; one that lives on is killed."""
+        try:
+            return Ended(self._process.wait(_GRACE_S))
+        except subprocess.TimeoutExpired:
+            self.kill()
+            return Ended(self._process.returncode, closed_link=True)
+
+    def dismiss(self) -> None:
+        """End the process: it is told to, and killed if it does not."""
+        self.send(RECORD.pack(0, Told.KILL))
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_GRACE_S)
+        self.kill()
+
+    def kill(self) -> None:
+        """Kill the process with all that it has started."""
+        with suppress(ProcessLookupError, PermissionError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        self._socket.close()
+
+
+@contextmanager
+def _addresses_as_they_are() -> Iterator[None]:
+    """Let children have the same addresses in every run, where the system allows it."""
+    personality = ctypes.CDLL(None).personality
+    before = personality(ctypes.c_ulong(_PRESENT))
+    if before >= 0:
+        personality(ctypes.c_ulong(before | _NO_RANDOM_ADDRESSES))
+    try:
+        yield
+    finally:
+        if before >= 0:
+            personality(ctypes.c_ulong(before))

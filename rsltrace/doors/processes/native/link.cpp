@@ -1,0 +1,203 @@
+#include "link.h"
+
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <signal.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include "endpoints.h"
+
+namespace rsltrace {
+
+namespace {
+
+constexpr std::size_t HEAD = 4;  // the length of a batch, before it
+constexpr std::size_t ROOM = 1 << 16;
+
+int link_fd = -1;
+std::int64_t time_ns = 0;
+std::uint64_t seed_of_process = 0;
+std::size_t filled = 0;  // bytes of what has been received
+
+// Not static objects: the link is up before these are made, and goes on when they are gone.
+std::vector<std::uint8_t> &batch_there() {
+  static auto *all = new std::vector<std::uint8_t>(HEAD);
+  return *all;
+}
+
+std::vector<std::uint8_t> &received_there() {
+  static auto *all = new std::vector<std::uint8_t>(ROOM);
+  return *all;
+}
+
+[[noreturn]] void leave(int status) {
+  syscall(SYS_exit_group, status);
+  __builtin_unreachable();
+}
+
+// The loop is gone, or says nothing that makes sense: nothing of this process may outlive the run.
+[[noreturn]] void lost() { leave(120); }
+
+void append(const void *data, std::size_t size) {
+  const auto *first = static_cast<const std::uint8_t *>(data);
+  auto &batch = batch_there();
+  batch.insert(batch.end(), first, first + size);
+}
+
+void send_batch() {
+  auto &batch = batch_there();
+  const auto size = static_cast<std::uint32_t>(batch.size() - HEAD);
+  std::memcpy(batch.data(), &size, HEAD);
+  const std::uint8_t *next = batch.data();
+  std::size_t left = batch.size();
+  while (left > 0) {
+    const auto sent = syscall(SYS_sendto, link_fd, next, left, MSG_NOSIGNAL, nullptr, 0);
+    if (sent < 0 && errno == EINTR) continue;
+    if (sent <= 0) lost();
+    next += sent;
+    left -= static_cast<std::size_t>(sent);
+  }
+  batch.resize(HEAD);
+}
+
+// Read until `size` bytes are there.
+void receive(std::size_t size) {
+  auto &received = received_there();
+  if (received.size() < size) received.resize(size);
+  while (filled < size) {
+    const auto got = syscall(SYS_recvfrom, link_fd, received.data() + filled,
+                             received.size() - filled, 0, nullptr, nullptr);
+    if (got < 0 && errno == EINTR) continue;
+    if (got <= 0) lost();
+    filled += static_cast<std::size_t>(got);
+  }
+}
+
+struct Message {
+  Told kind;
+  const std::uint8_t *body;
+  std::size_t size;
+};
+
+// Return the next thing that the loop says; it stays readable until the next call.
+Message listen() {
+  filled = 0;  // the loop speaks once for each time it is spoken to
+  std::uint32_t head[2];
+  receive(sizeof head);
+  std::memcpy(head, received_there().data(), sizeof head);
+  receive(sizeof head + head[0]);
+  const auto kind = static_cast<Told>(head[1]);
+  if (kind == Told::KILL) leave(0);
+  return {kind, received_there().data() + sizeof head, head[0]};
+}
+
+void forked() {
+  if (link_fd >= 0) syscall(SYS_close, link_fd);
+  link_fd = -1;
+}
+
+__attribute__((constructor(101))) void begin() {
+  const char *told = getenv("RSLTRACE_LINK");
+  int fd = -1;
+  int parent = 0;
+  if (told == nullptr || sscanf(told, "%d:%d", &fd, &parent) != 2) return;
+  if (getppid() != parent) return;  // started by a process of the run: outside of it
+  if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
+  link_fd = fd;
+  pthread_atfork(nullptr, nullptr, forked);
+  Writer hello;
+  hello.number(static_cast<std::uint32_t>(getpid()));
+  const auto answer = ask(Say::HELLO, hello);
+  Reader reader(answer.data(), answer.size());
+  time_ns = reader.number<std::int64_t>();
+  seed_of_process = reader.number<std::uint64_t>();
+}
+
+}  // namespace
+
+bool linked() { return link_fd >= 0; }
+
+std::int64_t now_ns() { return time_ns; }
+
+std::uint64_t seed() { return seed_of_process; }
+
+void say(Say kind, const Writer &body) {
+  const std::uint32_t head[2] = {static_cast<std::uint32_t>(kind),
+                                 static_cast<std::uint32_t>(body.bytes.size())};
+  append(head, sizeof head);
+  append(body.bytes.data(), body.bytes.size());
+}
+
+std::vector<std::uint8_t> ask(Say kind, const Writer &body) {
+  say(kind, body);
+  send_batch();
+  const Message message = listen();
+  if (message.kind != Told::ANSWER) lost();
+  return std::vector<std::uint8_t>(message.body, message.body + message.size);
+}
+
+void idle(Waiter *const *waiters, std::size_t count) {
+  Writer body;
+  body.number(static_cast<std::uint32_t>(count));
+  for (std::size_t i = 0; i < count; i++) {
+    const Waiter &waiter = *waiters[i];
+    body.number(waiter.thread);
+    body.number(waiter.set == nullptr ? 0U : waiter.set->set);
+    body.number(waiter.deadline_ns);
+    body.text(waiter.what);
+  }
+  say(Say::WAIT, body);
+  send_batch();
+  const Message message = listen();
+  if (message.kind == Told::STOP) {
+    for (std::size_t i = 0; i < count; i++) {
+      if (waiters[i]->thread == 0 || count == 1) {
+        waiters[i]->woken = true;
+        waiters[i]->ready = {Wake::STOP, 0};
+      }
+    }
+    raise(SIGINT);  // as whoever starts nodes does; without a handler, the process ends here
+    return;
+  }
+  if (message.kind != Told::GO) lost();
+  Reader reader(message.body, message.size);
+  time_ns = reader.number<std::int64_t>();
+  const auto thread = reader.number<std::uint32_t>();
+  Ready ready;
+  ready.kind = static_cast<Wake>(reader.number<std::uint32_t>());
+  ready.id = reader.number<std::uint32_t>();
+  if (ready.kind == Wake::ENTITY) deliver(ready.id, reader);
+  if (ready.kind == Wake::TIMER) timer_may_run(ready.id);
+  for (std::size_t i = 0; i < count; i++) {
+    if (waiters[i]->thread == thread) {
+      waiters[i]->woken = true;
+      waiters[i]->ready = ready;
+    }
+  }
+}
+
+void report(const std::string &text) {
+  if (!linked()) return;
+  Writer body;
+  body.text(text);
+  say(Say::REPORT, body);
+}
+
+void *original(const char *library, const char *name) {
+  void *handle = dlopen(library, RTLD_LAZY | RTLD_NOLOAD);
+  void *found = handle == nullptr ? dlsym(RTLD_NEXT, name) : dlsym(handle, name);
+  if (found == nullptr) {
+    fprintf(stderr, "rsltrace: %s has no %s\n", library, name);
+    abort();
+  }
+  return found;
+}
+
+}  // namespace rsltrace

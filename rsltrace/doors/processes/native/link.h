@@ -1,0 +1,59 @@
+// The link to the loop: what the process puts out goes there in one batch with each wait, and the
+// loop says what runs next and what time it is.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "wire.h"
+
+#define RSLTRACE_EXPORT extern "C" __attribute__((visibility("default")))
+
+namespace rsltrace {
+
+constexpr std::int64_t NEVER_NS = INT64_MAX;
+
+enum class Wake : std::uint32_t { TIMEOUT = 0, ENTITY = 1, TIMER = 2, STOP = 3 };
+
+struct Ready {
+  Wake kind = Wake::TIMEOUT;
+  std::uint32_t id = 0;
+};
+
+// What a thread waits for, by the numbers of entities and timers in this process. `set` names these
+// towards the loop: a thread that waits for the same again says the same number.
+struct WaitSet {
+  std::uint32_t set = 0;
+  std::vector<std::uint32_t> ids;
+};
+
+// One blocked thread; it lives on its stack.
+struct Waiter {
+  std::uint32_t thread = 0;
+  std::int64_t deadline_ns = NEVER_NS;
+  const WaitSet *set = nullptr;  // null: a sleep, or a wait of pthreads with a time
+  const char *what = "";
+  bool woken = false;
+  Ready ready{};
+};
+
+// Whether a loop runs this process. If not (a grandchild, a forked copy), libc is what it was.
+bool linked();
+std::int64_t now_ns();
+std::uint64_t seed();
+
+// Append a record to the batch that goes out with the next wait or question.
+void say(Say kind, const Writer &body);
+// Send the batch with a question at its end, and return the answer.
+std::vector<std::uint8_t> ask(Say kind, const Writer &body);
+// No thread can run: send the batch with what is waited for, and return when one may go on.
+void idle(Waiter *const *waiters, std::size_t count);
+// Tell the user something about this process.
+void report(const std::string &text);
+
+// The function that a name means in the ROS library which has it (ours comes before it).
+void *original(const char *library, const char *name);
+
+}  // namespace rsltrace

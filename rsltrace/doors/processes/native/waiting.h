@@ -1,0 +1,39 @@
+// Waiting for one of many: whoever waits gets exactly one thing that is ready.
+#pragma once
+
+#include <cstdint>
+#include <vector>
+
+#include "endpoints.h"
+#include "guard_conditions.h"
+
+namespace rsltrace {
+
+// What is waited for, in the order in which it was named. `place` is where the caller has it.
+struct Wanted {
+  struct Condition {
+    GuardCondition *condition;
+    std::size_t place;
+  };
+  struct Receiver {
+    Endpoint *endpoint;
+    std::size_t place;
+    std::uint32_t kind;
+  };
+  std::vector<Condition> conditions;
+  std::vector<Receiver> receivers;
+  std::vector<std::uint32_t> timers;
+};
+
+struct Found {
+  enum class Kind { NOTHING, CONDITION, RECEIVER, TIMER } kind = Kind::NOTHING;
+  std::size_t index = 0;  // in its list of Wanted
+};
+
+// Wait until one of them is ready, or until `timeout_ns` have passed (below 0: for ever).
+Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *what);
+
+// The least that a wait takes that does not want to wait: without it, who polls would stop time.
+constexpr std::int64_t POLL_NS = 1'000'000;
+
+}  // namespace rsltrace

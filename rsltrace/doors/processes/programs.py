@@ -1,0 +1,65 @@
+"""From a file to a command line: what runs it, and the environment it needs."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from rsltrace.doors.processes.build import Library
+from rsltrace.doors.processes.door import Program
+
+_ELF = b"\x7fELF"
+_UNBUFFERED = "PYTHONUNBUFFERED"
+
+
+def is_compiled(path: Path) -> bool:
+    """Return whether a file is a compiled program."""
+    with path.open("rb") as file:
+        return file.read(len(_ELF)) == _ELF
+
+
+def is_python(path: Path) -> bool:
+    """Return whether a file is run by Python: a ``.py``, or a script that says so."""
+    with path.open("rb") as file:
+        first = file.readline(256)
+    return path.suffix == ".py" or (first.startswith(b"#!") and b"python" in first)
+
+
+def program(
+    command: Sequence[str],
+    library: Library,
+    *,
+    environment: Mapping[str, str],
+    folder: Path | None,
+    search_path: Sequence[str] = (),
+) -> Program:
+    """Return a command as a process of the run.
+
+    Python's output is not buffered: a process may be killed at any time. Programs without Python
+    get stand-ins for the symbols of Python that libraries of ROS ask for.
+    """
+    path = Path(command[0])
+    preload = [str(library.path)]
+    with path.open("rb") as file:
+        needs_symbols = b"libpython" not in file.read() and is_compiled(path)
+    if needs_symbols and path.resolve() != Path(sys.executable).resolve():
+        preload.append(str(library.python_symbols))
+    known = dict(os.environ)
+    places = [str(place) for place in library.ros.libraries]
+    around = {
+        **known,
+        _UNBUFFERED: "1",
+        **environment,
+    }
+    around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
+    around["LD_LIBRARY_PATH"] = os.pathsep.join([*places, *_listed(around, "LD_LIBRARY_PATH")])
+    if search_path:
+        around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
+    return Program(list(command), around, folder)
+
+
+def _listed(environment: Mapping[str, str], name: str) -> list[str]:
+    value = environment.get(name, "")
+    return [value] if value else []

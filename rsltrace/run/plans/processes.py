@@ -1,0 +1,142 @@
+"""Entries that run as processes of their own: what to start, with which words and surroundings."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rsltrace.doors.processes.build import Library, library
+from rsltrace.doors.processes.door import Interfaces, ProcessDoor, Program
+from rsltrace.doors.processes.programs import is_compiled, is_python, program
+from rsltrace.doors.rclpy.arguments import RosArguments
+from rsltrace.doors.rclpy.entry import Entry
+from rsltrace.doors.rclpy.wire.interfaces import (
+    get_message_class,
+    get_service_class,
+    message_type,
+    service_type,
+)
+from rsltrace.doors.rclpy.world import World
+from rsltrace.errors import JobError, SetupError
+from rsltrace.job import Job, NodeSpec
+from rsltrace.middleware.interface import MessageType, ServiceType
+from rsltrace.model.regular_file import not_regular
+from rsltrace.run.plans.executables import compiled_file, installed_file
+
+
+class Processes:
+    """Makes the command lines of a job's processes; the first needs the library to be built."""
+
+    def __init__(self, job: Job, told: Callable[[str], None]) -> None:
+        self._job = job
+        self._told = told
+        self._library: Library | None = None
+
+    def find(
+        self, spec: NodeSpec, arguments: Sequence[RosArguments], *, where: str
+    ) -> Program | None:
+        """Return what an entry starts as a process, None if it runs in the process of the run.
+
+        :raises JobError: if there is no such file, or it cannot be executed.
+        :raises SetupError: if the library cannot be built.
+        """
+        command = self._command(spec, where)
+        if command is None:
+            return None
+        words = [word for part in arguments for word in part.arguments]
+        if self._library is None:
+            try:
+                self._library = library(self._told)
+            except SetupError as error:
+                raise JobError(str(error), where=where) from error
+        return program(
+            [*command, *spec.arguments, *words],
+            self._library,
+            environment=spec.environment,
+            folder=None,
+            search_path=[str(self._job.resolve(path)) for path in self._job.search_path],
+        )
+
+    def _command(self, spec: NodeSpec, where: str) -> list[str] | None:
+        if spec.program is not None:
+            return _executable(self._job.resolve(spec.program), spec.program, where)
+        if spec.executable is not None:
+            compiled = compiled_file(spec.executable)
+            if compiled is not None:
+                return [str(compiled)]
+        if not spec.isolated:
+            return None
+        if spec.module is not None:
+            return [sys.executable, "-m", spec.module]
+        if spec.script is not None:
+            path = self._job.resolve(spec.script)
+            _check_file(path, spec.script, where)
+            return [sys.executable, str(path)]
+        assert spec.executable is not None
+        found = installed_file(spec.executable, where=where)
+        return [sys.executable, str(found)] if is_python(found) else [str(found)]
+
+
+def _check_file(path: Path, given: str, where: str) -> None:
+    if not path.exists():
+        raise JobError(f"there is no file {given}", where=where)
+    if kind := not_regular(path):
+        raise JobError(f"{given} is {kind}, not a program", where=where)
+
+
+def _executable(path: Path, given: str, where: str) -> list[str]:
+    _check_file(path, given, where)
+    if is_python(path):
+        return [sys.executable, str(path)]
+    if not os.access(path, os.X_OK):
+        raise JobError(f"{given} cannot be executed: chmod +x it, or build it", where=where)
+    if is_compiled(path):
+        return [str(path)]
+    first = path.open("rb").readline(256)
+    interpreter = (
+        shutil.which(first[2:].split()[-1].decode(errors="replace"))
+        if (first[:2] == b"#!" and first[2:].split())
+        else None
+    )
+    if interpreter is None:
+        raise JobError(f"{given} is neither a compiled program nor a script", where=where)
+    return [interpreter, str(path)]
+
+
+def _message_type(name: str) -> MessageType:
+    try:
+        return message_type(get_message_class(name))
+    except SetupError:  # its package has nothing for Python: the trace has it by name only
+        return MessageType(name)
+
+
+def _service_type(name: str) -> ServiceType:
+    try:
+        return service_type(get_service_class(name))
+    except SetupError:
+        return ServiceType(name, MessageType(f"{name}_Request"), MessageType(f"{name}_Response"))
+
+
+def process_door(job: Job, world: World) -> ProcessDoor:
+    """Return the door through which a job's processes take part in its world."""
+    interfaces = Interfaces(_message_type, _service_type)
+    door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
+    programs = world.stacks.programs
+    door.on_end = lambda key: programs.tell("ended", key)
+
+    def start(entry: Entry, cause: tuple[int, int]) -> None:
+        assert isinstance(entry.program, Program)
+        door.start(
+            entry.program,
+            name=entry.name,
+            key=entry.key,
+            log_failure=entry.log_exceptions,
+            cause=cause,
+            on_start=lambda: programs.tell("started", entry.key),
+        )
+
+    world.start_process = start
+    return door
