@@ -120,9 +120,9 @@ def _paths_exist(job: JobFields) -> Iterator[Problem]:
                 loc = ("nodes", index, "parameter_files", number)
                 yield Problem(f"{file!r}: {what}{_near(job, file)}", loc)
     scripts = [
-        (("nodes", index, "script"), node.script)
+        (("nodes", index, node.kind), node.script or node.program or "")
         for index, node in enumerate(job.nodes)
-        if node.script is not None
+        if node.script is not None or node.program is not None
     ]
     typed = [
         (("nodes", index, "stdin", number, "file"), item.file)

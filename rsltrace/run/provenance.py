@@ -59,7 +59,7 @@ def write_job(writer: TraceWriter, job: Job) -> None:
 
 def source_files(job: Job) -> dict[str, Path]:
     """Return the file of every module loaded from the job's search path, by name; and of its
-    scripts and the files that its models come from (``file:`` and the path in the job).
+    scripts, programs and the files that its models come from (``file:`` and the path in the job).
 
     Which tests run beside it says nothing of a job, unless its nodes are theirs.
     """
@@ -87,8 +87,9 @@ def write_sources(writer: TraceWriter, job: Job) -> None:
 def _run_as_main(job: Job, folders: Sequence[str]) -> Iterator[tuple[str, Path]]:
     """Yield the files of a job that run as ``__main__`` and are no loaded modules."""
     for spec in job.nodes:
-        if spec.script is not None:
-            yield f"file:{spec.script}", job.resolve(spec.script)
+        file = spec.script or spec.program
+        if file is not None:
+            yield f"file:{file}", job.resolve(file)
         elif spec.module is not None:
             found = run_as_main(spec.module)
             if found is not None and is_below(found.origin or "", folders):

@@ -211,9 +211,7 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
     assert str(info.value).splitlines() == [
         "not all of the launch file can be simulated; --skip-unsupported (skip_unsupported: true "
         "in a job) leaves this out:",
-        "  a.launch.xml:2:3: demo/compiled: demo/compiled is a compiled program (compiled): "
-        "rsltrace runs Python nodes only; leave it out, or feed the graph what it publishes from "
-        "a bag",
+        "  a.launch.xml:2:3: demo/compiled: demo/compiled is a program for another machine",
         "  a.launch.xml:3:3: demo/script: demo/script is a script for /bin/sh (script): rsltrace "
         "runs Python nodes only; leave it out, or feed the graph what it publishes from a bag",
         "  a.launch.xml:4:3: demo/taker: package 'demo' has no executable 'taker'; did you mean "

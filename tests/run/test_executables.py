@@ -211,7 +211,7 @@ def test_a_main_that_exits_is_reported_and_the_others_go_on(
             "it has broken, defaults, listener, quitter, talker",
         ),
         ("executable: my_demo/broken", "my_demo_nodes:not_callable is a int, not callable"),
-        ("executable: my_scripts/compiled", "my_scripts/compiled is a compiled program"),
+        ("executable: my_scripts/compiled", "my_scripts/compiled is a program for another machine"),
         ("executable: my_scripts/launcher.sh", "my_scripts/launcher.sh is a script for /bin/sh"),
         ("executable: my_scripts/half", "my_scripts/half is not a Python program"),
         ("main: my_demo_nodes:taker", "module 'my_demo_nodes' has no 'taker'"),

@@ -21,6 +21,7 @@ _LOOK_S = 0.2
 _GRACE_S = 2.0
 _NO_RANDOM_ADDRESSES = 0x0040000
 _PRESENT = 0xFFFFFFFF
+_LOST_LINK = 120  # of native/link.cpp
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +40,7 @@ class Ended:
     def said(self) -> str:
         """What happened, as the end of a sentence."""
         if self.closed_link:
-            return "closed the descriptor by which rsltrace runs it, and was killed"
+            return "closed the descriptor by which rsltrace runs it"
         if self.status >= 0:
             return f"ended with exit status {self.status}"
         with suppress(ValueError):
@@ -133,7 +134,8 @@ class Child:
     def reap(self) -> Ended:
         """Wait for the end of a process that says no more; one that lives on is killed."""
         try:
-            return Ended(self._process.wait(_GRACE_S))
+            status = self._process.wait(_GRACE_S)
+            return Ended(status, closed_link=status == _LOST_LINK)
         except subprocess.TimeoutExpired:
             self.kill()
             return Ended(self._process.returncode, closed_link=True)

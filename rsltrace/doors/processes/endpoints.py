@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from rsltrace.doors.processes.wire import Ready, gid_of, packed_item
 from rsltrace.middleware.events.dispatcher import Dispatcher
@@ -18,10 +18,26 @@ from rsltrace.model.event import NO_EVENT, OutputKind
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 
-if TYPE_CHECKING:
-    from rsltrace.doors.processes.process import Process
-
 _NO_GID = bytes(16)
+
+
+class Host(Protocol):
+    """The process that endpoints and timers are in, as they see it."""
+
+    name: str
+    dispatcher: Dispatcher
+
+    def wants(self, thing: Endpoint | ProcessTimer) -> bool:
+        """Return whether one of its threads waits for a thing now."""
+
+    def hold(self, thing: Endpoint | ProcessTimer) -> None:
+        """Keep what is ready until the process waits for it."""
+
+    def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
+        """Let the thread that waits for a thing go on, until the process waits again."""
+
+    def was_no_callback(self) -> None:
+        """Say that the event under way is no callback's."""
 
 
 class RosoutPublisher(Publisher):
@@ -38,7 +54,7 @@ class ProcessSubscription(Subscription):
 
     def __init__(
         self,
-        process: Process,
+        process: Host,
         number: int,
         node: Participant,
         topic: str,
@@ -84,7 +100,7 @@ class ProcessService(Service):
 
     def __init__(
         self,
-        process: Process,
+        process: Host,
         number: int,
         transport: Transport,
         node: Participant,
@@ -136,7 +152,7 @@ class ProcessClient(Client):
 
     def __init__(
         self,
-        process: Process,
+        process: Host,
         number: int,
         transport: Transport,
         node: Participant,
@@ -188,9 +204,7 @@ class ProcessTimer(Timer):
 
     begins_active = False
 
-    def __init__(
-        self, dispatcher: Dispatcher, process: Process, number: int, period_ns: int
-    ) -> None:
+    def __init__(self, dispatcher: Dispatcher, process: Host, number: int, period_ns: int) -> None:
         super().__init__(dispatcher, None, period_ns)
         self.process = process
         self.number = number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 from rsltrace.doors.processes import graph_answers
 from rsltrace.doors.processes.child import Child, Ended
@@ -30,16 +30,16 @@ from rsltrace.doors.processes.wire import (
 )
 from rsltrace.errors import NodeError
 from rsltrace.loop.timer import TimerState
+from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.entity import DomainEntity
+from rsltrace.middleware.events.event import Door
+from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_ROSOUT
-
-if TYPE_CHECKING:
-    from rsltrace.doors.processes.door import ProcessDoor
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
@@ -53,13 +53,28 @@ _HELLO = struct.Struct("<qQ")
 Question = Callable[[Fields], bytes]
 
 
+class Surroundings(Door, Protocol):
+    """What a process finds in its run."""
+
+    domain: Domain
+    message_type: Callable[[str], MessageType]
+    service_type: Callable[[str], ServiceType]
+    log: Callable[[int, str, str], None]
+
+    def seed_of(self, key: str) -> int:
+        """Return the number from which a process draws what others take for entropy."""
+
+    def has_ended(self, process: Process) -> None:
+        """Take note that a process has ended, in the event under way."""
+
+
 class Process:
     """An executable that runs beside rsltrace; in the trace, a main.
 
     ``things`` are its nodes, endpoints and timers, by the numbers that it has for them.
     """
 
-    def __init__(self, door: ProcessDoor, name: str, key: str, *, log_failure: bool) -> None:
+    def __init__(self, door: Surroundings, name: str, key: str, *, log_failure: bool) -> None:
         self.door = door
         self.dispatcher = door.domain.dispatcher
         self.name = name
@@ -258,13 +273,13 @@ class Process:
         if not self.ended.failed:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)
-        text = (
-            f"process {self.name} {self.ended.said} at {at} s; the last that it ran was {self._last}"
-        )
+        ended = f"process {self.name} {self.ended.said} at {at} s"
+        text = f"{ended}; the last that it ran was {self._last}"
         if self.log_failure:
             self.door.log(40, self.name, text)
         else:
-            raise NodeError(text, node="", entity=self.name, stamp_ns=self.dispatcher.loop.now_ns)
+            now_ns = self.dispatcher.loop.now_ns
+            raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
 
     def vanish(self) -> None:
         """Destroy all that it has made."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -11,6 +12,9 @@ from rsltrace.doors.processes.build import Library
 from rsltrace.doors.processes.door import Program
 
 _ELF = b"\x7fELF"
+_ELF_HEAD = struct.Struct("<32xQ14xHH6x")
+"""Of its 64 bytes: where the program headers are, their size and number."""
+_PT_INTERP = struct.pack("<I", 3)
 _UNBUFFERED = "PYTHONUNBUFFERED"
 
 
@@ -18,6 +22,20 @@ def is_compiled(path: Path) -> bool:
     """Return whether a file is a compiled program."""
     with path.open("rb") as file:
         return file.read(len(_ELF)) == _ELF
+
+
+def why_not_run(path: Path) -> str:
+    """Return why a compiled program cannot take part in a run, "" if it can."""
+    with path.open("rb") as file, Path(sys.executable).open("rb") as own:
+        head, own_head = file.read(_ELF_HEAD.size), own.read(_ELF_HEAD.size)
+        if len(head) < _ELF_HEAD.size or head[:6] != own_head[:6] or head[18:20] != own_head[18:20]:
+            return "is a program for another machine"
+        start, size, count = _ELF_HEAD.unpack(head)
+        for number in range(count):
+            file.seek(start + number * size)
+            if file.read(4) == _PT_INTERP:
+                return ""
+    return "is linked statically, so that nothing can be put before its middleware"
 
 
 def is_python(path: Path) -> bool:

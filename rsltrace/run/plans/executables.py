@@ -16,12 +16,11 @@ from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
+from rsltrace.doors.processes.programs import is_compiled, why_not_run
 from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
-
-_ELF = b"\x7fELF"
 
 
 class Mains:
@@ -104,8 +103,10 @@ def _own_copy(package: str) -> Iterator[None]:
 
 def why_not(package: str, name: str) -> str | None:
     """Return why an executable cannot run here, or None if it can; nothing is imported."""
-    if compiled_file(f"{package}/{name}") is not None:
-        return None
+    compiled = compiled_file(f"{package}/{name}")
+    if compiled is not None:
+        reason = why_not_run(compiled)
+        return f"{package}/{name} {reason}" if reason else None
     try:
         find_executable(f"{package}/{name}", where="")
     except JobError as error:
@@ -154,10 +155,7 @@ def compiled_file(target: str) -> Path | None:
     """Return the file of ``package/name`` if that is a compiled program, else None."""
     package, _, name = target.partition("/")
     path = None if name in _console_scripts(package) else _installed_files(package).get(name)
-    if path is None:
-        return None
-    with path.open("rb") as file:
-        return path if file.read(len(_ELF)) == _ELF else None
+    return path if path is not None and is_compiled(path) else None
 
 
 def installed_file(target: str, *, where: str) -> Path:
@@ -230,7 +228,7 @@ def _python_script(path: Path, target: str, where: str) -> MainProgram:
     """
     with path.open("rb") as file:
         first = file.readline(256)
-    if first.startswith(_ELF):
+    if is_compiled(path):
         what = "a compiled program"
     elif first.startswith(b"#!") and b"python" not in first:
         what = f"a script for {first[2:].decode(errors='replace').strip()}"

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rsltrace.doors.processes.build import Library, library
 from rsltrace.doors.processes.door import Interfaces, ProcessDoor, Program
-from rsltrace.doors.processes.programs import is_compiled, is_python, program
+from rsltrace.doors.processes.programs import is_compiled, is_python, program, why_not_run
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.wire.interfaces import (
@@ -66,7 +66,7 @@ class Processes:
         if spec.executable is not None:
             compiled = compiled_file(spec.executable)
             if compiled is not None:
-                return [str(compiled)]
+                return _compiled(compiled, spec.executable, where)
         if not spec.isolated:
             return None
         if spec.module is not None:
@@ -87,6 +87,12 @@ def _check_file(path: Path, given: str, where: str) -> None:
         raise JobError(f"{given} is {kind}, not a program", where=where)
 
 
+def _compiled(path: Path, given: str, where: str) -> list[str]:
+    if reason := why_not_run(path):
+        raise JobError(f"{given} {reason}", where=where)
+    return [str(path)]
+
+
 def _executable(path: Path, given: str, where: str) -> list[str]:
     _check_file(path, given, where)
     if is_python(path):
@@ -94,7 +100,7 @@ def _executable(path: Path, given: str, where: str) -> list[str]:
     if not os.access(path, os.X_OK):
         raise JobError(f"{given} cannot be executed: chmod +x it, or build it", where=where)
     if is_compiled(path):
-        return [str(path)]
+        return _compiled(path, given, where)
     first = path.open("rb").readline(256)
     interpreter = (
         shutil.which(first[2:].split()[-1].decode(errors="replace"))

@@ -94,13 +94,34 @@ Message listen() {
   std::memcpy(head, received_there().data(), sizeof head);
   receive(sizeof head + head[0]);
   const auto kind = static_cast<Told>(head[1]);
-  if (kind == Told::KILL) leave(0);
+  if (kind == Told::KILL) {
+    fflush(nullptr);
+    leave(0);
+  }
   return {kind, received_there().data() + sizeof head, head[0]};
 }
 
 void forked() {
   if (link_fd >= 0) syscall(SYS_close, link_fd);
   link_fd = -1;
+}
+
+// What this process starts itself is no part of the run.
+void forget_environment() {
+  unsetenv("RSLTRACE_LINK");
+  const char *preload = getenv("LD_PRELOAD");
+  std::string kept;
+  for (std::string rest = preload == nullptr ? "" : preload; !rest.empty();) {
+    const auto end = rest.find(':');
+    const std::string name = rest.substr(0, end);
+    rest = end == std::string::npos ? "" : rest.substr(end + 1);
+    if (name.find("librmw_rsltrace") == std::string::npos) kept += (kept.empty() ? "" : ":") + name;
+  }
+  if (kept.empty()) {
+    unsetenv("LD_PRELOAD");
+  } else {
+    setenv("LD_PRELOAD", kept.c_str(), 1);
+  }
 }
 
 __attribute__((constructor(101))) void begin() {
@@ -111,6 +132,7 @@ __attribute__((constructor(101))) void begin() {
   if (getppid() != parent) return;  // started by a process of the run: outside of it
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
   link_fd = fd;
+  forget_environment();
   pthread_atfork(nullptr, nullptr, forked);
   Writer hello;
   hello.number(static_cast<std::uint32_t>(getpid()));

@@ -1,0 +1,92 @@
+// A node on rcl alone: a timer counts, and what comes in on /echo goes out on /heard.
+//
+// Usage: counter [period in ms] [what to do at the fifth count: crash, exit, hang, abort]
+#include <rcl/error_handling.h>
+#include <rcl/rcl.h>
+#include <signal.h>
+#include <std_msgs/msg/u_int64.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <unistd.h>
+
+#define CHECK(call)                                                            \
+  do {                                                                         \
+    if ((call) != RCL_RET_OK) {                                                \
+      fprintf(stderr, "%s: %s\n", #call, rcl_get_error_string().str);          \
+      exit(9);                                                                 \
+    }                                                                          \
+  } while (0)
+
+static const char *action = "";
+static rcl_publisher_t count_publisher;
+static uint64_t counted = 0;
+
+static void on_timer(rcl_timer_t *timer, int64_t since_last) {
+  (void)timer;
+  (void)since_last;
+  std_msgs__msg__UInt64 message;
+  std_msgs__msg__UInt64__init(&message);
+  message.data = ++counted;
+  CHECK(rcl_publish(&count_publisher, &message, NULL));
+  if (counted == 5 && strcmp(action, "crash") == 0) raise(SIGSEGV);
+  if (counted == 5 && strcmp(action, "exit") == 0) exit(7);
+  if (counted == 5 && strcmp(action, "leave") == 0) exit(0);
+  if (counted == 5 && strcmp(action, "fork") == 0 && fork() == 0) {
+    sleep(60);
+    _exit(0);
+  }
+  if (counted == 5 && strcmp(action, "close") == 0) {
+    for (int fd = 3; fd < 64; fd++) close(fd);
+  }
+  while (counted == 5 && strcmp(action, "hang") == 0) {
+  }
+}
+
+int main(int argc, const char **argv) {
+  const int64_t period_ms = argc > 1 && argv[1][0] != '-' ? atoi(argv[1]) : 100;
+  if (argc > 2 && argv[2][0] != '-') action = argv[2];
+  rcl_allocator_t allocator = rcl_get_default_allocator();
+  rcl_init_options_t options = rcl_get_zero_initialized_init_options();
+  CHECK(rcl_init_options_init(&options, allocator));
+  rcl_context_t context = rcl_get_zero_initialized_context();
+  CHECK(rcl_init(argc, argv, &options, &context));
+  rcl_node_t node = rcl_get_zero_initialized_node();
+  rcl_node_options_t node_options = rcl_node_get_default_options();
+  CHECK(rcl_node_init(&node, "counter", "", &context, &node_options));
+  const rosidl_message_type_support_t *type =
+      ROSIDL_GET_MSG_TYPE_SUPPORT(std_msgs, msg, UInt64);
+  rcl_publisher_options_t publisher_options = rcl_publisher_get_default_options();
+  count_publisher = rcl_get_zero_initialized_publisher();
+  CHECK(rcl_publisher_init(&count_publisher, &node, type, "count", &publisher_options));
+  rcl_publisher_t heard = rcl_get_zero_initialized_publisher();
+  CHECK(rcl_publisher_init(&heard, &node, type, "heard", &publisher_options));
+  rcl_subscription_options_t subscription_options = rcl_subscription_get_default_options();
+  rcl_subscription_t echo = rcl_get_zero_initialized_subscription();
+  CHECK(rcl_subscription_init(&echo, &node, type, "echo", &subscription_options));
+  rcl_clock_t clock;
+  CHECK(rcl_clock_init(RCL_STEADY_TIME, &clock, &allocator));
+  rcl_timer_t timer = rcl_get_zero_initialized_timer();
+  CHECK(rcl_timer_init2(&timer, &clock, &context, RCL_MS_TO_NS(period_ms), on_timer, allocator,
+                        true));
+  rcl_wait_set_t set = rcl_get_zero_initialized_wait_set();
+  CHECK(rcl_wait_set_init(&set, 1, 0, 1, 0, 0, 0, &context, allocator));
+  std_msgs__msg__UInt64 message;
+  std_msgs__msg__UInt64__init(&message);
+  while (rcl_context_is_valid(&context)) {
+    CHECK(rcl_wait_set_clear(&set));
+    CHECK(rcl_wait_set_add_subscription(&set, &echo, NULL));
+    CHECK(rcl_wait_set_add_timer(&set, &timer, NULL));
+    const rcl_ret_t told = rcl_wait(&set, -1);
+    if (told == RCL_RET_TIMEOUT) continue;
+    CHECK(told);
+    if (set.timers[0] != NULL) CHECK(rcl_timer_call(&timer));
+    if (set.subscriptions[0] != NULL) {
+      rmw_message_info_t info;
+      if (rcl_take(&echo, &message, &info, NULL) == RCL_RET_OK) {
+        CHECK(rcl_publish(&heard, &message, NULL));
+      }
+    }
+  }
+  return 0;
+}

@@ -1,0 +1,255 @@
+"""Executables in processes of their own, in the same run as nodes of this process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+
+import rsltrace
+from rsltrace.doors.processes.build import find_ros
+from rsltrace.errors import JobError, SetupError
+from rsltrace.job import load_job
+from rsltrace.model.event import EventKind
+from rsltrace.run.recording import run
+from rsltrace.trace.reader import Trace
+
+pytestmark = pytest.mark.ros
+
+ECHO = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import UInt64
+
+class Echo(Node):
+    def __init__(self):
+        super().__init__('echo')
+        self.publisher = self.create_publisher(UInt64, 'echo', 10)
+        self.create_subscription(UInt64, 'count', self.publisher.publish, 10)
+        self.create_subscription(UInt64, 'heard', self.heard, 10)
+
+    def heard(self, message):
+        now = self.get_clock().now().nanoseconds
+        self.get_logger().info(f'{message.data} at {now}')
+
+def main():
+    rclpy.init()
+    rclpy.spin(Echo())
+
+if __name__ == '__main__':
+    main()
+"""
+Compiled = Callable[[str], Path]
+
+
+@pytest.fixture
+def counter(compiled: Compiled, tmp_path: Path) -> Path:
+    """The C node, beside a Python file that answers it."""
+    (tmp_path / "echo_node.py").write_text(ECHO)
+    return compiled("counter.c")
+
+
+JOB = """
+search_path: [.]
+nodes:
+  - program: {program}
+    arguments: [{arguments}]
+    on_exception: {on_exception}
+  - {echo}
+stop: {{duration: 1s}}
+"""
+
+
+def _job(
+    folder: Path,
+    program: Path,
+    *arguments: str,
+    echo: str = "node: echo_node:Echo",
+    on_exception: str = "stop",
+    more: str = "",
+) -> rsltrace.Job:
+    text = JOB.format(
+        program=program, arguments=", ".join(arguments), echo=echo, on_exception=on_exception
+    )
+    (folder / "job.yaml").write_text(text + more)
+    return load_job(folder / "job.yaml")
+
+
+def _said(path: Path, *topics: str) -> dict[str, list[tuple[int, bytes]]]:
+    """Return (stamp, canonical bytes) of all messages of some topics."""
+    with Trace.open(path) as trace:
+        return {
+            topic: [(stamp, bytes(data)) for stamp, _, data in trace.messages(topic)]
+            for topic in topics
+        }
+
+
+def _logs(path: Path) -> list[tuple[int, str]]:
+    with Trace.open(path) as trace:
+        decoded = (
+            (stamp, trace.decode("/rosout", data)) for stamp, _, data in trace.messages("/rosout")
+        )
+        return [(stamp, record.msg) for stamp, record in decoded]  # type: ignore[attr-defined]
+
+
+def _number(count: int) -> bytes:
+    return b"\0\1\0\0" + count.to_bytes(8, "little")
+
+
+def test_a_c_program_and_a_node_of_this_process_are_in_one_run_and_each_run_is_the_same(
+    counter: Path, tmp_path: Path
+) -> None:
+    job = _job(tmp_path, counter, "'50'")
+    results = [run(job, tmp_path / f"{n}.mcap") for n in range(2)]
+    assert [result.error for result in results] == [None, None]
+    assert results[0].digest == results[1].digest
+    assert results[0].stop_reason.startswith("duration")
+    said = _said(tmp_path / "0.mcap", "/count", "/echo", "/heard")
+    expected = [(50_000_000 * n, _number(n)) for n in range(1, 21)]
+    assert said == {"/count": expected, "/echo": expected, "/heard": expected}
+    assert _logs(tmp_path / "0.mcap") == [(t, f"{t // 50_000_000} at {t}") for t, _ in expected]
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        heard = next(e for e in trace.entities.values() if e.name == "/echo" and e.node == 4)
+        events = [trace.event(i) for i in range(trace.event_count)]
+        first = next(event for event in events if event.entity == heard.id)
+        assert first.kind is EventKind.SUBSCRIPTION
+        assert events[first.cause_event].kind is EventKind.SUBSCRIPTION  # echo's own callback
+
+
+def test_an_isolated_script_says_what_it_says_in_this_process(
+    counter: Path, tmp_path: Path
+) -> None:
+    said = []
+    for name, more in (("here", ""), ("beside", "\n    isolated: true")):
+        job = _job(tmp_path, counter, echo=f"script: echo_node.py{more}")
+        assert run(job, tmp_path / f"{name}.mcap").error is None
+        path = tmp_path / f"{name}.mcap"
+        said.append((_said(path, "/count", "/echo", "/heard"), _logs(path)))
+    assert said[0] == said[1]
+    assert len(said[0][1]) == 10
+
+
+def test_a_link_delays_what_goes_to_a_process(counter: Path, tmp_path: Path) -> None:
+    job = _job(tmp_path, counter, more="delay: {default: 5ms}\n")
+    assert run(job, tmp_path / "t.mcap").error is None
+    said = _said(tmp_path / "t.mcap", "/count", "/echo", "/heard")
+    assert said["/echo"][0] == (105_000_000, _number(1))
+    assert said["/heard"][0] == (110_000_000, _number(1))
+
+
+@pytest.mark.parametrize(
+    ("action", "ending"),
+    [
+        ("crash", "was killed by SIGSEGV at 0.500000000 s"),
+        ("exit", "ended with exit status 7 at 0.500000000 s"),
+        ("close", "closed the descriptor by which rsltrace runs it at 0.500000000 s"),
+    ],
+)
+def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
+    counter: Path, tmp_path: Path, action: str, ending: str
+) -> None:
+    result = run(_job(tmp_path, counter, "'100'", action), tmp_path / "t.mcap")
+    assert str(result.error) == (
+        f"process {counter} {ending}; the last that it ran was /counter: timer timer 1"
+    )
+    assert result.exit_code == 3
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        assert trace.complete
+        last = trace.event(result.events - 1)
+    assert (last.kind, last.stamp_ns) == (EventKind.TIMER, 500_000_000)
+    _no_process_of(counter)
+
+
+def test_a_run_goes_on_without_a_process_if_the_job_says_so(counter: Path, tmp_path: Path) -> None:
+    job = _job(tmp_path, counter, "'100'", "crash", on_exception="log")
+    result = run(job, tmp_path / "t.mcap")
+    assert result.error is None
+    assert result.exit_code == 1
+    assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == 4  # the fifth was not sent
+
+
+@pytest.mark.parametrize(("action", "counted"), [("leave", 4), ("fork", 10)])
+def test_a_process_may_end_or_start_others(
+    counter: Path, tmp_path: Path, action: str, counted: int
+) -> None:
+    result = run(_job(tmp_path, counter, "'100'", action), tmp_path / "t.mcap")
+    assert (result.error, result.exit_code) == (None, 0)
+    assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == counted
+    _no_process_of(counter)
+
+
+def _no_process_of(program: Path) -> None:
+    """Fail unless every process of a program ends soon: the kernel needs a moment."""
+    deadline = time.monotonic() + 60
+    while _processes_of(program):
+        assert time.monotonic() < deadline, "a process was left behind"
+        time.sleep(0.02)
+
+
+def _processes_of(program: Path) -> list[int]:
+    found = []
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            with suppress(OSError):
+                if os.readlink(folder / "exe") == str(program):
+                    found.append(int(folder.name))
+    return found
+
+
+def test_no_process_outlives_a_run_that_is_killed(counter: Path, tmp_path: Path) -> None:
+    _job(tmp_path, counter, "'100'", "hang")
+    command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "t.mcap"]
+    with subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL) as started:
+        deadline = time.monotonic() + 100
+        while not _processes_of(counter):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        started.send_signal(signal.SIGKILL)
+    _no_process_of(counter)
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ("node: echo_node:Echo\n    isolated: true", "a 'node' is a part of a program"),
+        ("node: echo_node:Echo\n    environment: {A: b}", "only a process has an environment"),
+        ("program: nowhere", "there is no such file"),
+        ("program: echo_node.py\n    stdin: [yes]", "a process has no terminal in a run"),
+    ],
+)
+def test_entries_that_cannot_be_processes_are_refused(
+    tmp_path: Path, entry: str, expected: str
+) -> None:
+    (tmp_path / "echo_node.py").write_text(ECHO)
+    (tmp_path / "job.yaml").write_text(f"nodes:\n  - {entry}\n")
+    with pytest.raises(JobError, match=expected):
+        load_job(tmp_path / "job.yaml")
+
+
+def test_without_a_compiler_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "echo_node.py").write_text(ECHO)
+    (tmp_path / "job.yaml").write_text("nodes:\n  - script: echo_node.py\n    isolated: true\n")
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.delenv("CXX", raising=False)
+    with pytest.raises(
+        JobError, match=r"job.yaml:2:13: .*need a C\+\+ compiler.*apt install g\+\+"
+    ):
+        run(load_job(tmp_path / "job.yaml"), None)
+
+
+def test_without_headers_the_error_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.prefix", str(tmp_path))
+    monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
+    with pytest.raises(SetupError, match="need ROS 2 with its headers"):
+        find_ros()
