@@ -18,6 +18,7 @@ from rsltrace.guard.real_time import STEP_NS
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value
 from rsltrace.guard.redirect import copy_of
 from rsltrace.model.finding import Mode, Source
+from rsltrace.model.stamp import patience_ns
 
 NOT_YET: Any = object()
 """What somebody who looks for an answer returns if there is none."""
@@ -113,7 +114,7 @@ def wait_unrecorded(
 
 
 def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
-    return None if timeout_s is None else context.now_ns() + max(int(timeout_s * 1e9), 0)
+    return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
 
 
 def waiting_guard(frame: FrameType) -> Guard | None:

@@ -13,6 +13,15 @@ def format_seconds(stamp_ns: int) -> str:
     return f"{sign}{whole}.{fraction:09d}"
 
 
+def patience_ns(seconds: float) -> int:
+    """Return how long to wait for ``seconds``: a nanosecond at least, if it is more than nothing.
+
+    Who waits for what is left until a time (``Semaphore.acquire``, ``Condition.wait_for``) may find
+    that 1e-17 s are left: it would ask for ever, and never would any time pass.
+    """
+    return int(seconds * NS_PER_S) or int(seconds > 0)
+
+
 def format_duration(duration_ns: int) -> str:
     """Return a duration for people: ``12.5 s``, ``3.2 ms``, ``250 ns``.
 

@@ -18,6 +18,7 @@ from rsltrace.doors.rclpy.stacks.coroutines import Resume
 from rsltrace.doors.rclpy.stacks.sim_event import FutureWake, SimEvent
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.tasks import create_task
+from rsltrace.model.stamp import patience_ns
 
 
 class SimExecutor(Executor):  # type: ignore[misc]
@@ -80,7 +81,7 @@ class SimExecutor(Executor):  # type: ignore[misc]
         next_ns = loop.next_ns()
         limit_ns = None
         if timeout_sec is not None and timeout_sec >= 0:
-            limit_ns = int(timeout_sec * 1_000_000_000)
+            limit_ns = patience_ns(timeout_sec)
         if next_ns is not None:
             ahead_ns = max(next_ns - loop.now_ns, 0)
             limit_ns = ahead_ns if limit_ns is None else min(limit_ns, ahead_ns)

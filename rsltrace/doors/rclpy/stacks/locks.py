@@ -23,8 +23,8 @@ from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks, world_exists
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import UnsupportedError
+from rsltrace.model.stamp import patience_ns
 
-_NS_PER_S = 1_000_000_000
 _real_rlock = _thread.RLock
 
 
@@ -78,7 +78,7 @@ class SimLock:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
             )
-        for_ns = None if timeout == -1 else int(timeout * _NS_PER_S)
+        for_ns = None if timeout == -1 else patience_ns(timeout)
         in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
         what: Any = _Holder(stacks, self._owner, for_work=in_condition)
         if wait(stacks, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):

@@ -7,6 +7,7 @@ from typing import Any
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
 from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
+from rsltrace.model.stamp import patience_ns
 
 
 class SimEvent:
@@ -35,7 +36,7 @@ class SimEvent:
 
     def wait(self, timeout: float | None = None) -> bool:
         """Wait in simulated time until the event is set; return whether it is."""
-        return self.wait_ns(None if timeout is None else int(timeout * 1_000_000_000))
+        return self.wait_ns(None if timeout is None else patience_ns(timeout))
 
     def wait_ns(self, timeout_ns: int | None) -> bool:
         """Do ``wait`` with a timeout in nanoseconds."""

@@ -20,6 +20,7 @@ from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.recorded.processes import sleep_for_process
 from rsltrace.guard.redirect import Redirected, copy_of
 from rsltrace.middleware.events.event import Event
+from rsltrace.model.stamp import patience_ns
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
@@ -55,7 +56,7 @@ def _sleep(seconds: float) -> None:
     if frame.f_globals.get("__name__") == "subprocess":
         sleep_for_process(seconds, _real_sleep, frame)
         return
-    for_ns = int(seconds * 1_000_000_000)
+    for_ns = patience_ns(seconds)
     if stacks.ending.unwinding and stacks.ending.shutdown_ns < _SHUTDOWN_NS:
         # Time stands still, but destroy_node and ``finally`` shall have their say: as much as
         # ros2 launch leaves a node between SIGINT and SIGKILL.

@@ -42,6 +42,7 @@ from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.finding import Mode, Source
+from rsltrace.model.stamp import patience_ns
 
 _NS_PER_S = 1_000_000_000
 _FIRST_IDENT = 1_000_001
@@ -179,7 +180,7 @@ class SimThread:
     def join(self, timeout: float | None) -> None:
         """Wait in simulated time until the thread has ended."""
         if not self.ended:
-            for_ns = None if timeout is None else max(int(timeout * _NS_PER_S), 0)
+            for_ns = None if timeout is None else max(patience_ns(timeout), 0)
             what = f"thread {self.name} to end"
             wait(
                 self.stacks,

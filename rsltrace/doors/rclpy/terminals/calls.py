@@ -19,6 +19,7 @@ from rsltrace.doors.rclpy.terminals.curses_keys import simulated_curses
 from rsltrace.doors.rclpy.terminals.no_terminal import NoTerminal, refuse
 from rsltrace.doors.rclpy.terminals.terminal import Terminal
 from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.model.stamp import patience_ns
 
 _STEP_NS = 1_000_000
 _dup = copy_of(os.dup)  # type: ignore[arg-type]
@@ -157,7 +158,7 @@ def _selects(terminals: Terminals, real: Callable[..., Any]) -> Callable[..., An
         kinds = [waited_for, list(writes), list(others)]
         alone = sum(map(len, kinds)) == 1
         stacks = terminals._stacks
-        until_ns = None if timeout is None else stacks.loop.now_ns + int(timeout * 1e9)
+        until_ns = None if timeout is None else stacks.loop.now_ns + patience_ns(timeout)
         while True:
             terminal.offer()
             found = real(*kinds, 0)
