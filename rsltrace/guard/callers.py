@@ -77,7 +77,23 @@ def is_user_file(file: str) -> bool:
 
 def is_of_python(frame: FrameType) -> bool:
     """Return whether a frame is one of Python's own modules (or of the guard)."""
-    return _kind_of(frame.f_code.co_filename) == _STANDARD
+    file = frame.f_code.co_filename
+    kind = _kinds.get(file)
+    return (_kind_of(file) if kind is None else kind) == _STANDARD
+
+
+def is_nobodys(frame: FrameType | None) -> bool:
+    """Return whether it is seen at once that ``user_frame`` is None: rclpy, rsltrace or an import
+    asks, by way of Python's own modules at most."""
+    while frame is not None:
+        file = frame.f_code.co_filename
+        kind = _kinds.get(file)
+        if kind is None:
+            kind = _kind_of(file)
+        if kind != _STANDARD:
+            return kind == _IMPORT or (kind == _OURS and file != _THREADS)
+        frame = frame.f_back
+    return False
 
 
 def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType | None:
@@ -91,7 +107,13 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     installed = library = standard = None
     while frame is not None:
         file = frame.f_code.co_filename
-        kind = _kind_of(file)
+        kind = _kinds.get(file)
+        if kind is None:
+            kind = _kind_of(file)
+        if kind == _OURS:  # at first: most calls of a run are rclpy's, for itself
+            if file == _THREADS:
+                return installed or library or standard
+            return installed or (library if _calls_back(file) else None)
         if packages and is_in(frame, packages):
             return installed or frame
         if kind == _USER:
@@ -102,10 +124,6 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
             library = frame
         elif kind == _STANDARD:
             standard = frame
-        elif file == _THREADS:
-            return installed or library or standard
-        elif kind == _OURS:
-            return installed or (library if _calls_back(file) else None)
         elif kind == _IMPORT:
             return None
         frame = frame.f_back

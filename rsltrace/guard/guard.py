@@ -109,13 +109,13 @@ class Guard:
     def mode(self, source: Source, frame: FrameType) -> Mode:
         """Return what the job says about ``source`` in the code of ``frame``."""
         policy = self.context.policy() or self._policy
-        allowed = policy.allowed.get(source)
+        allowed = policy.allowed.get(source) if policy.allowed else None
         if allowed:
             user = user_frame(frame, self.packages) or frame
             names = {module_of(frame), module_of(user)}
             if any(fnmatchcase(name, glob) for name in names for glob in allowed):
                 return Mode.ALLOW
-        return policy.modes.get(source, DEFAULT_MODES[source])
+        return policy.modes.get(source) or DEFAULT_MODES[source]
 
     def is_virtual(self, source: Source) -> bool:
         """Return whether the run makes the answers of a source, unless a node says otherwise."""

@@ -11,6 +11,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
+from rsltrace.guard.callers import is_nobodys
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.recorded.descriptors import (
     RawDescriptor,
@@ -104,11 +105,14 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
 
 
 _real_stat = copy_of(os.stat)  # type: ignore[arg-type]
+_REAL = {"stat": _real_stat, "lstat": copy_of(os.lstat)}  # type: ignore[arg-type]
 
 
-def _looking(name: str, real: Callable[..., Any]) -> Any:
+def _looking(name: str, plain: Callable[..., Any], real: Callable[..., Any]) -> Any:
     def stat(path: Any, *more: Any, **options: Any) -> Any:
         frame = sys._getframe(1)
+        if is_nobodys(frame):  # nor does the watch below have to know
+            return plain(path, *more, **options)
         guard = None if isinstance(path, int) else recording(Source.FILE, frame)
         if guard is None:
             return real(path, *more, **options)
@@ -123,7 +127,7 @@ def recorded_files() -> Iterator[None]:
     """Let files that are read, and their times, answer from the trace in a re-run."""
     with ExitStack() as stack:
         redirect(stack, io.open, _opening)
-        for name in ("stat", "lstat"):
+        for name, plain in _REAL.items():
             # Outermost: what is recorded here is no finding of the watch below.
-            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}"))
+            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}", plain))
         yield

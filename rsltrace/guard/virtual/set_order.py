@@ -36,6 +36,9 @@ _GOES_THROUGH = frozenset(
     "fromiter".split()
 )
 _SHOWS = frozenset("str repr print format".split())
+_NUMBERS = frozenset((int, float, bool))
+"""Their places in a set are the same in every process."""
+_TEXTS = frozenset((str,))
 _PLAIN = (str, bytes, int, float, bool, type(None))
 
 
@@ -44,7 +47,7 @@ def ordered(thing: Any) -> Any:
     kind = type(thing)
     if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
         return thing
-    if len(thing) < 2:
+    if len(thing) < 2 or _NUMBERS.issuperset(map(type, thing)):
         return thing
     guard = engaged()
     if guard is None:
@@ -66,6 +69,8 @@ def ordered(thing: Any) -> Any:
 
 
 def _in_order(guard: Guard, thing: Any) -> list[Any] | None:
+    if _TEXTS.issuperset(map(type, thing)):
+        return sorted(thing)
     try:
         return sorted(thing, key=_key)
     except TypeError:

@@ -19,7 +19,7 @@ from types import BuiltinFunctionType
 from typing import Any
 
 from rsltrace.guard.addresses import hashed_by_address, is_by_address
-from rsltrace.guard.callers import user_frame
+from rsltrace.guard.callers import is_nobodys, user_frame
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.watched.audit_hook import (
@@ -66,6 +66,8 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         if guard is None:
             return real(*arguments, **options)
         frame = sys._getframe(1)
+        if is_nobodys(frame):
+            return real(*arguments, **options)
         if source is not Source.THREAD and asking_module(frame) in _NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
