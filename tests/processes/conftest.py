@@ -22,6 +22,8 @@ _LIBRARIES = (
     "rosidl_runtime_c",
     "std_msgs__rosidl_typesupport_c",
     "std_msgs__rosidl_generator_c",
+    "std_srvs__rosidl_typesupport_c",
+    "std_srvs__rosidl_generator_c",
 )
 
 

@@ -22,6 +22,7 @@ from rsltrace.run.recording import run
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
+long = pytest.mark.long
 
 ECHO = """
 import rclpy
@@ -136,6 +137,7 @@ def test_an_isolated_script_says_what_it_says_in_this_process(
     assert len(said[0][1]) == 10
 
 
+@long
 def test_a_link_delays_what_goes_to_a_process(counter: Path, tmp_path: Path) -> None:
     job = _job(tmp_path, counter, more="delay: {default: 5ms}\n")
     assert run(job, tmp_path / "t.mcap").error is None
@@ -148,8 +150,10 @@ def test_a_link_delays_what_goes_to_a_process(counter: Path, tmp_path: Path) -> 
     ("action", "ending"),
     [
         ("crash", "was killed by SIGSEGV at 0.500000000 s"),
-        ("exit", "ended with exit status 7 at 0.500000000 s"),
-        ("close", "closed the descriptor by which rsltrace runs it at 0.500000000 s"),
+        pytest.param("exit", "ended with exit status 7 at 0.500000000 s", marks=long),
+        pytest.param(
+            "close", "closed the descriptor by which rsltrace runs it at 0.500000000 s", marks=long
+        ),
     ],
 )
 def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
@@ -175,7 +179,8 @@ def test_a_run_goes_on_without_a_process_if_the_job_says_so(counter: Path, tmp_p
     assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == 4  # the fifth was not sent
 
 
-@pytest.mark.parametrize(("action", "counted"), [("leave", 4), ("fork", 10)])
+@long
+@pytest.mark.parametrize(("action", "counted"), [("leave", 5), ("fork", 10)])
 def test_a_process_may_end_or_start_others(
     counter: Path, tmp_path: Path, action: str, counted: int
 ) -> None:

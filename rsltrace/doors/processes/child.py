@@ -21,6 +21,7 @@ _LOOK_S = 0.2
 _GRACE_S = 2.0
 _NO_RANDOM_ADDRESSES = 0x0040000
 _PRESENT = 0xFFFFFFFF
+_USUAL_THREADS = 3
 _LOST_LINK = 120  # of native/link.cpp
 
 
@@ -84,6 +85,7 @@ class Child:
                 raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
         self._socket = here
         self._there = b""
+        self._patience = 0
 
     @property
     def pid(self) -> int:
@@ -119,7 +121,16 @@ class Child:
         self._there = data[size:]
         return memoryview(data)[HEAD.size : size]
 
+    def has_threads(self) -> bool:
+        """Return whether there are threads in it beside the first and the two of LTTng."""
+        return len(list(Path(f"/proc/{self.pid}/task").iterdir())) > _USUAL_THREADS
+
+    def give_up_after(self, seconds: float) -> None:
+        """Kill the process if it says nothing for so long (real time)."""
+        self._patience = int(seconds / _LOOK_S)
+
     def _read(self, size: int) -> bytes:
+        looks = 0
         while True:
             try:
                 return self._socket.recv(size)
@@ -127,6 +138,10 @@ class Child:
                 if self._process.poll() is not None:
                     with suppress(BlockingIOError):  # what it said before
                         return self._socket.recv(size, socket.MSG_DONTWAIT)
+                    return b""
+                looks += 1
+                if looks == self._patience:
+                    self.kill()
                     return b""
             except ConnectionResetError:
                 return b""

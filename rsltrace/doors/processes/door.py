@@ -96,8 +96,8 @@ class ProcessDoor:
 
     @property
     def exit_code(self) -> int:
-        """The first exit status other than 0 with which a process ended that may fail."""
-        return next((1 for one in self.processes if one.ended and one.ended.failed), 0)
+        """1 if a process has failed that may, else 0."""
+        return int(any(one.has_failed for one in self.processes))
 
     def end(self) -> None:
         """End all that still run, in the order of their start, each as one event."""
@@ -105,16 +105,12 @@ class ProcessDoor:
             if process.ended is not None or self.domain.outcome.error is not None:
                 continue
 
-            def leave(process: Process = process) -> None:
-                process.child.dismiss()
-                process.vanish()
-
             self.domain.dispatcher.run_outside(
                 OutsideEvent(process.describe),
                 EventKind.SHUTDOWN,
                 process.entity_id,
                 None,
-                leave,
+                process.stop,
             )
 
     def close(self) -> None:

@@ -44,6 +44,8 @@ from rsltrace.trace.format import TOPIC_ROSOUT
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 _ROS_TIME = 1
+_GRACE_S = 5.0
+"""How long a process may take (in real time) to end when it is told to."""
 _WAITER = struct.Struct("<IIqI")
 _TIMER = struct.Struct("<IIq")
 _DEADLINE = struct.Struct("<Iq")
@@ -96,6 +98,7 @@ class Process:
         self._held: list[Endpoint | ProcessTimer] = []
         self._running_thread = 0
         self._last = "its start"
+        self._is_stopping = False
         self._questions: dict[int, Question] = {
             Say.HELLO: self._hello,
             Say.TAKE: self._take,
@@ -136,6 +139,11 @@ class Process:
     def entity(self) -> Entity:
         """Return the process as the trace describes it."""
         return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns, {})
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether it has ended as it should not, while the run went on."""
+        return self.ended is not None and self.ended.failed and not self._is_stopping
 
     # -- going on --------------------------------------------------------------------------------
 
@@ -270,7 +278,7 @@ class Process:
         self.ended = self.child.reap()
         self.vanish()
         self.door.has_ended(self)
-        if not self.ended.failed:
+        if not self.ended.failed or self._is_stopping:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)
         ended = f"process {self.name} {self.ended.said} at {at} s"
@@ -280,6 +288,18 @@ class Process:
         else:
             now_ns = self.dispatcher.loop.now_ns
             raise NodeError(text, node="", entity=self.name, stamp_ns=now_ns, traceback_text="")
+
+    def stop(self) -> None:
+        """Tell it as whoever starts nodes does that the run is over (Ctrl-C), and end it once it
+        waits again."""
+        self._is_stopping = True
+        if not self.child.has_threads():  # theirs, which handle signals, would race with the end
+            self.child.give_up_after(_GRACE_S)
+            self.child.send(RECORD.pack(0, Told.STOP))
+            self._converse()
+        if self.ended is None:
+            self.child.dismiss()
+            self.vanish()
 
     def vanish(self) -> None:
         """Destroy all that it has made."""

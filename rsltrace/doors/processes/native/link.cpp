@@ -142,6 +142,11 @@ __attribute__((constructor(101))) void begin() {
   seed_of_process = reader.number<std::uint64_t>();
 }
 
+// What was put out after the last wait still counts.
+__attribute__((destructor(101))) void end() {
+  if (linked() && batch_there().size() > HEAD) send_batch();
+}
+
 }  // namespace
 
 bool linked() { return link_fd >= 0; }
