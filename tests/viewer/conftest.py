@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip("textual", reason="needs textual: pip install 'rsltrace[view]'")
 
+import textual.app
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.terminal import screenshot, shell
 from rsltrace_viewer.terminal.app import ViewerApp, open_session
@@ -31,10 +32,16 @@ if "trace_maker" not in sys.modules:
     _spec.loader.exec_module(_module)
 
 screenshot._SETTLE_S = 600.0  # settling ends with the work; on a loaded machine that takes its time
-shell._VALUES_S = 0.0  # nobody is kept waiting by what a key shows a moment later
 screenshot._PAUSE_S = 0.01
-
 shell._VALUES_S = 0.001  # a test stops at every event
+
+
+async def _give_way(*_: float) -> None:
+    """Stand in for Textual's wait for an idle processor after each key: ``settle`` follows."""
+    await asyncio.sleep(0)
+
+
+textual.app.wait_for_idle = _give_way
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 GOLDEN = Path(__file__).parent / "golden"

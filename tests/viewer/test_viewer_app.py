@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rsltrace_viewer.model.query.conditions import ANY_LOG, find
 from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.terminal import screenshot
 from rsltrace_viewer.terminal.app import ViewerApp
 from rsltrace_viewer.terminal.keys import KEYS
 from rsltrace_viewer.terminal.screens.help import HelpScreen
@@ -19,7 +22,7 @@ from rsltrace_viewer.terminal.widgets.bars import FooterBar
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.timeline import Timeline
-from textual import events
+from textual import events, timer
 
 Drive = Callable[..., None]
 Steps = Callable[[Any], Awaitable[None]]
@@ -147,6 +150,21 @@ def test_exceptions_logs_warnings_and_findings(made: Path, run: Run, drive: Driv
         for key, what in (("u", "later finding"), ("U", "earlier finding")):
             await viewer.press(key)
             assert f"no {what} of the guard" in viewer.text
+
+    drive(made, steps)
+
+
+def test_an_event_is_shown_on_a_machine_that_is_late(
+    made: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Textual's own timers for one call are lost where a second passes before they start."""
+    monkeypatch.setattr(screenshot, "_SETTLE_S", 20.0)
+
+    async def steps(viewer: Any) -> None:
+        seconds = count(1)
+        monkeypatch.setattr(timer, "_time", SimpleNamespace(get_time=lambda: next(seconds)))
+        await viewer.press("j")
+        assert not viewer.app.busy
 
     drive(made, steps)
 

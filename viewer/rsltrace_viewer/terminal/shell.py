@@ -7,6 +7,8 @@ and ``app``.
 
 from __future__ import annotations
 
+import asyncio
+from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
@@ -14,7 +16,6 @@ from textual import events
 from textual.app import App, ComposeResult
 from textual.containers import Container
 from textual.geometry import Size
-from textual.timer import Timer
 from textual.worker import get_current_worker
 
 from rsltrace.errors import RsltraceError
@@ -89,7 +90,7 @@ class Shell(App[None]):
         """Of SHARES, how many the events have; 0: as the style sheet says."""
         self._more_lanes = 0
         self._status = ""
-        self._soon: Timer | None = None
+        self._soon: asyncio.TimerHandle | None = None
         self.following = False
         self.theme = "textual-light" if light else "textual-dark"
 
@@ -336,14 +337,20 @@ class Shell(App[None]):
         self._show_footer()
         self.busy = True
         if self._soon is not None:
-            self._soon.stop()
-        self._soon = self.set_timer(_INSPECT_S, self._inspect)
+            self._soon.cancel()
+        self._call_in(_INSPECT_S, self._inspect)
+
+    def _call_in(self, delay_s: float, callback: Callable[[], None]) -> None:
+        # Not set_timer: where a busy machine makes Textual's timer start later than its delay, it
+        # counts the one call that it has to make as one it has missed.
+        loop = asyncio.get_running_loop()
+        self._soon = loop.call_later(delay_s, self.call_next, callback)
 
     def _inspect(self) -> None:
         # Whatever is selected now: the comparison may have given the event another place.
         if self.screen_stack:
             self._show_inspector()
-            self._soon = self.set_timer(_VALUES_S, self._complete)
+            self._call_in(_VALUES_S, self._complete)
 
     def _complete(self) -> None:
         if self.screen_stack:
