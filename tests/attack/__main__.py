@@ -36,7 +36,7 @@ def main() -> int:
         if options.seed is not None and not options.minutes:
             planned: Iterator[tuple[Family, int]] = iter([(one, options.seed) for one in chosen])
         elif options.slice:
-            planned = campaign.slice_of(chosen)
+            planned = campaign.slice_of(chosen, options.every)
         else:
             return _long(options, chosen, work, corpus)
         log = options.out / f"{options.name}.jsonl"
@@ -50,7 +50,8 @@ def _options() -> argparse.Namespace:
     parser.add_argument("--family", action="append", choices=NAMES, help="only these")
     parser.add_argument("--seed", type=int, help="this case alone; with --minutes, where to begin")
     parser.add_argument("--minutes", type=float, default=0, help="go on for so long")
-    parser.add_argument("--slice", action="store_true", help="what make test tries")
+    parser.add_argument("--slice", action="store_true", help="what tests try")
+    parser.add_argument("--every", type=int, default=1, help="one in so many of the slice")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--out", type=Path, default=REPOSITORY / "out" / "attack")
     parser.add_argument("--name", default="cases", help="of the files with the figures")

@@ -1,6 +1,6 @@
 """What gives way today, each with the item of the trust issue that will mend it.
 
-It shrinks to nothing: the test fails when an entry no longer shows in the slice of ``make test``.
+It shrinks to nothing: the test fails when an entry no longer shows in the slice.
 A key is ``family/attack: what was wrong``, or a pattern of such.
 """
 

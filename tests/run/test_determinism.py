@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.ros, pytest.mark.repeated]
 
 ROOT = Path(__file__).parents[2]
 RUNS = int(os.environ.get("RSLTRACE_RUNS", "4"))
-RUNS_OF_A_POLICY = 3 if RUNS < 100 else 10
+RUNS_OF_A_POLICY = 2 if RUNS < 100 else 10
 JOB = """
 # All that a run may contain: topics, services, coroutines, parameters, logs, padding.
 nodes:
