@@ -14,6 +14,7 @@ from rsltrace.audit.treatment import GuardTreatment, module_of
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
 from rsltrace.model.finding import Policy
+from rsltrace.workspace.installs import module_folders
 
 Executables = Callable[[str, str], "str | Path"]
 """Given ``package/executable`` and where it is written: ``module:function``, or a script's path."""
@@ -61,6 +62,8 @@ def audit_job(job: Job, executable: Executables) -> Audit:
         else:
             names.setdefault(module_of(target), where)
     folders = [job.resolve(folder).resolve() for folder in job.search_path]
+    if any(spec.executable is not None for spec in job.nodes):
+        folders += [folder for folder in module_folders(folders) if folder not in folders]
     collection, missing = collect_modules(list(names), scripts, folders, programs)
     for name in missing:
         parent = name.rpartition(".")[0]

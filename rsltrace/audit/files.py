@@ -191,7 +191,7 @@ def find(name: str, path: Sequence[str]) -> ModuleSpec | None:
         full = f"{full}.{part}" if full else part
         try:
             spec = PathFinder.find_spec(full, list(places))
-        except (ImportError, ValueError):
+        except (ImportError, ValueError, KeyError):  # KeyError: of folders without modules
             return None
         if spec is None:
             return None

@@ -86,10 +86,13 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
         return audit_path(only)
     from rsltrace.launch import expand
     from rsltrace.run.plans.executables import source_of, why_not
+    from rsltrace.workspace.imports import unbuilt_packages
 
     job, _ = job_of(words, launch, skip, overrides)
     expanded = expand(job, why_not=why_not)
-    return audit_job(expanded.job, lambda target, where: source_of(target, where=where))
+    folders = [expanded.job.resolve(folder) for folder in expanded.job.search_path]
+    with unbuilt_packages(folders):
+        return audit_job(expanded.job, lambda target, where: source_of(target, where=where))
 
 
 def _line(one: Found) -> str:

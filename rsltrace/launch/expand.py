@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
@@ -12,6 +14,8 @@ from rsltrace.launch.apart import read_apart
 from rsltrace.launch.model import Argument, Launched
 from rsltrace.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.launch.specs import node_specs
+from rsltrace.workspace.imports import unbuilt_packages
+from rsltrace.workspace.packages import source_packages, workspace_of
 
 
 @dataclass(frozen=True)
@@ -27,17 +31,37 @@ def expand(
 ) -> Expanded:
     """Return a job whose launch files have become nodes.
 
-    A Python launch file is a program, and is run to do so, unless ``programs`` is False.
+    A Python launch file is a program, and so is the ``setup.py`` of a package that nobody has
+    built: they are run to do so, or not used if ``programs`` is False.
     ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot.
 
     :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
         return Expanded(job)
+    if not programs:
+        return _expand(job, None, why_not)
+    folders = [job.resolve(folder) for folder in job.search_path]
+    around = [workspace_of(job.resolve(spec.file)) for spec in job.launch]
+    new = [f for f in dict.fromkeys(around) if f is not None and f not in folders]
+    with unbuilt_packages([*folders, *new]):
+        expanded = _expand(job, [*folders, *new], why_not)
+    job = expanded.job
+    named = {spec.executable.partition("/")[0] for spec in job.nodes if spec.executable}
+    if new and not named.isdisjoint(source_packages(new)):
+        more = [os.path.relpath(folder, job.base_dir) for folder in new]
+        job = job.replace(search_path=[*job.search_path, *more])
+    return Expanded(job, expanded.notes)
+
+
+def _expand(
+    job: Job, folders: Sequence[Path] | None, why_not: Callable[[str, str], str | None]
+) -> Expanded:
+    """Do so; ``folders`` are those of packages and modules, None if no programs are to run."""
     nodes: list[NodeSpec] = list(job.nodes)
     notes: list[str] = []
     for index, spec in enumerate(job.launch):
-        launched = _read(job, index, programs)
+        launched = _read(job, index, folders)
         nodes += node_specs(
             launched,
             skip_unsupported=spec.skip_unsupported,
@@ -52,16 +76,16 @@ def expand(
     return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 
-def _read(job: Job, index: int, programs: bool) -> Launched:
+def _read(job: Job, index: int, folders: Sequence[Path] | None) -> Launched:
     spec = job.launch[index]
     path = job.resolve(spec.file)
     try:
         read = ros_launch.read_launch_file if ros_launch.can_read(path) else read_launch_file
         launched = read(path, spec.arguments)
     except ProgramNeededError:
-        if not programs:
+        if folders is None:
             raise JobError("a Python launch file is a program", where=spec.file) from None
-        launched = read_apart(path, spec.arguments, [job.resolve(f) for f in job.search_path])
+        launched = read_apart(path, spec.arguments, folders)
     _check_known(job, index, launched.arguments)
     return launched
 

@@ -14,6 +14,7 @@ from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import flat, parameters_for
 from rsltrace.launch.scope import ParameterFile
 from rsltrace.launch.values import inferred
+from rsltrace.workspace.cache import lasting
 
 _LISTED_MAX = 30
 
@@ -130,7 +131,7 @@ def _in_order(
     values: dict[str, Any] = {}
     for item in parameters:
         if isinstance(item, ParameterFile):
-            files.append(item.path)
+            files.append(lasting(item.path))
             for name in parameters_for(item.path, full_name):
                 values.pop(name, None)
         else:

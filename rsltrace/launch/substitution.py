@@ -14,6 +14,7 @@ from rsltrace.launch.expression import evaluate
 from rsltrace.launch.scope import Scope
 from rsltrace.launch.template import Call, Template, parse_template
 from rsltrace.model.regular_file import read_regular
+from rsltrace.workspace.imports import unbuilt_prefix
 
 _TRUE, _FALSE = ("true", "1"), ("false", "0")
 
@@ -140,11 +141,11 @@ def equal_texts(a: str, b: str) -> bool:
 
 
 def _prefix(package: str) -> Path:
-    prefix = package_prefix(package)
+    prefix = package_prefix(package) or unbuilt_prefix(package)
     if prefix is None:
         raise ValueError(
-            f"there is no ROS package {package!r} in AMENT_PREFIX_PATH: install it, or source the "
-            "workspace that has it"
+            f"there is no ROS package {package!r} in AMENT_PREFIX_PATH, nor among the sources "
+            "here: install it, or source the workspace that has it"
         )
     return prefix
 

@@ -15,6 +15,7 @@ from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.values.target import target_text
 from rsltrace.run.plans.executables import source_of
+from rsltrace.workspace.installs import module_folders
 
 _OF_FILES = "file:"
 
@@ -42,7 +43,10 @@ class Code:
 
 def code_of(job: Job, sources: dict[str, str]) -> tuple[Code, ...]:
     """Return the code of a job; ``sources`` are the hashes that a trace has of it."""
-    folders = [str(job.resolve(folder)) for folder in job.search_path]
+    places = [job.resolve(folder) for folder in job.search_path]
+    if any(spec.executable is not None for spec in job.nodes):
+        places += module_folders(places, ask=False)  # nothing is run to find out
+    folders = [str(folder) for folder in places]
     named = dict.fromkeys(name for name in sources if not name.startswith(_OF_FILES))
     found = {name: file_of(name, folders) for name in named}
     for name, file in _named_by(job, folders):
@@ -88,7 +92,8 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
     try:
         found = source_of(name, where="")
     except JobError:
-        yield name, None
+        if not any(Path(folder, "package.xml").is_file() for folder in folders):
+            yield name, None  # else it is one of a package that nobody has built
         return
     if isinstance(found, Path):
         yield name, found

@@ -43,6 +43,11 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     return place
 
 
+def lasting(path: str) -> str:
+    """Return a path, with links followed if it lies in the cache, which anybody may empty."""
+    return os.path.realpath(path) if Path(path).is_relative_to(_root()) else path
+
+
 @cache
 def _root() -> Path:
     """Return the user's folder for caches, or one for this process if that cannot be written."""
@@ -60,4 +65,4 @@ def _root() -> Path:
     return root / "rsltrace"
 
 
-__all__ = ["cached_folder", "key_of"]
+__all__ = ["cached_folder", "key_of", "lasting"]

@@ -16,6 +16,7 @@ from types import ModuleType
 from typing import Any
 
 from rsltrace.guard.guard import engage
+from rsltrace.workspace.installs import executables, modules
 from rsltrace.workspace.interfaces import interface_prefix
 from rsltrace.workspace.packages import SourcePackage, source_packages
 from rsltrace.workspace.share import share_prefix
@@ -31,6 +32,7 @@ class Workspace:
         self._folders = folders
         self._packages: dict[str, SourcePackage] | None = None
         self._prefixes: dict[str, Path] = {}
+        self._modules: dict[str, Path] | None = None
         self.made: set[str] = set()
         """Packages whose interfaces somebody has imported."""
 
@@ -56,6 +58,30 @@ class Workspace:
             self.made.add(name)
         return self._prefixes[name] / "site-packages" / name
 
+    def shadows(self, name: str) -> bool:
+        """Whether a folder of that name could be taken for a package, though it is none."""
+        for folder in self._folders:
+            place = folder / name
+            if place.is_dir() and not (place / "__init__.py").exists():
+                return True
+        return False
+
+    def module(self, name: str) -> Path | None:
+        """Return the file or folder of a module that a package would install, or None."""
+        if self._modules is None:
+            with engage(None):
+                listed = [modules(package) for package in self.packages.values()]
+            self._modules = {name: path for each in reversed(listed) for name, path in each.items()}
+        return self._modules.get(name)
+
+    def executables(self, package: str) -> dict[str, str | Path]:
+        """Return the executables of a package: ``module:function`` or a script, by name."""
+        found = self.packages.get(package)
+        if found is None:
+            return {}
+        with engage(None):
+            return executables(found)
+
     def prefix(self, name: str) -> str | None:
         """Return a prefix with the ``share`` of a package, or None if it is none of these."""
         package = self.packages.get(name)
@@ -66,7 +92,8 @@ class Workspace:
 
 
 class _Kinds:
-    """Finds ``package.msg`` and its like before anybody takes a folder of sources for it."""
+    """Finds ``package.msg`` and its like before anybody takes a folder of sources for it; and the
+    modules of a package before anybody takes the folder of its sources for them."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
@@ -76,6 +103,11 @@ class _Kinds:
     ) -> ModuleSpec | None:
         """Return the spec of a module that was made of interface files, or None."""
         package, _, rest = name.partition(".")
+        if not rest and self._workspace.shadows(name):
+            built = PathFinder.find_spec(name)
+            if built is not None and built.origin is None:
+                return _source_spec(self._workspace, name)
+            return None
         if rest not in _KINDS and rest != package + _SUPPORT:
             return None
         built = PathFinder.find_spec(name, path)
@@ -89,7 +121,7 @@ class _Kinds:
 
 
 class _Packages:
-    """Finds the package itself, if it has nothing but interfaces and so no Python sources."""
+    """Finds the modules of packages, and a package that has nothing but interfaces."""
 
     def __init__(self, workspace: Workspace) -> None:
         self._workspace = workspace
@@ -100,13 +132,46 @@ class _Packages:
         """Return the spec of a package with interfaces that nobody else has found, or None."""
         if "." in name:
             return None
+        found = _source_spec(self._workspace, name)
+        if found is not None:
+            return found
         folder = self._workspace.interfaces(name)
         return None if folder is None else _spec(name, folder / "__init__.py")
+
+
+def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:
+    """Return the spec of a module that lies among the sources of a package, or None."""
+    place = workspace.module(name)
+    if place is None:
+        return None
+    return _spec(name, place if place.suffix == ".py" else place / "__init__.py")
 
 
 def _spec(name: str, file: Path) -> ModuleSpec | None:
     folder = [str(file.parent)] if file.name == "__init__.py" else None
     return spec_from_file_location(name, file, submodule_search_locations=folder)
+
+
+_open: list[Workspace] = []
+
+
+def unbuilt_executables(package: str) -> dict[str, str | Path]:
+    """Return the executables of a package that is used as if it were built, by name."""
+    found: dict[str, str | Path] = {}
+    for workspace in _open:
+        found = found or workspace.executables(package)
+    return found
+
+
+def unbuilt_prefix(package: str) -> Path | None:
+    """Return a prefix with the ``share`` of a package that is used as if it were built."""
+    prefixes = (workspace.prefix(package) for workspace in _open)
+    return next((Path(prefix) for prefix in prefixes if prefix is not None), None)
+
+
+def unbuilt_names() -> set[str]:
+    """Return the names of the packages that are used as if they were built."""
+    return {name for workspace in _open for name in workspace.packages}
 
 
 @contextmanager
@@ -116,12 +181,14 @@ def unbuilt_packages(folders: Sequence[Path]) -> Iterator[Workspace]:
     before, after = _Kinds(workspace), _Packages(workspace)
     sys.meta_path.insert(0, before)
     sys.meta_path.append(after)
+    _open.append(workspace)
     try:
         with ExitStack() as stack:
             if find_spec("ament_index_python") is not None:
                 _put_into_index(stack, workspace)
             yield workspace
     finally:
+        _open.remove(workspace)
         sys.meta_path.remove(before)
         sys.meta_path.remove(after)
         for name in [name for name in sys.modules if name.partition(".")[0] in workspace.made]:
@@ -177,4 +244,10 @@ def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., An
             setattr(module, name, ours)
 
 
-__all__ = ["Workspace", "unbuilt_packages"]
+__all__ = [
+    "Workspace",
+    "unbuilt_executables",
+    "unbuilt_names",
+    "unbuilt_packages",
+    "unbuilt_prefix",
+]

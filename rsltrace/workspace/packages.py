@@ -48,6 +48,23 @@ def source_packages(folders: Iterable[Path]) -> dict[str, SourcePackage]:
     return found
 
 
+def workspace_of(file: Path) -> Path | None:
+    """Return the folder of the workspace that a file's package lies in; None if it has none.
+
+    That is a ``src`` or a checkout around the package; else the package itself.
+    """
+    above = file.resolve().parents
+    own = next((folder for folder in above[:_DEPTH_MAX] if (folder / _MARK).is_file()), None)
+    if own is None:
+        return None
+    for folder in (own, *list(own.parents)[:_DEPTH_MAX]):
+        if folder != own and folder.name == "src":
+            return folder
+        if (folder / ".git").exists():
+            return folder
+    return own
+
+
 def _around(folder: Path) -> Iterator[SourcePackage]:
     """Give the package that a folder is a part of."""
     for parent in list(folder.parents)[:_DEPTH_MAX]:
@@ -100,4 +117,4 @@ def _walk(top: Path, *, inside: bool) -> Iterator[Path]:
             ]
 
 
-__all__ = ["SourcePackage", "source_packages"]
+__all__ = ["SourcePackage", "source_packages", "workspace_of"]

@@ -1,8 +1,8 @@
 """Finding what ``main:``, ``executable:``, ``script:`` and ``module:`` name: what runs it.
 
 An executable is a console script of a Python distribution, or a Python script that a ROS package
-has installed (``lib/<package>/<executable>`` below a prefix of the ament index). Both run as they
-are, in this process.
+has installed (``lib/<package>/<executable>`` below a prefix of the ament index); or what a package
+that nobody has built would install as such. All run as they are, in this process.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
+from rsltrace.workspace.imports import unbuilt_executables, unbuilt_names
 
 
 class Mains:
@@ -121,7 +122,10 @@ def source_of(target: str, *, where: str) -> str | Path:
     """
     found = find_executable(target, where=where)
     package, _, name = target.partition("/")
-    return found if isinstance(found, str) else _installed_files(package)[name]
+    if isinstance(found, str):
+        return found
+    files: dict[str, str | Path] = {**unbuilt_executables(package), **_installed_files(package)}
+    return files[name]
 
 
 def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
@@ -136,14 +140,18 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     files = _installed_files(package)
     if name in files:
         return _python_script(files[name], target, where)
-    known = _packages()
+    sources = unbuilt_executables(package)
+    if name in sources:
+        source = sources[name]
+        return source if isinstance(source, str) else _python_script(source, target, where)
+    known = _packages() | unbuilt_names()
     if not scripts and not files and package not in known:
         raise JobError(
             f"there is no package {package!r}{_near(package, known)}: install it for this Python "
             "(pip install), source the workspace it is built in, or name its function with 'main:'",
             where=where,
         )
-    available = sorted({*scripts, *files})
+    available = sorted({*scripts, *files, *sources})
     has = f"it has {', '.join(available[:10])}" if available else "it has none"
     raise JobError(
         f"package {package!r} has no executable {name!r}{_near(name, available)}: {has}",

@@ -1,0 +1,196 @@
+"""A checkout of a workspace runs as it is: its executables, modules and launch files."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsltrace import Trace
+from rsltrace.workspace.installs import executables, modules
+from rsltrace.workspace.packages import SourcePackage, workspace_of
+
+Command = Callable[..., subprocess.CompletedProcess[str]]
+
+_PACKAGE = "<package format='3'><name>{}</name></package>"
+_SETUP = """
+import os
+from glob import glob
+from setuptools import find_packages, setup
+open('setup_was_run', 'w')
+setup(
+    name='talker_py', packages=find_packages(exclude=['test']),
+    data_files=[(os.path.join('share', 'talker_py', 'settings'), glob('config/*.yaml'))],
+    entry_points={'console_scripts': ['talker = talker_py.talker:main']},
+)
+"""
+_TALKER = """
+import rclpy
+from rclpy.node import Node
+from std_msgs.msg import String
+from tools_cmake.helper import word
+
+class Talker(Node):
+    def __init__(self):
+        super().__init__('talker')
+        self.declare_parameter('rate', 1.0)
+        self.publisher = self.create_publisher(String, 'said', 10)
+        self.create_timer(1 / self.get_parameter('rate').value, self.tick)
+
+    def tick(self):
+        self.publisher.publish(String(data=word()))
+
+def main(args=None):
+    rclpy.init(args=args)
+    rclpy.spin(Talker())
+"""
+_RELAY = """#!/usr/bin/env python3
+import rclpy
+from std_msgs.msg import String
+rclpy.init()
+node = rclpy.create_node('relay')
+publisher = node.create_publisher(String, 'heard', 10)
+node.create_subscription(String, 'said', publisher.publish, 10)
+rclpy.spin(node)
+"""
+_CMAKE = """
+project(tools_cmake)  # what follows is plain
+ament_python_install_package(${PROJECT_NAME} PACKAGE_DIR python/tools_cmake)
+install(PROGRAMS scripts/relay.py DESTINATION lib/${PROJECT_NAME} RENAME relay)
+install(PROGRAMS scripts/relay.py DESTINATION bin)
+install(FILES README.md DESTINATION share/${PROJECT_NAME})
+"""
+_LAUNCH = """
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import AnyLaunchDescriptionSource
+from launch_ros.actions import Node
+
+def generate_launch_description():
+    share = get_package_share_directory('talker_py')
+    return LaunchDescription([
+        Node(package='talker_py', executable='talker', parameters=[share + '/settings/p.yaml']),
+        IncludeLaunchDescription(AnyLaunchDescriptionSource(share + '/launch/relay.launch.xml')),
+    ])
+"""
+_FILES = {
+    "src/talker_py/package.xml": _PACKAGE.format("talker_py"),
+    "src/talker_py/setup.py": _SETUP,
+    "src/talker_py/talker_py/__init__.py": "",
+    "src/talker_py/talker_py/talker.py": _TALKER,
+    "src/talker_py/config/p.yaml": "talker: {ros__parameters: {rate: 4.0}}\n",
+    "src/talker_py/launch/all.launch.py": _LAUNCH,
+    "src/talker_py/launch/relay.launch.xml": (
+        "<launch><let name='share' value='$(find-pkg-share tools_cmake)'/>"
+        "<node pkg='tools_cmake' exec='relay'/></launch>"
+    ),
+    "src/group/tools_cmake/package.xml": _PACKAGE.format("tools_cmake"),
+    "src/group/tools_cmake/CMakeLists.txt": _CMAKE,
+    "src/group/tools_cmake/python/tools_cmake/__init__.py": "",
+    "src/group/tools_cmake/python/tools_cmake/helper.py": "def word():\n    return 'from cmake'\n",
+    "src/group/tools_cmake/scripts/relay.py": _RELAY,
+    "job.yaml": (
+        "search_path: [src]\nstop: {duration: 2s}\n"
+        "nodes: [{executable: talker_py/talker, parameters: {rate: 4.0}}, "
+        "{executable: tools_cmake/relay}]\n"
+    ),
+    "wrong.yaml": "search_path: [src]\nnodes: [{executable: tools_cmake/rely}]\n",
+}
+
+
+def _write(folder: Path, files: dict[str, str]) -> None:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+
+@pytest.mark.ros
+def test_a_checkout_runs_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    pytest.importorskip("ament_index_python", reason="needs ROS's ament_index_python")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    _write(tmp_path, _FILES)
+    launch = "src/talker_py/launch/all.launch.py"
+    done = command("record", "--launch", launch, "--until", "2", "-o", "launched.mcap")
+    assert done.returncode == 0, done.stderr
+    with Trace.open("launched.mcap") as trace:
+        heard = [trace.decode("/heard", data).data for _, _, data in trace.messages("/heard")]  # type: ignore[attr-defined]
+        assert heard == ["from cmake"] * 8
+        assert str(tmp_path / "cache") not in trace.job["resolved"]  # it may be emptied
+    named = command("record", "job.yaml", "-o", "named.mcap")
+    assert named.stdout.split()[1:4] == done.stdout.split()[1:4], named.stderr
+    audit = command("audit", "job.yaml")
+    assert "nothing found in 5 files" in audit.stdout + audit.stderr
+
+    wrong = command("check", "wrong.yaml")
+    assert (
+        "wrong.yaml:2:22: package 'tools_cmake' has no executable 'rely'; did you mean 'relay'"
+        in (wrong.stderr)
+    )
+
+    # Whether to trust a trace is found out without running anything.
+    mark = tmp_path / "src/talker_py/setup_was_run"
+    assert mark.exists()
+    mark.unlink()
+    listed = command("replay", "launched.mcap", "--job-folder", "src/talker_py/launch")
+    assert listed.returncode == 2
+    assert "src/talker_py/talker_py/talker.py\n" in listed.stderr
+    assert not mark.exists()
+
+
+def test_what_build_files_say(tmp_path: Path) -> None:
+    _write(
+        tmp_path,
+        {
+            "a/setup.cfg": (
+                "[options]\npackage_dir =\n    = source\n"
+                "[options.entry_points]\nconsole_scripts =\n  one = a.one:main\n"
+            ),
+            "a/setup.py": (
+                "from setuptools import setup\n"
+                "setup(entry_points='[console_scripts]\\ntwo = a.two:main [extra]\\n',\n"
+                "      py_modules=['single'], scripts=['bin/three'], packages=['b', 'b.c'],\n"
+                "      data_files=[('lib/a', ['four.py'])], package_dir={'': 'source'})\n"
+            ),
+            "a/pyproject.toml": "[project.scripts]\nfive = 'a.five:main'\n",
+            **dict.fromkeys(["a/source/single.py", "a/source/b/__init__.py"], ""),
+            **dict.fromkeys(["a/bin/three", "a/four.py", "a/test/__init__.py"], ""),
+            "broken/setup.py": "raise SystemExit('no')",
+            "broken/broken/__init__.py": "",
+        },
+    )
+    a = SourcePackage("a", tmp_path / "a")
+    found = executables(a)
+    found.pop("five", None)  # Python 3.10 cannot read it
+    assert found == {
+        "one": "a.one:main",
+        "two": "a.two:main",
+        "three": tmp_path / "a" / "bin" / "three",
+        "four.py": tmp_path / "a" / "four.py",
+    }
+    source = tmp_path / "a" / "source"
+    assert modules(a) == {"single": source / "single.py", "b": source / "b"}
+    broken = SourcePackage("broken", tmp_path / "broken")
+    assert (executables(broken), modules(broken)) == (
+        {},
+        {"broken": tmp_path / "broken" / "broken"},
+    )
+
+
+def test_the_workspace_around_a_launch_file(tmp_path: Path) -> None:
+    _write(tmp_path, {"ws/src/p/package.xml": "", "git/.git/x": "", "git/a/p/package.xml": ""})
+    _write(tmp_path, {"alone/p/package.xml": "", "none/launch/x": ""})
+    for file, around in [
+        ("ws/src/p/launch/x", "ws/src"),
+        ("git/a/p/launch/x", "git"),
+        ("alone/p/launch/x", "alone/p"),
+        ("none/launch/x", None),
+    ]:
+        found = workspace_of(tmp_path / file)
+        assert found == (None if around is None else tmp_path / around)
