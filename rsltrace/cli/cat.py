@@ -48,7 +48,11 @@ class _Time(_IntParam):
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object per line.")
 @click.option("--payloads", is_flag=True, help="With --json: add the decoded messages.")
-@click.option("--code", is_flag=True, help="Add where the function that ran is: module.py:24.")
+@click.option(
+    "--code",
+    is_flag=True,
+    help="Add where the function that ran is (module.py:24), and the lines of its outputs.",
+)
 @click.option(
     "--topic",
     "topics",

@@ -19,6 +19,7 @@ from rsltrace.terminal import say
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
 from rsltrace.trace.reader import Trace
+from rsltrace.words.code import entity_places, places_text
 from rsltrace.words.kinds import kind_label
 from rsltrace.words.table import table
 
@@ -148,7 +149,7 @@ def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
                 str(_count(counts.events, entity.id)),
                 str(_count(counts.outputs, entity.id)),
                 "-" if rate is None else f"{rate:.6g}",
-                printable(entity.source) or "-",
+                printable(places_text(entity_places(trace, entity), ", ")) or "-",
             )
         )
     return [title, *table(rows, right=frozenset((0, 5, 6, 7)))]
@@ -193,6 +194,7 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
                 "type": entity.type,
                 "created_ns": entity.created_ns,
                 "detail": entity.detail,
+                "code": entity_places(trace, entity),
                 "events": _count(counts.events, entity.id),
                 "outputs": _count(counts.outputs, entity.id),
                 "rate_hz": counts.rate_hz(entity.id),

@@ -16,15 +16,18 @@ def source_of(callback: object) -> str:
     The line is that of ``def``, or of its first decorator. The file is named as it is imported, so
     that traces do not differ by the folder in which they were made.
     """
-    found = _function_of(callback)
+    found = function_of(callback)
     if found is None:
         return ""
     code, names = found
-    return f"{_file_of(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
+    return f"{file_of(code, names)}:{code.co_firstlineno}" if code.co_filename[:1] != "<" else ""
 
 
-def _function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:
-    """Go through methods, partials, decorators and callable objects (which may answer anything)."""
+def function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | None:
+    """Return the code that a callback runs in the end, with its module's names; None if unknown.
+
+    Goes through methods, partials, decorators and callable objects (which may answer anything).
+    """
     for _ in range(_WRAPPED_MAX):
         if isinstance(callback, partial):
             callback = callback.func
@@ -48,7 +51,8 @@ def _function_of(callback: object) -> tuple[CodeType, Mapping[str, object]] | No
     return None
 
 
-def _file_of(code: CodeType, names: Mapping[str, object]) -> str:
+def file_of(code: CodeType, names: Mapping[str, object]) -> str:
+    """Return a code's file as it is imported, ``package/module.py``: the same on any machine."""
     path = PurePath(code.co_filename)
     module = names.get("__name__")
     if isinstance(module, str):

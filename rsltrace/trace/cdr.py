@@ -10,12 +10,14 @@ import json
 import struct
 
 from rsltrace.errors import TraceError
+from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.finding import Finding, Mode, Source
 from rsltrace.trace.format import CDR_HEADER
 
 _ENTITY_HEAD = struct.Struct("<IIB")
 _DETAIL_HEAD = struct.Struct("<QI")
+_LINE_HEAD = struct.Struct("<QII")
 _LOG_HEAD = struct.Struct("<iIB")
 _LENGTH = struct.Struct("<I")
 _KINDS = frozenset(map(int, EntityKind))
@@ -84,6 +86,22 @@ def unpack_finding(data: bytes) -> Finding:
         return Finding(event, entity, node, Source(source), Mode(mode), *texts)
     except (struct.error, ValueError) as error:
         raise TraceError(f"a finding of the trace cannot be read: {error}") from error
+
+
+def pack_code_line(line: CodeLine) -> bytes:
+    """Return an ``rsltrace_msgs/msg/CodeLine``."""
+    head = CDR_HEADER + _LINE_HEAD.pack(line.event, line.entity, line.output)
+    return _append_strings(head, line.place, line.function)
+
+
+def unpack_code_line(data: bytes) -> CodeLine:
+    """Return the place of one message. Raises TraceError when the bytes are not one."""
+    try:
+        _check_header(data)
+        head = _LINE_HEAD.unpack_from(data, 4)
+        return CodeLine(*head, *_read_strings(data, 4 + _LINE_HEAD.size, 2))
+    except (struct.error, ValueError) as error:
+        raise TraceError(f"a place in the code cannot be read: {error}") from error
 
 
 def log_content(data: bytes, stamp_ns: int | None = None) -> bytes:

@@ -25,6 +25,7 @@ TOPIC_ENTITIES = "/rsltrace/entities"
 TOPIC_DETAILS = "/rsltrace/details"
 TOPIC_FINDINGS = "/rsltrace/findings"
 TOPIC_STATES = "/rsltrace/states"
+TOPIC_CODE_LINES = "/rsltrace/code_lines"
 TOPIC_ROSOUT = "/rosout"
 PREFIX_OWN = "/rsltrace/"
 PREFIX_REQUEST = "/rsltrace/request"
@@ -70,6 +71,7 @@ SCHEMA_ENTITY = "rsltrace_msgs/msg/Entity"
 SCHEMA_DETAIL = "rsltrace_msgs/msg/Detail"
 SCHEMA_FINDING = "rsltrace_msgs/msg/Finding"
 SCHEMA_STATE = "rsltrace_msgs/msg/StateChange"
+SCHEMA_CODE_LINE = "rsltrace_msgs/msg/CodeLine"
 
 SCHEMA_TEXT = {
     SCHEMA_EVENT: """\
@@ -110,6 +112,13 @@ string text
 uint64 event         # index of the event after which the state is this
 uint32 node          # id in /rsltrace/entities
 string changes       # JSON: attributes that changed, each with its values by path
+""",
+    SCHEMA_CODE_LINE: """\
+uint64 event         # index of the first event of which this is so
+uint32 entity        # id in /rsltrace/entities
+uint32 output        # which output of the event came from here; 2^32-1: what it ran is here
+string place         # package/module.py:24
+string function
 """,
     SCHEMA_FINDING: """\
 uint64 event         # index of the event it happened in

@@ -22,10 +22,11 @@ from rsltrace.mcap.place import open_source
 from rsltrace.mcap.records import Header
 from rsltrace.mcap.source import ByteSource
 from rsltrace.mcap.summary import has_end
+from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.model.finding import Finding, GuardCount
-from rsltrace.trace.cdr import unpack_detail, unpack_entity, unpack_finding
+from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.check import check_data_section, check_hashes, check_records
 from rsltrace.trace.format import (
@@ -37,6 +38,7 @@ from rsltrace.trace.format import (
     METADATA_RESULT,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
+    TOPIC_CODE_LINES,
     TOPIC_DETAILS,
     TOPIC_ENTITIES,
     TOPIC_EVENTS,
@@ -309,6 +311,15 @@ class Trace:
             finding = self._named(unpack_finding, data)
             findings.setdefault(finding.event, []).append(finding)
         return findings
+
+    @cached_property
+    def code_lines(self) -> dict[int, list[CodeLine]]:
+        """The places in the code that the run has met, by entity and in the order of meeting."""
+        lines: dict[int, list[CodeLine]] = {}
+        for _, _, data in self.messages(TOPIC_CODE_LINES):
+            line = self._named(unpack_code_line, data)
+            lines.setdefault(line.entity, []).append(line)
+        return lines
 
     @cached_property
     def guarded(self) -> tuple[GuardCount, ...]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, OutputKind
 from rsltrace.model.finding import Finding
@@ -87,6 +88,10 @@ class Recorder:
     def finding(self, finding: Finding, stamp_ns: int) -> None:
         """Write down what the guard found in the event under way. It is not hashed."""
         self.writer.add_finding(finding, stamp_ns)
+
+    def code_line(self, line: CodeLine, stamp_ns: int) -> None:
+        """Write down a place in the code. It is not hashed."""
+        self.writer.add_code_line(line, stamp_ns)
 
     def state(self, node: int, stamp_ns: int, changes: str) -> None:
         """Write down how the state of a node changed in the event under way. It is not hashed."""

@@ -22,11 +22,12 @@ from rsltrace.mcap.chunk_body import Waiting, messages_chunk
 from rsltrace.mcap.limits import MESSAGE_BYTES_MAX
 from rsltrace.mcap.records import MESSAGE_HEAD
 from rsltrace.mcap.writer import McapWriter
+from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE
 from rsltrace.model.finding import Finding
 from rsltrace.trace import chunks
-from rsltrace.trace.cdr import pack_detail, pack_entity, pack_finding
+from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
@@ -42,6 +43,7 @@ from rsltrace.trace.format import (
     OUTPUTS_PER_SEGMENT,
     PAYLOAD_BYTES_PER_CHUNK,
     PROFILE,
+    SCHEMA_CODE_LINE,
     SCHEMA_DETAIL,
     SCHEMA_ENTITY,
     SCHEMA_EVENT,
@@ -50,6 +52,7 @@ from rsltrace.trace.format import (
     SCHEMA_STATE,
     SCHEMA_TEXT,
     SEGMENT_DTYPE,
+    TOPIC_CODE_LINES,
     TOPIC_DETAILS,
     TOPIC_ENTITIES,
     TOPIC_EVENTS,
@@ -245,6 +248,11 @@ class TraceWriter:
         """Take a finding of the guard. Its channel is there once there is something in it."""
         channel_id = self._own_channel(TOPIC_FINDINGS, SCHEMA_FINDING)
         return self.add_payload(channel_id, stamp_ns, pack_finding(finding))
+
+    def add_code_line(self, line: CodeLine, stamp_ns: int) -> int:
+        """Take a place in the code."""
+        channel_id = self._own_channel(TOPIC_CODE_LINES, SCHEMA_CODE_LINE)
+        return self.add_payload(channel_id, stamp_ns, pack_code_line(line))
 
     def add_state(self, event: int, node: int, stamp_ns: int, changes: str) -> int:
         """Take what changed in a node's state, as JSON."""

@@ -1,4 +1,4 @@
-"""The code of a callback on this machine: traces name files as they are imported."""
+"""The code of callbacks and of outputs, on this machine: traces name files as they are imported."""
 
 from __future__ import annotations
 
@@ -6,19 +6,79 @@ import json
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
-from rsltrace.model.event import Event, EventKind
+from rsltrace.model.code_line import CodeLine
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import NO_SEQUENCE, Event, EventKind, Output, OutputKind
 from rsltrace.trace.reader import Trace
+from rsltrace.words.logs import log_record
+
+_SENT = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST))
+_LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKind.ACTION))
+"""Kinds of events that may run another function than the callback of their entity."""
+_PLACES_SHOWN = 3
 
 
 def code_place(trace: Trace, event: Event) -> str:
     """Return ``module.py:24`` of the function that an event ran, or "": a constructor's for a node
-    that was made in it."""
+    that was made in it, the call's for an answer that somebody awaits."""
     entity = event.entity
     if event.kind is EventKind.CONSTRUCT:
         made = (output.entity for output in trace.outputs_of(event.index))
         entity = next((one for one in made if _is_node(trace, one)), entity)
     found = trace.entities.get(entity)
-    return "" if found is None else found.source
+    source = "" if found is None else found.source
+    if event.kind in _LATER and not (source and event.kind is EventKind.ACTION):
+        return _function(trace.code_lines.get(entity, []), event) or source
+    return source
+
+
+def _function(lines: list[CodeLine], event: Event) -> str:
+    met = [line for line in lines if line.event <= event.index]
+    of_call = [line for line in met if event.kind is EventKind.CLIENT]
+    best = [line for line in met if line.output == NO_SEQUENCE] or of_call
+    return best[-1].place if best else ""
+
+
+def output_places(trace: Trace, output: Output) -> list[str]:
+    """Return the lines (``module.py:31``) from which a message, call or log record came.
+
+    There are several where its entity had sent from several until then, none if nobody knows.
+    """
+    if output.kind is OutputKind.LOG:
+        record = log_record(trace, output)
+        return [record.place] if record is not None and record.place else []
+    if output.kind not in _SENT:
+        return []
+    lines = [
+        line
+        for line in trace.code_lines.get(output.entity, [])
+        if line.event <= output.event and line.output != NO_SEQUENCE
+    ]
+    first = [line for line in lines if line.event == output.event]
+    return list(dict.fromkeys(line.place for line in (first if len(first) == 1 else lines)))
+
+
+def entity_places(trace: Trace, entity: Entity) -> list[str]:
+    """Return where the functions are that an entity runs, then the lines from which it sends."""
+    lines = trace.code_lines.get(entity.id, [])
+    ran = [line.place for line in lines if line.output == NO_SEQUENCE]
+    sent = [line.place for line in lines if line.output != NO_SEQUENCE]
+    return list(dict.fromkeys(filter(None, [entity.source, *ran, *sent])))
+
+
+def places_text(places: list[str], joint: str = " or ") -> str:
+    """Return places as one text; of many the first: ``a.py:3 or a.py:9``."""
+    more = len(places) - _PLACES_SHOWN
+    shown = places[:_PLACES_SHOWN] + ([f"{more} more"] if more > 0 else [])
+    return joint.join(shown)
+
+
+def place_here(trace: Trace, place: str) -> str:
+    """Return a place by its path in the present folder if it is below that, or else as it is."""
+    found = code_file(trace, place)
+    if found is None or found[0].is_absolute() or ".." in found[0].parts:
+        return place
+    return f"{found[0].as_posix()}:{found[1]}"
 
 
 def code_file(trace: Trace, place: str) -> tuple[Path, int] | None:

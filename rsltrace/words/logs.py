@@ -22,11 +22,12 @@ _LENGTH = struct.Struct("<I")
 
 @dataclass(frozen=True, slots=True)
 class LogRecord:
-    """A log record: level as a number (30: warning), logger name and text."""
+    """A log record: level as a number (30: warning), logger name, text, ``module.py:31``."""
 
     level: int
     name: str
     text: str
+    place: str = ""
 
     @property
     def level_name(self) -> str:
@@ -51,10 +52,13 @@ def parse_log(data: bytes) -> LogRecord:
     try:
         _, _, level = _HEAD.unpack_from(data)
         name, position = _string(data, _HEAD.size)
-        text, _ = _string(data, position)
+        text, position = _string(data, position)
+        file, position = _string(data, position)
+        _, position = _string(data, position)
+        (line,) = _LENGTH.unpack_from(data, position + (-position % 4))
     except (struct.error, IndexError) as error:
         raise ValueError(f"not a log record: {error}") from error
-    return LogRecord(level, name, text)
+    return LogRecord(level, name, text, f"{file}:{line}" if file else "")
 
 
 def _string(data: bytes, position: int) -> tuple[str, int]:

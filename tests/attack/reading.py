@@ -17,7 +17,9 @@ from mcap.records import Channel, DataEnd, Message, Schema
 from mcap.stream_reader import StreamReader
 
 _EVENT = struct.Struct("<QQQQQQQIIIBB")
-_FOR_PEOPLE = frozenset(("/rsltrace/details", "/rsltrace/findings", "/rsltrace/states"))
+_FOR_PEOPLE = frozenset(
+    ("/rsltrace/details", "/rsltrace/findings", "/rsltrace/states", "/rsltrace/code_lines")
+)
 
 
 def content(path: Path) -> bytes:

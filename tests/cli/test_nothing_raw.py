@@ -19,7 +19,13 @@ from tests.attack.families.texts import with_strings
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x08\x9b31m\u202eevil\u2066"
 _RAW = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
-_TOPICS = ("/rsltrace/entities", "/rsltrace/details", "/rsltrace/findings", "/rsltrace/states")
+_TOPICS = (
+    "/rsltrace/entities",
+    "/rsltrace/details",
+    "/rsltrace/findings",
+    "/rsltrace/states",
+    "/rsltrace/code_lines",
+)
 
 Run = Callable[..., str]
 

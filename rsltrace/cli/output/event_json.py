@@ -9,11 +9,12 @@ from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKin
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place
+from rsltrace.words.code import code_place, output_places
 from rsltrace.words.kinds import flag_names
 from rsltrace.words.logs import log_record
 
 _WITH_MESSAGE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG)
+_WITH_PLACE = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.LOG)
 
 
 class EventJson:
@@ -74,6 +75,8 @@ class EventJson:
             "hash": f"{output.hash:016x}",
             "sequence": output.sequence if kept else None,
         }
+        if output.kind in _WITH_PLACE:
+            result["code"] = output_places(self._trace, output)
         if output.kind is OutputKind.DRAW:
             result["text"] = draw_text(output.hash)
         if output.kind is OutputKind.LOG and kept:

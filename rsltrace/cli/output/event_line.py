@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from rsltrace.model.event import Event, Output
 from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place
+from rsltrace.words.code import code_place, output_places, places_text
 from rsltrace.words.events import EventWords
 from rsltrace.words.kinds import flag_names
 
@@ -21,14 +23,18 @@ class EventLines:
 
     Index, simulated seconds, node, kind, entity, input hash, output hash, outputs, flags. Columns
     without a value hold ``-``; outputs and flags come last because they have any length. With
-    ``code``, the place of the function that ran comes before the outputs.
+    ``code``, the place of the function that ran comes before the outputs, and each of these has its
+    line.
     """
 
     def __init__(self, trace: Trace, *, code: bool = False) -> None:
         self._trace = trace
-        places = [printable(entity.source) for entity in trace.entities.values()] if code else []
+        made = (entity.source for entity in trace.entities.values())
+        ran = (line.place for lines in trace.code_lines.values() for line in lines)
+        places = list(map(printable, chain(made, ran))) if code else []
         self._code_width = min(max(map(len, places), default=0), _COLUMN_MAX)
         self._findings = trace.findings
+        self._more = self._from_where if code else lambda output: ""
         self._words = EventWords(trace)
         names = self._words.names
         self._index_width = max(len(str(trace.event_count)), 5)
@@ -49,11 +55,15 @@ class EventLines:
         if self._code_width:
             place = printable(code_place(self._trace, event)) or "-"
             columns += f"  {place:<{self._code_width}}"
-        what = ", ".join(self._words.outputs(outputs))
+        what = ", ".join(self._words.outputs(outputs, self._more))
         flags = "".join(f"  [{flag}]" for flag in flag_names(event.flags))
         found = self._findings.get(event.index, ())
         lines = [f"{columns}  {what}{flags}".rstrip(), *map(self._finding, found)]
         return "\n".join(lines)
+
+    def _from_where(self, output: Output) -> str:
+        places = printable(places_text(output_places(self._trace, output)))
+        return f"at {places}" if places else ""
 
     def _finding(self, finding: Finding) -> str:
         where = printable(finding.stack.partition("\n")[0])

@@ -11,9 +11,8 @@ import numpy.typing as npt
 from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import Event, EventFlag, EventKind, OutputKind
-from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_file, code_place
+from rsltrace.model.event import EventFlag, EventKind, OutputKind
+from rsltrace.words.code import code_place, place_here
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.outputs import output_text
 from rsltrace.words.phrases import event_phrase
@@ -55,7 +54,7 @@ class EventViews:
             outputs=event.outputs,
             position=self._position(index, event.entity) if event.entity else 0,
             summary=self.summary(outputs),
-            code=_code(run.trace, event),
+            code=place_here(run.trace, code_place(run.trace, event)),
         )
 
     def before(self, index: int, count: int) -> tuple[EventView, ...]:
@@ -121,14 +120,6 @@ class EventViews:
     def _first_entities(self) -> npt.NDArray[np.uint32]:
         parts = [part["entity"] for part in self._run.trace.events(0, COUNTED_MAX)]
         return np.concatenate(parts) if parts else np.zeros(0, dtype=np.uint32)
-
-
-def _code(trace: Trace, event: Event) -> str:
-    place = code_place(trace, event)
-    found = code_file(trace, place)
-    if found is None or found[0].is_absolute() or ".." in found[0].parts:
-        return place
-    return f"{found[0].as_posix()}:{found[1]}"
 
 
 def drawn_for(key: EntityKey) -> str:

@@ -21,6 +21,7 @@ from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
+from rsltrace.words.code import output_places, place_here
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.outputs import output_text
 
@@ -76,11 +77,20 @@ class _Evidence:
             if bag and (x or y or (0,))[0] == OutputKind.MESSAGE:
                 continue  # what is published is the input, shown already
             found = self._difference(position, x, y, x and x[2], y and y[2], moved=moved)
+            places = self._places(self._run_a, x, a) + self._places(self._run_b, y, b)
+            found = replace(found, code=tuple(dict.fromkeys(places)))
             one = x or y
             if one is not None and not (x and y):
                 note = notes.note(one, (outputs_a, outputs_b), only_b=x is None)
                 found = replace(found, note=note or found.note)
             yield found
+
+    def _places(self, run: Run, row: OutputRow | None, view: EventView | None) -> list[str]:
+        """Return the lines from which an output may have come."""
+        if row is None or view is None or row[0] not in _WITH_PAYLOAD:
+            return []
+        output = Output(view.index, _entity_id(run, row[1]), OutputKind(row[0]), row[2], row[3])
+        return [place_here(run.trace, place) for place in output_places(run.trace, output)]
 
     def _input(self, run: Run, view: EventView | None) -> OutputRow | None:
         """Return the output that was an event's input; for a bag message, its own publication."""

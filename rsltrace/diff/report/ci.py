@@ -63,11 +63,12 @@ def github(diffs: Sequence[Diff | BagDiff], options: DiffOptions) -> str:
 
 
 def _place(diff: Diff | BagDiff) -> str:
-    """Return what an annotation points to: the code that ran where two runs diverge, if it is
-    here, or else the file that was compared."""
+    """Return what an annotation points to: the line that sent what differs first, or the function
+    that ran where two runs diverge, if it is here, or else the file that was compared."""
     found = diff.shown if isinstance(diff, Diff) else None
     views = () if found is None else (found.b, found.a)
-    for code in (view.code for view in views if view is not None):
+    sent = [one.code[0] for one in found.messages[:1] if len(one.code) == 1] if found else []
+    for code in (*sent, *(view.code for view in views if view is not None)):
         name, _, number = code.rpartition(":")
         if Path(name).is_file():
             return f"file={command_property(printable(name))},line={number}"

@@ -9,6 +9,7 @@ from rsltrace.diff.result.divergence import MessageDifference
 from rsltrace.diff.result.fields import ULP_TOLD_MAX, FieldDifference
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import printable, shortened
+from rsltrace.words.code import places_text
 
 _INDENT = "    "
 _INLINE_MAX = 26
@@ -34,6 +35,8 @@ def message_title(message: MessageDifference) -> str:
         text += f" ({printable(message.type)})"
     if message.presence != "both":
         text += f", {message.presence}"
+    if message.code:
+        text += f", at {printable(places_text(list(message.code)))}"
     return text
 
 

@@ -23,7 +23,8 @@ class MessageDifference:
     says so, and how to record it. ``note`` says in a few words what became of it: ``in another
     order``, ``twice in b``, ``4 ms later in b``, ``cancelled in a``. ``preview`` is the decoded
     message as one short line where only one side has it (of an exception: its last line). A new
-    entity has hash 0: it is known by name.
+    entity has hash 0: it is known by name. ``code`` are the lines it may have come from
+    (``module.py:31``), of both runs.
     """
 
     kind: OutputKind | None
@@ -38,6 +39,7 @@ class MessageDifference:
     preview: str = ""
     reason: str = ""
     note: str = ""
+    code: tuple[str, ...] = ()
 
     @property
     def is_covered(self) -> bool:

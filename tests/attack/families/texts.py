@@ -21,6 +21,7 @@ _STRINGS = {
     "/rsltrace/details": (12, 1),
     "/rsltrace/findings": (12, 6),
     "/rsltrace/states": (12, 1),
+    "/rsltrace/code_lines": (16, 2),
     "/rosout": (9, 4),
 }
 """Where the strings of these messages begin after the CDR header, and how many there are."""
@@ -168,6 +169,7 @@ FAMILY = Family(
         "details": _messages("/rsltrace/details", (0,)),
         "findings": _messages("/rsltrace/findings", (0, 1, 2, 3, 4, 5)),
         "states": _messages("/rsltrace/states", (0,)),
+        "code-lines": _messages("/rsltrace/code_lines", (0, 1)),
         "logs": _messages("/rosout", (0, 1, 2, 3)),
         "topics": _records(_topics),
         "topics-that-do-not-decode": _records(_topics_that_do_not_decode),

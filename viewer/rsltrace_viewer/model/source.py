@@ -5,11 +5,11 @@ from __future__ import annotations
 import ast
 import hashlib
 from dataclasses import dataclass
-from pathlib import PurePosixPath
+from pathlib import Path, PurePosixPath
 
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_file, code_place
+from rsltrace.words.code import code_file, code_place, output_places
 from rsltrace_viewer.model.run import Run
 
 _LINES_MAX = 400
@@ -19,8 +19,8 @@ _BYTES_MAX = 4 << 20
 @dataclass(frozen=True, slots=True)
 class Source:
     """The callback of an event: ``line`` is the number of the first of ``lines``, ``at`` that of
-    the one at which it waits. ``note`` says why there are none, or that they may not be those of
-    the run."""
+    the one at which it waits, ``sent`` those from which its outputs came. ``note`` says why there
+    are none, or that they may not be those of the run."""
 
     file: str
     line: int
@@ -28,6 +28,7 @@ class Source:
     lines: tuple[str, ...]
     note: str = ""
     at: int | None = None
+    sent: frozenset[int] = frozenset()
 
 
 def source_of(run: Run, index: int) -> Source | None:
@@ -54,7 +55,24 @@ def source_of(run: Run, index: int) -> Source | None:
     if first > len(lines):
         note = f"changed since this run: it has {len(lines)} lines now"
     last = min(_last_line(text, first), first + _LINES_MAX)
-    return Source(str(path), first, place, tuple(lines[first - 1 : last]), note)
+    sent = _lines_in(name, run, index)
+    return Source(str(path), first, place, tuple(lines[first - 1 : last]), note, sent=sent)
+
+
+def place_of_output(run: Run, index: int, number: int) -> tuple[Path, int] | None:
+    """Return file and line from which an output of an event came; None if that is not known.
+
+    Raises TraceError, IndexError.
+    """
+    places = output_places(run.trace, run.outputs(index)[number])
+    return code_file(run.trace, places[0]) if len(places) == 1 else None
+
+
+def _lines_in(name: str, run: Run, index: int) -> frozenset[int]:
+    """Return the lines of a file from which the outputs of an event came."""
+    places = (output_places(run.trace, output) for output in run.outputs(index))
+    lines = (one[0].rpartition(":") for one in places if len(one) == 1)
+    return frozenset(int(line) for file, _, line in lines if file == name and line.isdecimal())
 
 
 def _is_that_of(trace: Trace, name: str, data: bytes) -> bool:

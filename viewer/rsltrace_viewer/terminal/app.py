@@ -18,7 +18,7 @@ from rsltrace.model.printable import printable, shortened
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.source import source_of
+from rsltrace_viewer.model.source import place_of_output, source_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.editor import edit
@@ -281,22 +281,34 @@ class ViewerApp(Stepping):
         self._show_source()
 
     def action_edit(self) -> None:
-        """Open the callback in an editor; the viewer waits for it."""
+        """Open the callback in an editor, of an output in the inspector the line that sent it; the
+        viewer waits for it."""
         here = self.session.current()
         if here is None:
             return
         try:
             source = source_of(*here)
+            place = self._place_of_output(*here)
         except TraceError as error:
             self.notify(str(error), severity="error")
             return
-        if source is None:
+        if place is not None:
+            self._say(edit(self, *place) or (source.note if source is not None else ""))
+        elif source is None:
             self._say("the trace does not say where its callback is")
         elif not source.lines:
             self.notify(f"{source.file}:{source.line} {source.note}", severity="warning")
         else:
             said = edit(self, Path(source.file), source.line)
             self._say(said or source.note)
+
+    def _place_of_output(self, run: Run, index: int) -> tuple[Path, int] | None:
+        inspector = self._focused_inspector()
+        line = inspector.current if inspector is not None else None
+        words = line.path.split(".") if line is not None else []
+        if words[:1] != ["out"] or len(words) < 2 or not words[1].isdecimal():
+            return None
+        return place_of_output(run, index, int(words[1]))
 
     def action_yank(self) -> None:
         """Copy the event, or the line of the inspector one is at, to the clipboard."""

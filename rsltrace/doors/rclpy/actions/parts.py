@@ -14,6 +14,7 @@ from rsltrace.doors.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.services import ClientHandle, ServiceHandle
+from rsltrace.doors.rclpy.stacks.code_lines import Functions
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, start_coroutine
 from rsltrace.doors.rclpy.wire.interfaces import type_name
 from rsltrace.model.event import EventKind
@@ -27,6 +28,8 @@ class Part(ReceiverHandle):
     """One of an action's endpoints: its arrivals are handed to the action's waitable."""
 
     owner: ActionHandle
+    purpose: str
+    """``goal``, ``cancel``, or what else it is for."""
 
     def find_wrapper(self) -> Any:
         """Return the action's waitable once its node is being run."""
@@ -47,7 +50,11 @@ class Part(ReceiverHandle):
         return {"action": self.owner.name}
 
     def user_callback(self) -> object:
-        return getattr(self.wrapper, "_execute_callback", None)  # of an action client: none
+        """Return the server's callback for this kind of request; a client has none of its own."""
+        own = getattr(self.wrapper, f"_{self.purpose}_callback", None)
+        if getattr(own, "__module__", "").startswith("rclpy."):  # a goal that is simply accepted
+            own = None
+        return own or getattr(self.wrapper, "_execute_callback", None)
 
 
 class GoalService(Part, ServiceHandle):
@@ -71,6 +78,7 @@ class ActionHandle(Handle):
     def __init__(self, node: NodeHandle, action_type: Any, name: str) -> None:
         super().__init__()
         self.stacks = node.stacks
+        self._functions = Functions(node.dispatcher)
         self.node = node
         self.name = node.resolve(name, service=False)
         self.parts: list[Part] = []
@@ -88,6 +96,7 @@ class ActionHandle(Handle):
         """Make a part at ``<name>/_action/``; it has its owner before its constructor runs."""
         part = kind.__new__(kind)
         part.owner = self
+        part.purpose = name.partition("_goal")[0].replace("send", "goal")
         part.__init__(self.node, interface, self.path(name), qos)  # type: ignore[misc]
         self.parts.append(part)
         return part
@@ -130,9 +139,16 @@ class ActionHandle(Handle):
             data = waitable.take_data()
         finally:
             self._ready = None
+        if "feedback" in data:
+            self._tell_feedback_callback(part, data["feedback"])
         for future in waitable._futures:
             future._set_executor(executor_of(self.stacks, part))
         await waitable.execute(data)
+
+    def _tell_feedback_callback(self, part: Part, message: Any) -> None:
+        callbacks = part.wrapper._feedback_callbacks
+        callback = callbacks.get(bytes(message.goal_id.uuid))
+        self._functions.run(part.entity_id, callback)
 
     def _destroy(self) -> None:
         self.node.actions.remove(self)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -86,10 +87,14 @@ def boundary() -> Boundary:
 def _load_type_support() -> None:
     """Load what messages load when their type is first used.
 
-    It drags a template engine in, which in a run would be compiled as if it were a node's library.
+    It drags a template engine in, which in a run would be compiled as if it were a node's library;
+    and a parser with warnings of old modules, which ``pytest -W error`` makes a node's failure.
     """
-    with suppress(ImportError):
-        importlib.import_module("rosidl_generator_py")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for name in ("rosidl_parser", "rosidl_generator_py"):
+            with suppress(ImportError):
+                importlib.import_module(name)
 
 
 def check_free() -> None:

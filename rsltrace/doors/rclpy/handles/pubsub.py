@@ -8,6 +8,7 @@ from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle, ReceiverHan
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import qos_of
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
+from rsltrace.doors.rclpy.stacks.code_lines import CallSites
 from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import message_type
@@ -32,18 +33,26 @@ class PublisherHandle(EntityHandle, Publisher):
         profile = qos if isinstance(qos, Qos) else qos_of(qos)
         domain = node.stacks.domain
         Publisher.__init__(self, domain.transport, node, resolved, message_type(msg_type), profile)
+        self._event = node.dispatcher.event
+        self._sites = CallSites(node.dispatcher, self.entity_id)
         domain.graph.add_publisher(self)
 
     def publish(self, msg: Any) -> None:
         """Publish a message: a snapshot of it goes to every connected subscription."""
-        self.send(self._serialize(msg))
+        data = self._serialize(msg)
+        sites = self._sites
+        if self._count == sites.due or self._event.entity != sites.running:
+            sites.look(self._count)
+        self.send(data)
 
     def publish_raw(self, data: bytes) -> None:
         """Publish a serialized message, in canonical form.
 
         :raises ValueError: if the bytes are not a message of this topic's type.
         """
-        self.send(self._canonical(data))
+        data = self._canonical(data)
+        self._sites.look(self._count)
+        self.send(data)
 
     def get_topic_name(self) -> str:
         """Return the resolved topic."""

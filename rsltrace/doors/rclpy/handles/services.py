@@ -17,6 +17,7 @@ from rsltrace.doors.rclpy.handles.introspection import (
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import profile_of, qos_of
+from rsltrace.doors.rclpy.stacks.code_lines import CallSites, Functions
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, is_coroutine_function, start_coroutine
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import service_type
@@ -149,6 +150,8 @@ class ClientHandle(ServiceEndHandle, Client):
 
     def __init__(self, node: NodeHandle, srv_type: Any, name: str, qos: Any) -> None:
         Client.__init__(self, *self._prepare(node, srv_type, name, qos))
+        self._sites = CallSites(node.dispatcher, self.entity_id)
+        self._functions = Functions(node.dispatcher)
         node.stacks.domain.graph.add_client(self)
 
     @property
@@ -162,7 +165,11 @@ class ClientHandle(ServiceEndHandle, Client):
 
     def send_request(self, request: Any) -> int:
         """Send a request to every server of that name; without one it is lost, as in DDS."""
-        request_id = self.request(self._request.serialize(request))
+        data = self._request.serialize(request)
+        sites = self._sites
+        if self._sequence == sites.due or self.dispatcher.event.entity != sites.running:
+            sites.look(self._sequence)
+        request_id = self.request(data)
         if self._service_events is not None:
             self._tell(REQUEST_SENT, request_id, request)
         return request_id.sequence_number
@@ -207,6 +214,7 @@ class ClientHandle(ServiceEndHandle, Client):
             callbacks, future._callbacks = future._callbacks, []
         future.set_result(response)
         for callback in callbacks:
+            self._functions.run(self.entity_id, callback)
             if is_coroutine_function(callback):
                 executor.create_task(callback, future)
             else:

@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from rsltrace.doors.rclpy.stacks.code_lines import Functions
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.wait_reasons import awaited
 from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.entity import Runnable
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 
+_TASK = int(EventKind.TASK)
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 
@@ -25,6 +27,7 @@ class Coroutines:
     def __init__(self, domain: Domain) -> None:
         self.domain = domain
         self.suspended: dict[TaskRun, None] = {}
+        self.functions = Functions(domain.dispatcher)
         self._polled: list[TaskRun] = []
         self._polls = 0
         self._stage: tuple[int, int] | None = None
@@ -89,6 +92,7 @@ class TaskRun:
         self.cause_output = 0
         self.input_hash = 0
         self._on_end = on_end
+        self._is_told = kind != _TASK  # others run their entity's callback
         self._awaited: Any = None
 
     def dispatch(self) -> None:
@@ -140,6 +144,9 @@ class TaskRun:
     def _step(self) -> None:
         coroutines = self._coroutines
         coroutines.suspended.pop(self, None)
+        if not self._is_told:
+            self._is_told = True
+            coroutines.functions.run(self.entity, *self.called)
         self._awaited = None
         task = self.task
         task()

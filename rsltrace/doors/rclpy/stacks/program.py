@@ -20,6 +20,7 @@ from greenlet import greenlet
 
 from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.middleware.events.failure import Raised
+from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
 
 _FAILURES_MAX = 16
@@ -163,7 +164,9 @@ class Program:
 
     def entity(self) -> Entity:
         """Return the main as the trace describes it."""
-        return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, {})
+        source = "" if self.entry is None else source_of(self.entry.make)
+        detail: dict[str, object] = {"source": source} if source else {}
+        return Entity(self.entity_id, 0, EntityKind.MAIN, self.name, "", self.begun_ns or 0, detail)
 
     def forget(self) -> None:
         """Let go of everything user code made, so that its finalizers run."""

@@ -20,6 +20,7 @@ from rsltrace.model.event import (
 )
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.words.code import output_places, places_text
 from rsltrace.words.entities import RUN_NAME
 from rsltrace.words.logs import LEVEL_WARN, log_record
 from rsltrace_viewer.model.inspector.effects import Effects
@@ -155,9 +156,9 @@ def _finding_lines(
 
 
 def _output_title(run: Run, output: Output) -> str:
-    if output.kind in _MESSAGES:
-        return _channel_text(run, output)
-    return run.words.output(output)
+    text = _channel_text(run, output) if output.kind in _MESSAGES else run.words.output(output)
+    places = printable(places_text(output_places(run.trace, output)))
+    return f"{text}  at {places}" if places else text
 
 
 def _output_role(run: Run, output: Output) -> Role:

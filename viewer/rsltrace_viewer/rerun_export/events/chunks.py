@@ -12,8 +12,10 @@ import rerun as rr
 from rerun.chunk import Chunk
 
 from rsltrace.model.event import NO_EVENT, EventFlag
+from rsltrace.model.printable import printable
 from rsltrace.trace.format import OUTPUT_DTYPE
 from rsltrace.trace.reader import Trace
+from rsltrace.words.code import entity_places, places_text
 from rsltrace_viewer.rerun_export.colours import lane
 from rsltrace_viewer.rerun_export.columns import (
     EVENT,
@@ -72,6 +74,16 @@ class EventRows:
         for path, states in self._lane_states.items():
             yield from lane_colours(path, {text: lane(i) for i, text in enumerate(states)})
         yield from self._rates()
+        yield from self._places()
+
+    def _places(self) -> Iterator[Chunk]:
+        """Yield where the code of each entity is, beside what it did."""
+        for entity in self._trace.entities.values():
+            places = printable(places_text(entity_places(self._trace, entity), ", "))
+            if places:
+                yield from make_chunk(
+                    self._paths.callback(entity), (), (("code", pa.array([places])),)
+                )
 
     def _batches(self) -> Iterator[Batch]:
         """Join segments until they are a batch."""

@@ -35,7 +35,7 @@ class SourceView(VerticalScroll, can_focus=True):
         yield Static(id="code")
 
     def show(self, source: Source | None) -> None:
-        """Show a callback, with a sign at the line that waits; None: there is none in Python."""
+        """Show a callback, with signs at lines that wait or send; None: there is none in Python."""
         if source == self._shown and source is not None:
             return
         self._shown = source
@@ -54,7 +54,7 @@ class SourceView(VerticalScroll, can_focus=True):
         width = len(str(source.line + len(rows))) if source.lines else 0
         code.update(
             Content("\n").join(
-                _numbered(number, row, width, waits=number == source.at)
+                _numbered(number, row, width, _sign(source, number))
                 for number, row in enumerate(rows, source.line)
             )
         )
@@ -62,6 +62,12 @@ class SourceView(VerticalScroll, can_focus=True):
         self.scroll_to(0, max(above, 0), animate=False)
 
 
-def _numbered(number: int, row: Content, width: int, *, waits: bool) -> Content:
-    sign, style = ("▶", "bold $text-accent") if waits else (" ", "$text-muted")
-    return Content.styled(f"{sign}{number:>{width}} ", style) + row if width else row
+def _sign(source: Source, number: int) -> tuple[str, str]:
+    """Return what stands before a line, and its style: where it waits, where it sent something."""
+    if number == source.at:
+        return "▶", "bold $text-accent"
+    return ("→", "$text-success") if number in source.sent else (" ", "$text-muted")
+
+
+def _numbered(number: int, row: Content, width: int, sign: tuple[str, str]) -> Content:
+    return Content.styled(f"{sign[0]}{number:>{width}} ", sign[1]) + row if width else row

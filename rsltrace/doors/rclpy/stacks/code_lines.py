@@ -1,0 +1,120 @@
+"""Where in user code things are sent, and which functions run: told to the trace once per place.
+
+Looking at a caller costs as much as a tenth of an event, since the guard's audit hook is told of
+each look. So the first outputs of each entity are looked at, later ones now and then.
+"""
+
+from __future__ import annotations
+
+import sys
+from types import CodeType, FrameType, FunctionType, MethodType
+from typing import Any
+
+from rsltrace.guard.callers import is_user_file, user_frame
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.source_position import file_of, function_of
+from rsltrace.model.code_line import CodeLine
+from rsltrace.model.event import NO_SEQUENCE
+
+_PLACES_MAX = 1000
+"""Code may be made while a program runs, ever anew: no more places of one entity are told."""
+_LOOKS_FIRST = 32
+_STRIDE = 256
+"""So many outputs are looked at first, of each callback that sends some; then about every 256th."""
+
+
+class CallSites:
+    """The places from which one entity sends.
+
+    Who sends compares how often it has sent with ``due`` and the entity whose callback is running
+    with ``running``, and calls ``look`` where one of them says so.
+    """
+
+    __slots__ = ("_dispatcher", "_entity", "_looks", "_told", "due", "running")
+
+    def __init__(self, dispatcher: Dispatcher, entity: int) -> None:
+        self._dispatcher = dispatcher
+        self._entity = entity
+        self._told: set[tuple[str, int, int]] = set()
+        self._looks: dict[int, int] = {}
+        self.due = 0
+        self.running = -1
+
+    def look(self, sent: int) -> None:
+        """Take note of who calls rclpy's method that has called ours, its ``sent``-th call."""
+        running = self._dispatcher.event.entity
+        looks = self._looks[running] = self._looks.get(running, 0) + 1
+        is_due = sent == self.due
+        if looks < _LOOKS_FIRST:
+            self.due = sent + 1
+        elif is_due:  # uneven steps, as callbacks may go round in even ones
+            self.due = sent + _STRIDE // 2 + sent * 7919 % _STRIDE
+        self.running = running
+        if looks <= _LOOKS_FIRST or is_due:
+            self._look(sys._getframe(3))
+
+    def _look(self, frame: FrameType) -> None:
+        recorder = self._dispatcher.recorder
+        found = frame if is_user_file(frame.f_code.co_filename) else _caller(frame)
+        if recorder is None or found is None:
+            return
+        code = found.f_code
+        key = code.co_filename, found.f_lineno, found.f_lasti  # hashing code takes long
+        if key not in self._told and len(self._told) < _PLACES_MAX:
+            self._told.add(key)
+            output = recorder.outputs
+            _tell(self._dispatcher, self._entity, code, found.f_globals, found.f_lineno, output)
+
+
+class Functions:
+    """The functions of the user's that events run beside the callbacks of their entities."""
+
+    def __init__(self, dispatcher: Dispatcher) -> None:
+        self._dispatcher = dispatcher
+        self._known: set[tuple[int, object]] = set()
+        self._told: set[tuple[int, CodeType]] = set()
+        self._met = 0
+
+    def run(self, entity: int, callback: Any, args: tuple[Any, ...] = ()) -> None:
+        """Take note that the event under way runs a function for ``entity``.
+
+        It may be given to a function of rclpy's in ``args``.
+        """
+        plain = callback.__func__ if type(callback) is MethodType else callback
+        is_known = type(plain) is FunctionType and not args
+        if is_known and (entity, plain) in self._known:
+            return
+        self._met += 1
+        if self._met > _LOOKS_FIRST and self._met % _STRIDE:
+            return
+        if is_known and len(self._known) < _PLACES_MAX:
+            self._known.add((entity, plain))
+        for one in (callback, *args):
+            found = function_of(one)
+            if found is not None and is_user_file(found[0].co_filename):
+                self._tell(entity, *found)
+                return
+
+    def _tell(self, entity: int, code: CodeType, names: Any) -> None:
+        if (entity, code) not in self._told and len(self._told) < _PLACES_MAX:
+            self._told.add((entity, code))
+            _tell(self._dispatcher, entity, code, names, code.co_firstlineno, NO_SEQUENCE)
+
+
+def _tell(
+    dispatcher: Dispatcher, entity: int, code: CodeType, names: Any, line: int, output: int
+) -> None:
+    recorder = dispatcher.recorder
+    if recorder is not None and code.co_filename[:1] != "<":
+        name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
+        place = f"{file_of(code, names)}:{line}"
+        told = CodeLine(recorder.index, entity, output, place, name)
+        recorder.code_line(told, dispatcher.loop.now_ns)
+
+
+def _caller(frame: FrameType) -> FrameType | None:
+    """Return the user's frame that called rclpy or a library, None if only the run itself did."""
+    above: FrameType | None = frame
+    while above is not None and str(above.f_globals.get("__name__")).startswith("rclpy."):
+        above = above.f_back
+    return user_frame(above, frozenset())

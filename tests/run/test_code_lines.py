@@ -1,0 +1,174 @@
+"""The trace says from which line each output came, and which function ran where that varies."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from rsltrace.cli.main import cli
+from rsltrace.model.event import EventKind, OutputKind
+from rsltrace.trace.reader import Trace
+from rsltrace.words.code import code_place, output_places
+
+pytestmark = pytest.mark.ros
+
+PROGRAM = """\
+import rclpy
+from rclpy.action import ActionClient, ActionServer
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from std_msgs.msg import String
+from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
+
+
+class Server(Node):
+    def __init__(self):
+        super().__init__("server")
+        self.create_service(Trigger, "go", lambda request, response: response)  # serve
+        self.action = ActionServer(self, Fibonacci, "fib", self.execute)
+
+    def execute(self, goal):  # executes
+        goal.publish_feedback(Fibonacci.Feedback())  # feedback
+        goal.succeed()
+        return Fibonacci.Result()
+
+
+class Caller(Node):
+    def __init__(self):
+        super().__init__("caller")
+        self.declare_parameter("speed", 1.0)
+        self.pub = self.create_publisher(String, "chat", 10)
+        self.client = self.create_client(Trigger, "go")
+        self.waits = self.create_client(Trigger, "go")
+        self.action = ActionClient(self, Fibonacci, "fib")
+        self.ticks = 0
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.ticks += 1
+        if self.ticks % 2:
+            self.pub.publish(String(data="a"))  # odd
+        else:
+            self.pub.publish(String(data="b"))  # even
+        for _ in range(2):
+            send(self.pub, "c")
+        self.client.call_async(Trigger.Request()).add_done_callback(self.on_answer)  # calls
+        self.executor.create_task(self.work)
+        if self.ticks == 1:
+            sent = self.action.send_goal_async(  # goal
+                Fibonacci.Goal(), feedback_callback=self.on_feedback
+            )
+            sent.add_done_callback(self.on_goal)
+            self.set_parameters([Parameter("speed", value=2.0)])  # parameter
+
+    async def work(self):  # work
+        await self.waits.call_async(Trigger.Request())  # awaits
+        self.get_logger().info("done")  # logs
+
+    def on_answer(self, future):  # answer
+        pass
+
+    def on_feedback(self, message):  # on feedback
+        pass
+
+    def on_goal(self, future):  # on goal
+        pass
+
+
+def send(publisher, text):
+    publisher.publish(String(data=text))  # helper
+
+
+def main():  # main
+    rclpy.init()
+    rclpy.spin(Caller())
+"""
+
+
+def _line(mark: str) -> str:
+    lines = PROGRAM.splitlines()
+    return f"marked.py:{1 + next(i for i, line in enumerate(lines) if line.endswith(f'# {mark}'))}"
+
+
+@pytest.fixture(scope="module")
+def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("test_msgs.action", reason="needs ros-jazzy-test-msgs")
+    import rsltrace
+
+    folder = tmp_path_factory.mktemp("lines")
+    (folder / "marked.py").write_text(PROGRAM)
+    (folder / "job.yaml").write_text(
+        "nodes: [{node: 'marked:Server'}, {main: 'marked:main'}]\n"
+        "search_path: [.]\nstop: {time: 500 ms}\n"
+    )
+    rsltrace.record(rsltrace.load_job(folder / "job.yaml"), folder / "run.mcap")
+    return folder / "run.mcap"
+
+
+def test_outputs_have_the_lines_that_sent_them(trace: Path) -> None:
+    with Trace.open(trace) as opened:
+        met: dict[tuple[str, str], list[list[str]]] = {}
+        for index in range(opened.event_count):
+            for output in opened.outputs_of(index):
+                key = output.kind.name, opened.entity(output.entity).name
+                met.setdefault(key, []).append(output_places(opened, output))
+    odd, even, helper = (_line(mark) for mark in ("odd", "even", "helper"))
+    chat = met["MESSAGE", "/chat"]
+    assert chat[0] == [odd, helper]  # both are new in one event
+    assert chat[3] == [even]  # the only one that is new
+    assert chat[-1] == [odd, helper, even]  # nobody knows
+    calls = {tuple(places) for places in met["REQUEST", "/go"]}
+    assert calls == {(_line("calls"),), (_line("awaits"),)}
+    assert met["REQUEST", "/fib/_action/send_goal"] == [[_line("goal")]]
+    assert met["MESSAGE", "/fib/_action/feedback"] == [[_line("feedback")]]
+    assert [_line("parameter")] in met["MESSAGE", "/parameter_events"]
+    assert [_line("logs")] in met["LOG", "/rosout"]
+
+
+def test_events_have_the_function_that_ran(trace: Path) -> None:
+    with Trace.open(trace) as opened:
+        events = [opened.event(index) for index in range(opened.event_count)]
+        met = {
+            (event.kind, opened.entity(event.entity).name, code_place(opened, event))
+            for event in events
+        }
+        mains = [one.source for one in opened.entities.values() if one.kind.name == "MAIN"]
+    assert mains == [_line("main")]
+    assert {
+        (EventKind.TASK, "Caller.tick", _line("work")),
+        (EventKind.CLIENT, "/go", _line("answer")),
+        (EventKind.CLIENT, "/go", _line("awaits")),
+        (EventKind.ACTION, "/fib/_action/feedback", _line("on feedback")),
+        (EventKind.TASK, "/fib/_action/send_goal", _line("on goal")),
+        (EventKind.TASK, "/fib/_action/send_goal", _line("executes")),
+        (EventKind.SERVICE, "/go", _line("serve")),
+    } <= met
+
+
+def test_each_place_is_told_once_and_where(trace: Path) -> None:
+    with Trace.open(trace) as opened:
+        for entity, lines in opened.code_lines.items():
+            assert len({(line.place, line.output) for line in lines}) <= len(lines) <= 4
+            for line in lines:
+                if line.output != 2**32 - 1:
+                    output = opened.outputs_of(line.event)[line.output]
+                    assert output.entity == entity
+                    assert output.kind in (OutputKind.MESSAGE, OutputKind.REQUEST)
+
+
+def test_commands_show_them(trace: Path) -> None:
+    def run(*words: str) -> str:
+        done = CliRunner().invoke(cli, [*words, str(trace)])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert f"call /go at {_line('calls')}" in run("cat", "--code")
+    chat = [line for line in run("info").splitlines() if "  /chat  " in line]
+    assert f"{_line('odd')}, {_line('helper')}, {_line('even')}" in chat[0]
+    rows = map(json.loads, run("cat", "--json").splitlines())
+    sent = [output for row in rows for output in row["outputs"] if output["kind"] == "log"]
+    assert sent[0]["code"] == [_line("logs")]
