@@ -1,9 +1,13 @@
-"""CRC-32 of bytes whose parts have been summed already."""
+"""CRC-32: as fast as the processor can, and of bytes whose parts have been summed already."""
 
 from __future__ import annotations
 
 from functools import cache
-from zlib import crc32
+
+try:
+    from zlib_ng.zlib_ng import crc32  # carry-less multiplication: ten times as fast as zlib's
+except ImportError:  # a sourced ROS 2 with its own Python may not have it
+    from zlib import crc32
 
 _POLYNOMIAL = 0xEDB88320
 
@@ -56,3 +60,6 @@ def _times(matrix: _Matrix, vector: int) -> int:
             result ^= column
         vector >>= 1
     return result
+
+
+__all__ = ["crc32", "crc_of", "joined_crc"]

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import struct
-from binascii import crc32
 from collections.abc import Mapping
 from operator import itemgetter
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
+from rsltrace.mcap.checksum import crc32
 from rsltrace.mcap.limits import CHUNK_BYTES_MAX
 from rsltrace.mcap.records import MESSAGE, MESSAGE_HEAD, RECORD_HEAD, Damaged, Span, records_in
 from rsltrace.mcap.source import ByteSource

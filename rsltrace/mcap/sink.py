@@ -14,12 +14,11 @@ import errno
 import os
 import stat
 import sys
-import zlib
 from contextlib import suppress
 from pathlib import Path
 
 from rsltrace.errors import OutputError
-from rsltrace.mcap.checksum import joined_crc
+from rsltrace.mcap.checksum import crc32, joined_crc
 from rsltrace.mcap.descriptor import Descriptor
 from rsltrace.mcap.records import MAGIC
 
@@ -108,7 +107,7 @@ class Sink:
         number = self._descriptor.number
         if crc is None:
             for part in parts:
-                self.crc = zlib.crc32(part, self.crc)
+                self.crc = crc32(part, self.crc)
         else:
             self.crc = joined_crc(self.crc, crc, sum(map(len, parts)))
         rest = [memoryview(part) for part in parts if part]
@@ -184,7 +183,7 @@ class Sink:
     def _reads_back(self) -> bool:
         crc = at = 0
         while piece := os.pread(self._descriptor.number, _PIECE_BYTES, at):
-            crc = zlib.crc32(piece, crc)
+            crc = crc32(piece, crc)
             at += len(piece)
         return (at, crc) == (self.offset, self.crc)
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import struct
-from binascii import crc32
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from mcap.opcode import Opcode
 
+from rsltrace.mcap.checksum import crc32
 from rsltrace.mcap.limits import SUMMARY_BYTES_MAX
 from rsltrace.mcap.records import (
     MAGIC,

@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import os
 import struct
-from binascii import crc32
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import zstandard
 from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, Metadata, Schema
 
 from rsltrace.errors import OutputError
-from rsltrace.mcap.checksum import crc_of, joined_crc
+from rsltrace.mcap.checksum import crc32, crc_of, joined_crc
 from rsltrace.mcap.chunk_body import ChunkBody
 from rsltrace.mcap.records import MAGIC, MESSAGE_ENCODING, SCHEMA_ENCODING
 from rsltrace.mcap.sink import Sink

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from binascii import crc32
 from collections.abc import Iterator, Mapping
 from itertools import chain
 
@@ -12,6 +11,7 @@ from mcap.opcode import Opcode
 from rsltrace.errors import TraceError
 from rsltrace.mcap import chunk as mcap_chunk
 from rsltrace.mcap import walk
+from rsltrace.mcap.checksum import crc32
 from rsltrace.mcap.limits import CHUNK_BYTES_MAX
 from rsltrace.mcap.records import (
     MESSAGE,

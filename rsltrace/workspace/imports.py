@@ -236,8 +236,8 @@ def _put_into_index(stack: ExitStack, workspace: Workspace) -> None:
 def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., Any]) -> None:
     """Exchange a function of the index in all modules of it that have its name."""
     name = real.__name__
-    for module in list(sys.modules.values()):
-        if not module.__name__.startswith("ament_index_python"):
+    for key, module in list(sys.modules.items()):
+        if not key.startswith("ament_index_python"):
             continue
         if getattr(module, name, None) is real:
             stack.callback(setattr, module, name, real)

@@ -17,6 +17,7 @@ from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.trace.reader import Trace
 from rsltrace.workspace import cache
+from rsltrace.workspace.imports import unbuilt_packages
 from rsltrace.workspace.interfaces import interface_prefix
 from rsltrace.workspace.packages import SourcePackage, source_packages
 from rsltrace.workspace.share import share_prefix
@@ -244,3 +245,9 @@ def test_shares_are_laid_out_as_cmake_installs_them(tmp_path: Path, caches: Path
         assert (share / name).read_text() == "x", name
     assert not (share / "go.py").exists()
     assert not re.search("CMake", " ".join(os.listdir(share)))
+
+
+def test_modules_that_are_blocked_stop_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "somebody_blocks_this", None)  # its import is an ImportError
+    with unbuilt_packages([]) as workspace:
+        assert not workspace.made
