@@ -17,6 +17,7 @@ from rsltrace.doors.processes.wire import HEAD, RECORD, Told
 from rsltrace.errors import JobError
 
 _ROOM = 1 << 16
+_HEAD_SIZE = HEAD.size
 _LOOK_S = 0.2
 _GRACE_S = 2.0
 _NO_RANDOM_ADDRESSES = 0x0040000
@@ -85,6 +86,7 @@ class Child:
                 raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
         self._socket = here
         self._there = b""
+        self._room = memoryview(bytearray(_ROOM))
         self._patience = 0
 
     @property
@@ -98,28 +100,33 @@ class Child:
             self._socket.sendall(data)
 
     def receive(self) -> memoryview | None:
-        """Return the next batch, None if the process has ended."""
-        data = self._there or self._read(_ROOM)
-        if not data:
-            return None
-        size = HEAD.size
-        while len(data) < size:
-            more = self._read(_ROOM)
+        """Return the next batch, None if the process has ended; it holds until the next call."""
+        there, self._there = self._there, b""
+        if not there:
+            count = self._read_into(self._room)
+            if count >= _HEAD_SIZE:
+                size: int = HEAD.unpack_from(self._room)[0]
+                if count == _HEAD_SIZE + size:  # nearly always
+                    return self._room[_HEAD_SIZE:count]
+            there = bytes(self._room[:count])
+        return self._assembled(there)
+
+    def _assembled(self, data: bytes) -> memoryview | None:
+        """Return the batch that begins with ``data``, of which the rest is still to come."""
+        parts, count, size = [data], len(data), -1
+        while size < 0 or count < size:
+            if size < 0 and count >= _HEAD_SIZE:
+                parts = [b"".join(parts)]
+                size = _HEAD_SIZE + HEAD.unpack_from(parts[0])[0]
+                continue
+            more = self._read_into(self._room)
             if not more:
                 return None
-            data += more
-        size += HEAD.unpack_from(data)[0]
-        if len(data) < size:
-            parts, count = [data], len(data)
-            while count < size:
-                more = self._read(max(_ROOM, size - count))
-                if not more:
-                    return None
-                parts.append(more)
-                count += len(more)
-            data = b"".join(parts)
-        self._there = data[size:]
-        return memoryview(data)[HEAD.size : size]
+            parts.append(bytes(self._room[:more]))
+            count += more
+        whole = b"".join(parts)
+        self._there = whole[size:]
+        return memoryview(whole)[_HEAD_SIZE:size]
 
     def has_threads(self) -> bool:
         """Return whether there are threads in it beside the first and the two of LTTng."""
@@ -129,22 +136,23 @@ class Child:
         """Kill the process if it says nothing for so long (real time)."""
         self._patience = int(seconds / _LOOK_S)
 
-    def _read(self, size: int) -> bytes:
+    def _read_into(self, room: memoryview) -> int:
+        """Read what there is, at least something; 0 if the process has ended."""
         looks = 0
         while True:
             try:
-                return self._socket.recv(size)
+                return self._socket.recv_into(room)
             except BlockingIOError:
                 if self._process.poll() is not None:
                     with suppress(BlockingIOError):  # what it said before
-                        return self._socket.recv(size, socket.MSG_DONTWAIT)
-                    return b""
+                        return self._socket.recv_into(room, 0, socket.MSG_DONTWAIT)
+                    return 0
                 looks += 1
                 if looks == self._patience:
                     self.kill()
-                    return b""
+                    return 0
             except ConnectionResetError:
-                return b""
+                return 0
 
     def reap(self) -> Ended:
         """Wait for the end of a process that says no more; one that lives on is killed."""

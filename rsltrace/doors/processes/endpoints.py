@@ -39,6 +39,9 @@ class Host(Protocol):
     def was_no_callback(self) -> None:
         """Say that the event under way is no callback's."""
 
+    def own(self, timer: ProcessTimer) -> None:
+        """Give a timer whose callback has run to a node."""
+
 
 class RosoutPublisher(Publisher):
     """A publisher of /rosout: what it sends are log records."""
@@ -209,7 +212,7 @@ class ProcessTimer(Timer):
         self.process = process
         self.number = number
         self.name = ""
-        self.was_called = False
+        self.is_callback = True
 
     def due_at(self, deadline_ns: int) -> None:
         """Take note of when it is due, by what rcl says."""
@@ -231,15 +234,17 @@ class ProcessTimer(Timer):
         digest = self.deadline_hash()
         state.call(loop.now_ns)
         loop.timers.ran(state)
-        self.was_called = False
+        self.is_callback = True
         self.dispatcher.execute(
             self, self.entity_id, self.node, TIMER, self._run, (), NO_EVENT, 0, digest
         )
 
     def _run(self) -> None:
         self.process.go_on_with(self.number, Ready.TIMER, b"")
-        if not self.was_called and not self.destroyed:
+        if not self.is_callback:
             self.process.was_no_callback()
+        elif self.node is None and not self.destroyed:
+            self.process.own(self)
 
     def trace_name(self) -> str:
         return self.name

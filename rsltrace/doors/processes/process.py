@@ -51,6 +51,9 @@ _TIMER = struct.Struct("<IIq")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
 _HELLO = struct.Struct("<qQ")
+_RECORD_SIZE = RECORD.size
+_PUBLISH, _WAIT = int(Say.PUBLISH), int(Say.WAIT)
+_number = HEAD.unpack_from
 
 Question = Callable[[Fields], bytes]
 
@@ -97,7 +100,10 @@ class Process:
         self._waking: dict[int, WakingTimer] = {}
         self._held: list[Endpoint | ProcessTimer] = []
         self._running_thread = 0
-        self._last = "its start"
+        self._same_wait = b""
+        """What it waited for last, if that has no end."""
+        self._waking_soon = False
+        self._last: Endpoint | ProcessTimer | None = None
         self._is_stopping = False
         self._questions: dict[int, Question] = {
             Say.HELLO: self._hello,
@@ -115,12 +121,11 @@ class Process:
             Say.CLIENT: self._client,
             Say.TIMER: self._timer,
             Say.GONE: self._gone,
-            Say.PUBLISH: self._publish,
             Say.REQUEST: self._request,
             Say.RESPONSE: self._response,
             Say.LOG: self._log,
             Say.REPORT: self._report,
-            Say.TIMER_CALLED: self._timer_called,
+            Say.TIMER_PASSED: self._timer_passed,
             Say.TIMER_NEXT: self._timer_next,
             Say.WAIT_SET: self._wait_set,
             Say.ALIVE: self._alive,
@@ -163,7 +168,7 @@ class Process:
     def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
         """Let the thread that waits for a thing go on, until the process waits again."""
         thing = self.things[number]
-        self._last = thing.describe()
+        self._last = thing
         self._go(self._wanted[number], ready, number, item)
 
     def wake(self, thread: int) -> None:
@@ -203,12 +208,18 @@ class Process:
         place, end = 0, len(batch)
         while place < end:
             kind, size = RECORD.unpack_from(batch, place)
-            place += RECORD.size
-            fields = Fields(batch[place : place + size])
+            place += _RECORD_SIZE
+            body = batch[place : place + size]
             place += size
-            if kind == Say.WAIT:
-                self._wait(fields)
+            if kind == _PUBLISH:
+                self.things[_number(body)[0]].send(body[4:].tobytes())
+                continue
+            if kind == _WAIT:
+                if body != self._same_wait or self._held:
+                    self._wait(Fields(body))
+                    self._same_wait = b"" if self._waking_soon else body.tobytes()
                 return None
+            fields = Fields(body)
             question = self._questions.get(kind)
             if question is not None:
                 answer = question(fields)
@@ -228,12 +239,15 @@ class Process:
         """Take note of what its threads wait for."""
         event = self.dispatcher.event
         waits = []
+        self._waking_soon = False
         for _ in range(fields.number()):
             thread, number, deadline_ns, size = fields.unpack(_WAITER)
             fields.unpack(struct.Struct(f"{size}s"))
             waits.append((thread, number))
             if number == 0 and thread == self._running_thread:
                 event.flags |= _SUSPENDED
+            if number == 0 or deadline_ns != NEVER_NS:
+                self._waking_soon = True
             if deadline_ns != NEVER_NS:
                 self._wake_at(thread, deadline_ns, asleep=number == 0)
         if self._waits != tuple(waits):
@@ -281,8 +295,9 @@ class Process:
         if not self.ended.failed or self._is_stopping:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)
+        last = "its start" if self._last is None else self._last.describe()
         ended = f"process {self.name} {self.ended.said} at {at} s"
-        text = f"{ended}; the last that it ran was {self._last}"
+        text = f"{ended}; the last that it ran was {last}"
         if self.log_failure:
             self.door.log(40, self.name, text)
         else:
@@ -381,9 +396,9 @@ class Process:
         timer.cancel()  # until the process says when it is due
         self.things[number] = timer
         if clock == _ROS_TIME and self._nodes:  # a node's own: executors use other clocks
-            self._own(timer)
+            self.own(timer)
 
-    def _own(self, timer: ProcessTimer) -> None:
+    def own(self, timer: ProcessTimer) -> None:
         """Give a timer to the node that was made last: no function of rcl says whose it is."""
         if timer.node is not None or not self._nodes:
             return
@@ -392,10 +407,13 @@ class Process:
         timer.node = self._nodes[-1]
         timer.node.timers.append(timer)
         self.dispatcher.entities.look_again(timer.node)
+        event = self.dispatcher.event
+        if event.entity == timer.entity_id:
+            event.node = timer.node
 
     def _gone(self, fields: Fields) -> None:
         thing: DomainEntity = self.things.pop(fields.number())
-        self._waits = ()
+        self._waits, self._same_wait = (), b""
         if isinstance(thing, ProcessTimer) and thing.node is not None:
             thing.node.timers.remove(thing)
         elif isinstance(thing, Participant):
@@ -403,9 +421,6 @@ class Process:
         thing.destroy()
 
     # -- what it does ----------------------------------------------------------------------------
-
-    def _publish(self, fields: Fields) -> None:
-        self.things[fields.number()].send(fields.rest())
 
     def _request(self, fields: Fields) -> None:
         self.things[fields.number()].request(fields.rest())
@@ -420,14 +435,8 @@ class Process:
     def _report(self, fields: Fields) -> None:
         self.door.domain.outcome.notes.append(f"process {self.name}: {fields.text()}")
 
-    def _timer_called(self, fields: Fields) -> None:
-        timer = self.things[fields.number()]
-        timer.was_called = True
-        if timer.node is None:
-            self._own(timer)
-        event = self.dispatcher.event
-        if event.entity == timer.entity_id:
-            event.node = timer.node
+    def _timer_passed(self, fields: Fields) -> None:
+        self.things[fields.number()].is_callback = False
 
     def _timer_next(self, fields: Fields) -> None:
         number, deadline_ns = fields.unpack(_DEADLINE)

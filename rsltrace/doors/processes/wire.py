@@ -43,7 +43,7 @@ class Say(IntEnum):
     RESPONSE = 11
     LOG = 12
     REPORT = 13
-    TIMER_CALLED = 14
+    TIMER_PASSED = 14
     TIMER_NEXT = 15
     WAIT_SET = 16
     WAIT = 17

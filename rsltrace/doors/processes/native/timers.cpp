@@ -18,7 +18,11 @@ struct Timer {
   std::int64_t period_ns;
   std::int64_t made_ns;
   std::int64_t told_ns;  // the deadline that the loop knows
+  bool was_called;
 };
+
+// The timer that the loop has let run, and whose callback may be called now.
+std::uint32_t let_run = 0;
 
 std::unordered_map<std::uint32_t, Timer> &timers() {
   static auto *all = new std::unordered_map<std::uint32_t, Timer>;
@@ -52,7 +56,7 @@ std::int64_t deadline_of(const Timer &timer) {
 
 void made(const rcl_timer_t *handle, rcl_clock_t *clock, std::int64_t period_ns) {
   const std::uint32_t id = new_id();
-  timers()[id] = {handle, period_ns, now_ns(), UNKNOWN_NS};
+  timers()[id] = {handle, period_ns, now_ns(), UNKNOWN_NS, false};
   ids()[handle] = id;
   Writer body;
   body.number(id);
@@ -70,7 +74,26 @@ std::uint32_t timer_id(const rcl_timer_t *timer) {
 
 void timer_may_run(std::uint32_t id) {
   const auto found = timers().find(id);
-  if (found != timers().end()) found->second.told_ns = UNKNOWN_NS;
+  if (found == timers().end()) return;
+  Timer &timer = found->second;
+  timer.was_called = false;
+  let_run = id;
+  // What the loop takes for its next deadline: on the grid it was started on, none of it twice.
+  timer.told_ns += timer.period_ns;
+  if (timer.told_ns > now_ns()) return;
+  const std::int64_t late_ns = now_ns() - timer.told_ns;
+  timer.told_ns = timer.period_ns == 0
+                      ? now_ns()
+                      : timer.told_ns + (1 + late_ns / timer.period_ns) * timer.period_ns;
+}
+
+void say_passed() {
+  const auto found = timers().find(let_run);
+  let_run = 0;
+  if (found == timers().end() || found->second.was_called) return;
+  Writer body;
+  body.number(found->first);
+  say(Say::TIMER_PASSED, body);
 }
 
 void say_deadlines(const std::vector<std::uint32_t> &wanted) {
@@ -122,26 +145,23 @@ RSLTRACE_EXPORT rcl_ret_t rcl_timer_fini(rcl_timer_t *timer) {
 
 namespace {
 
-void say_called(const rcl_timer_t *timer) {
-  const std::uint32_t id = timer_id(timer);
-  if (id == 0 || !linked()) return;
-  Writer body;
-  body.number(id);
-  say(Say::TIMER_CALLED, body);
+void note_called(const rcl_timer_t *timer) {
+  const auto found = timers().find(timer_id(timer));
+  if (found != timers().end()) found->second.was_called = true;
 }
 
 }  // namespace
 
 RSLTRACE_EXPORT rcl_ret_t rcl_timer_call(rcl_timer_t *timer) {
   static const auto real = rcl<decltype(rcl_timer_call)>("rcl_timer_call");
-  say_called(timer);
+  note_called(timer);
   return real(timer);
 }
 
 RSLTRACE_EXPORT rcl_ret_t rcl_timer_call_with_info(rcl_timer_t *timer,
                                                    rcl_timer_call_info_t *info) {
   static const auto real = rcl<decltype(rcl_timer_call_with_info)>("rcl_timer_call_with_info");
-  say_called(timer);
+  note_called(timer);
   return real(timer, info);
 }
 

@@ -75,6 +75,7 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
     waiter.thread = this_thread();
     waiter.deadline_ns = deadline_ns;
     waiter.what = what;
+    say_passed();
     say_deadlines(wanted.timers);
     waiter.set = &numbered(wanted);
     for (const auto &one : wanted.conditions) one.condition->waiters.push_back(&waiter);

@@ -25,7 +25,7 @@ enum class Say : std::uint32_t {
   RESPONSE,
   LOG,
   REPORT,
-  TIMER_CALLED,
+  TIMER_PASSED,
   TIMER_NEXT,
   WAIT_SET,
   WAIT,
