@@ -94,8 +94,8 @@ def missing_packages_allowed(context: LaunchContext) -> Iterator[None]:
     ours = (get_package_share_directory, get_package_share_path, get_package_prefix)
     with ExitStack() as stack:
         for name, function in zip(_ASKED, ours, strict=True):
-            for module in list(sys.modules.values()):
-                if module.__name__.startswith("ament_index_python") and hasattr(module, name):
+            for key, module in list(sys.modules.items()):
+                if key.startswith("ament_index_python") and hasattr(module, name):
                     stack.callback(setattr, module, name, getattr(module, name))
                     setattr(module, name, function)
         yield
