@@ -36,6 +36,7 @@ class PayloadReader:
         self._index = index
         self._records = lru_cache(maxsize=_CHUNKS_CACHED)(self._read_records)
         self._by_channel: dict[int, tuple[list[int], list[ChunkEntry]]] = {}
+        self._holding = lru_cache(maxsize=_CHUNKS_CACHED)(self._find_in_chunk)
         self._offsets = lru_cache(maxsize=4 * _CHUNKS_CACHED)(self._read_offsets)
 
     def message(self, channel_id: int, sequence: int) -> tuple[int, bytes]:
@@ -78,6 +79,41 @@ class PayloadReader:
                     yield channel_id, log_time, sequence, records[start:end]
             except Damaged as error:
                 raise damaged(self._source, entry.span.offset, "the chunk", error) from error
+
+    def holding(self, channel_id: int, first: int, last: int, text: bytes) -> Iterator[int]:
+        """Yield which messages ``first`` … ``last`` of a channel may have ``text`` in their bytes.
+
+        ``text`` is lower case; letters of ASCII in the messages may be of either.
+        """
+        firsts, entries = self._of_channel(channel_id)
+        for position in range(max(bisect_right(firsts, first) - 1, 0), len(entries)):
+            if firsts[position] > last:
+                return
+            for place in self._holding(entries[position].span, text).get(channel_id, ()):
+                if first <= firsts[position] + place <= last:
+                    yield firsts[position] + place
+
+    def _find_in_chunk(self, span: Span, text: bytes) -> dict[int, list[int]]:
+        """Return by channel which of its messages in a chunk hold ``text``."""
+        records = self._records(span)
+        folded = records.lower()
+        at = folded.find(text)
+        if at < 0:
+            return {}
+        found: dict[int, list[int]] = {}
+        counts: dict[int, int] = {}
+        try:
+            walked = list(messages_in(records))
+            ends = [offset for _, offset in walked[1:]] + [len(records)]
+            for (channel_id, offset), end in zip(walked, ends, strict=True):
+                place = counts[channel_id] = counts.get(channel_id, -1) + 1
+                if 0 <= at < end:
+                    if at >= offset:
+                        found.setdefault(channel_id, []).append(place)
+                    at = folded.find(text, end)
+        except Damaged as error:
+            raise damaged(self._source, span.offset, "the chunk", error) from error
+        return found
 
     def _chunks_with(self, channel_ids: frozenset[int]) -> list[ChunkEntry]:
         try:

@@ -374,6 +374,11 @@ class Trace:
         for _, stamp_ns, sequence, data in self.messages_of(channels):
             yield stamp_ns, sequence, data
 
+    def holding(self, channel: int, first: int, last: int, text: bytes) -> Iterator[int]:
+        """Yield the numbers ``first`` … ``last`` of a channel's messages in whose bytes ``text``
+        is, in lower case, whatever case theirs is; it may lie across two messages."""
+        yield from self._payloads.holding(channel, first, last, text)
+
     def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]:
         """Yield (channel, stamp in ns, sequence, data) of every message of some channels."""
         yield from self._payloads.messages(channels)

@@ -178,20 +178,6 @@ class WithFinding:
 
 
 @dataclass(frozen=True, slots=True)
-class EachEvent(_Anywhere):
-    """Events for which ``accept(run, index)`` says yes: the slow way, for decoded messages."""
-
-    accept: Callable[[Run, int], bool]
-
-    def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
-        """Return the mask."""
-        found = np.zeros(len(segment.events), dtype=np.bool_)
-        for place in np.flatnonzero(among).tolist():
-            found[place] = self.accept(run, segment.first + place)
-        return found
-
-
-@dataclass(frozen=True, slots=True)
 class Not:
     """Events that do not fulfil ``inner``."""
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.words.kinds import SHORT_KINDS
@@ -16,6 +15,7 @@ from rsltrace.words.matching import LOG_LEVELS, is_named
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
+from rsltrace_viewer.model.query.message_text import MessageText
 from rsltrace_viewer.model.query.tokens import (
     LARGEST,
     QueryError,
@@ -152,30 +152,7 @@ def _read_hash(run: Run, token: Token) -> Condition:
 
 def _read_text(run: Run, token: Token) -> Condition:
     folded = unquoted(token).casefold()
-    return conditions.Any(
-        (conditions.says(folded), conditions.EachEvent(lambda run, i: _contains(run, i, folded)))
-    )
-
-
-def _contains(run: Run, index: int, folded: str) -> bool:
-    """Whether the input or an output of an event has ``folded`` in its decoded text."""
-    from rsltrace.trace.decode import to_plain  # its library takes as long as opening a trace
-
-    event = run.event(index)
-    found = run.input_of(event)
-    messages = run.outputs(index) if event.outputs else []
-    for output in [found, *messages] if found is not None else messages:
-        try:
-            payload = run.trace.payload(output)
-            channel = run.trace.channel_of(output)
-            if payload is None or channel is None:
-                continue
-            plain = to_plain(run.trace.decode(channel, payload[2]))
-        except TraceError:  # one that cannot be decoded says nothing of the others
-            continue
-        if folded in str(plain).casefold():
-            return True
-    return False
+    return conditions.Any((conditions.says(folded), MessageText(folded)))
 
 
 def bare_word(run: Run, token: Token) -> Condition:
@@ -222,7 +199,7 @@ FIELDS: dict[str, Field] = {
     ),
     "time": Field("simulated seconds: 1.5..2, >3, 20ms", _read_time),
     "index": Field("event numbers: 100..200, >5000", _read_index),
-    "text": Field("text in messages and logs (slow)", _read_text),
+    "text": Field("text in messages and logs", _read_text),
     "level": Field("logs of a level or worse", _read_level, lambda run: list(LOG_LEVELS)),
     "out": Field(
         "events with an output of a kind", _read_out, lambda run: [k.label for k in OutputKind]

@@ -12,6 +12,7 @@ from __future__ import annotations
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.fields import FIELDS, bare_word
+from rsltrace_viewer.model.query.message_text import MessageText
 from rsltrace_viewer.model.query.tokens import QueryError, Token, tokens
 from rsltrace_viewer.model.run import Run
 
@@ -111,7 +112,7 @@ class _Parser:
 
 def _cost(condition: Condition) -> int:
     """Numbers first, then logs, then decoded messages."""
-    if isinstance(condition, conditions.EachEvent):
+    if isinstance(condition, MessageText):
         return 3
     if isinstance(condition, conditions.WithOutput) and condition.accept is not None:
         return 2
