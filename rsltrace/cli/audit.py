@@ -84,14 +84,13 @@ def _look(words: Sequence[str], launch: Path | None, skip: bool, overrides: Sequ
         if overrides:
             raise click.UsageError(f"--set changes a job, and {only} is none")
         return audit_path(only)
-    from rsltrace.launch import expand
-    from rsltrace.run.plans.executables import source_of, why_not
-    from rsltrace.workspace.imports import unbuilt_packages
+    from rsltrace.run.launch_files import without_launch_files
+    from rsltrace.run.plans.executables import source_of
+    from rsltrace.run.process import search_path
 
     job, _ = job_of(words, launch, skip, overrides)
-    expanded = expand(job, why_not=why_not)
-    folders = [expanded.job.resolve(folder) for folder in expanded.job.search_path]
-    with unbuilt_packages(folders):
+    expanded = without_launch_files(job)
+    with search_path(job):
         return audit_job(expanded.job, lambda target, where: source_of(target, where=where))
 
 

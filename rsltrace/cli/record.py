@@ -154,10 +154,9 @@ def _say_that_it_has_no_end(job: Job) -> None:
 
 
 def _print_job(job: Job) -> None:
-    from rsltrace.launch import expand
-    from rsltrace.run.plans.executables import why_not
+    from rsltrace.run.launch_files import without_launch_files
 
-    expanded = expand(job, why_not=why_not)
+    expanded = without_launch_files(job)
     for note in expanded.notes:
         _note(note)
     say(expanded.job.to_yaml(), end="")

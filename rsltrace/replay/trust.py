@@ -15,11 +15,11 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, job_from_text, load_job
-from rsltrace.launch import expand, ros_launch
+from rsltrace.launch import ros_launch
 from rsltrace.model.finding import Mode
 from rsltrace.replay.edits import edits_of
 from rsltrace.replay.job_folder import job_name, without_bags
-from rsltrace.run.plans.executables import why_not
+from rsltrace.run.launch_files import without_launch_files
 from rsltrace.trace.reader import Trace
 
 _LAUNCH = (".launch.xml", ".launch.yaml", ".launch.yml")
@@ -81,7 +81,7 @@ def _own_job(file: Path, *, bags: bool) -> Job | None:
         # ROS's own launch runs what a launch file tells it to.
         if not launch.file.endswith(_LAUNCH) or ros_launch.can_read(job.resolve(launch.file)):
             return None
-    return expand(job, why_not=why_not, programs=False).job
+    return without_launch_files(job, programs=False).job
 
 
 def _differing(own: Job, job: Job) -> list[str]:

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 from rsltrace.doors.processes.door import ProcessDoor
 from rsltrace.errors import BagError, DeadlockError, RunError
 from rsltrace.job import Job, locate
-from rsltrace.launch import expand
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.stop import Stop
@@ -28,6 +27,7 @@ from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.inputs import check_output
+from rsltrace.run.launch_files import without_launch_files
 from rsltrace.run.numerical_libraries import LateLibraries
 from rsltrace.run.plans.bags import (
     BagInput,
@@ -39,7 +39,6 @@ from rsltrace.run.plans.bags import (
 )
 from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
-from rsltrace.run.plans.executables import why_not
 from rsltrace.run.plans.guard import RunGuard, install_guard
 from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
@@ -207,7 +206,7 @@ class Session:
         from rsltrace.doors.rclpy.world import World  # keeps functions that the guard redirects
 
         check_free()
-        expanded = expand(self.job, why_not=why_not)
+        expanded = without_launch_files(self.job)
         self.job = expanded.job
         self._open_bags(stack, expanded.notes)
         stack.enter_context(search_path(self.job))

@@ -2,8 +2,8 @@
 
 rosbags generates a Python decoder per type from schema text. A trace may come from anybody, so its
 schemas are checked before they reach that generator: only the parsed structure goes on, every name
-in it is a plain identifier, sizes and nesting are bounded, and constants (which decoding does not
-need) are left out. Opening a trace runs none of this; only decoding a message does.
+in it is a plain identifier, sizes and nesting are bounded, and of constants only whole numbers with
+names in capitals stay. Opening a trace runs none of this; only decoding a message does.
 """
 
 from __future__ import annotations
@@ -28,6 +28,8 @@ from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
+_CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
+_CONSTANTS_MAX = 1000
 _FIELD_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*", re.ASCII)
 _INTEGER_TYPES = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 _BASE_TYPES = _INTEGER_TYPES | {"bool", "byte", "char", "float32", "float64", "string"}
@@ -58,7 +60,7 @@ class Decoder:
         try:
             types = get_types_from_msg(channel.schema_text, self.name)
             self.types: dict[str, Any] = {
-                name: ([], _checked_fields(name, types)) for name in types
+                name: (_constants(types[name]), _checked_fields(name, types)) for name in types
             }
             self.items = sum(map(_unrolled, self.types.values()))
             if self.items > limits.SCHEMA_ITEMS_MAX:
@@ -157,6 +159,21 @@ def to_plain(value: object) -> Any:
 
 class _UnsafeSchema(ValueError):
     """The schema says something that no ROS interface says."""
+
+
+def _constants(definition: Any) -> list[tuple[str, str, int]]:
+    """Return the whole numbers that a message definition gives names to."""
+    constants, fields = definition
+    taken = {name for name, _ in fields}
+    found = {
+        name: (name, kind, value)
+        for name, kind, value in constants
+        if kind in _INTEGER_TYPES | {"byte", "char"}
+        and type(value) is int
+        and name not in taken
+        and _CONSTANT_NAME.fullmatch(name)
+    }
+    return list(found.values())[:_CONSTANTS_MAX]
 
 
 def _checked_fields(name: str, types: dict[str, Any]) -> list[tuple[str, Any]]:

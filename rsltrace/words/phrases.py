@@ -13,6 +13,17 @@ if TYPE_CHECKING:
     from rsltrace.words.entities import EntityKey
 
 
+_ACTION = "/_action/"
+_PARTS = {
+    "send_goal": "goal",
+    "get_result": "result",
+    "cancel_goal": "cancelling",
+    "feedback": "feedback",
+    "status": "status",
+}
+"""What a person calls the services and topics that an action is made of."""
+
+
 def event_title(kind: EventKind, entity: EntityKey) -> str:
     """Return ``/filter: subscription /scan``, with what else ran: ``/filter: … (resume)``."""
     text = printable(str(entity)).rstrip()
@@ -35,12 +46,19 @@ def event_phrase(kind: EventKind, entity: EntityKey) -> str:
     if kind is EventKind.CLOCK_JUMP:
         return "the jump of the clock to the start"
     number = f" (number {entity.ordinal + 1} of that name)" if entity.ordinal else ""
-    what = kind.label.replace("_", " ")
+    owner = f" of {entity.node}" if entity.node else ""
+    action, _, part = name.rpartition(_ACTION)
+    what = entity.kind if kind in (EventKind.TASK, EventKind.RESUME) else kind.label
+    if part in _PARTS:
+        name, what = f"{action} ({_PARTS[part]})", "action"
+    what = what.replace("_", " ")
     if kind is EventKind.CLIENT:
-        what = "the response of"
-    elif kind in (EventKind.TASK, EventKind.RESUME):
-        what = f"{'a task' if kind is EventKind.TASK else 'a resumed task'} of {entity.kind}"
-    return f"{what} {name}{number} of {entity.node or 'the run'}"
+        what = f"the response of{' action' if part in _PARTS else ''}"
+    elif kind is EventKind.TASK:
+        what = f"a task of {what}"
+    elif kind is EventKind.RESUME:
+        what = f"the resumed {what}"
+    return f"{what} {name}{number}{owner}"
 
 
 def seconds_text(stamp_ns: int) -> str:

@@ -7,6 +7,7 @@ import importlib
 import os
 import random
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections import Counter
@@ -20,6 +21,17 @@ from tests.truth.complaint import Complaint
 from tests.truth.graph import HIDDEN, World
 from tests.truth.known import item_of
 from tests.truth.oracle import complaints
+
+_SERVER = """
+import socket, sys
+server = socket.create_server(("127.0.0.1", int(sys.argv[1])))
+print("ready", flush=True)
+while True:
+    link = server.accept()[0]
+    link.recv(4096)
+    link.sendall(b"HTTP/1.0 200 OK\\r\\n\\r\\n" + sys.argv[2].encode())
+    link.close()
+"""
 
 
 @dataclass(frozen=True)
@@ -63,24 +75,52 @@ def _record(world: World, folder: Path, output: Path) -> None:
 
     job = world.write(folder)
     importlib.invalidate_caches()
-    with _surroundings(world):
+    with _surroundings(world, folder):
         run(load_job(job), output, force=True)
 
 
 @contextmanager
-def _surroundings(world: World) -> Iterator[None]:
+def _surroundings(world: World, folder: Path) -> Iterator[None]:
     """Set what a run finds around it, and no bytecode of an earlier one."""
     kept, written = dict(os.environ), sys.dont_write_bytecode
     os.environ.update(world.environment)
     sys.dont_write_bytecode = True
     setattr(builtins, HIDDEN, world.hidden)
     try:
-        yield
+        with _answering(world), _working_in(folder / world.working_folder):
+            yield
     finally:
         delattr(builtins, HIDDEN)
         sys.dont_write_bytecode = written
         os.environ.clear()
         os.environ.update(kept)
+
+
+@contextmanager
+def _answering(world: World) -> Iterator[None]:
+    """Run a server that gives one answer to everybody, in a process of its own."""
+    if world.answer is None:
+        yield
+        return
+    words = [sys.executable, "-c", _SERVER, *map(str, world.answer)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE) as server:
+        assert server.stdout is not None
+        server.stdout.readline()
+        try:
+            yield
+        finally:
+            server.kill()
+
+
+@contextmanager
+def _working_in(folder: Path) -> Iterator[None]:
+    before = Path.cwd()
+    folder.mkdir(parents=True, exist_ok=True)
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
 
 
 def try_cases(cases: Iterable[tuple[str, int]]) -> Iterator[Outcome]:
@@ -131,6 +171,12 @@ FAMILIES = {
     "behaviour": "what a callback does",
     "waiting": "what a callback waits for, makes, destroys, fails in",
     "messages": "what is in a message",
+    "sensors": "messages of sensors, poses, maps, joints",
+    "answers": "answers of sockets, programs and files",
+    "actions": "actions: goals, feedback, results, cancelling",
+    "lifecycle": "lifecycle nodes",
+    "mains": "programs: mains, threads, executors, launch files",
+    "timing": "timers and clocks",
     "settings": "settings and code",
     "rules": "links, drawn orders, clocks, bags and parameters of the job",
     "delivery": "queues and QoS",
@@ -142,6 +188,7 @@ FAMILIES = {
     "endings": "how runs end",
     "equal": "what changes nothing, alone and beside a fault",
     "pairs": "two faults at once",
+    "unrelated": "two faults that have nothing to do with each other",
 }
 _TWICE = (", in code", ", hidden")
 

@@ -28,7 +28,8 @@ import time
 
 import rclpy
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.duration import Duration
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from geometry_msgs.msg import PoseStamped
 from std_msgs.msg import (
     Bool, Float32, Float64, Float64MultiArray, Int64, String, UInt8MultiArray
@@ -57,11 +58,16 @@ class Callback:
     lines: list[str]
     publishes: str = ""
     period_ms: int = 0
+    arguments: str = ""
+    """What it is called with, where its kind does not say so: ``future``."""
 
 
 @dataclass
 class NodePlan:
-    """A node: name, class, lines of its constructor, callbacks."""
+    """A node: name, class, lines of its constructor, callbacks.
+
+    ``bottom`` are lines below its class; with some, its module is a program with a ``main``.
+    """
 
     name: str
     role: str
@@ -71,6 +77,9 @@ class NodePlan:
     hears: tuple[str, ...] = ()
     top: list[str] = field(default_factory=list)
     """Lines of the module in front of the class."""
+
+    bottom: list[str] = field(default_factory=list)
+    base: str = "Node"
 
     @property
     def module(self) -> str:
@@ -89,16 +98,22 @@ class NodePlan:
         text = (
             HEADER
             + "".join(f"{line}\n" for line in self.top)
-            + f"class {self.class_name}(Node):\n    def __init__(self):\n"
+            + f"class {self.class_name}({self.base}):\n    def __init__(self):\n"
         )
         body = [f"super().__init__({self.name!r})", "self.n = 0", *self.setup]
         text += "".join(f"        {line}\n" for line in body)
         for callback in self.callbacks:
             arguments = {"timer": "self", "service": "self, request, response"}
             head = arguments.get(callback.kind, "self, message")
+            head = f"self, {callback.arguments}" if callback.arguments else head
             text += f"\n    def {callback.method}({head}):\n"
             text += "".join(f"        {line}\n" for line in ["self.n += 1", *callback.lines])
-        return text
+        return text + "".join(f"{line}\n" for line in ["", "", *self.bottom] if self.bottom)
+
+    def callback(self, method: str = "") -> Callback:
+        """Return the callback of that name, without one the first."""
+        found = (callback for callback in self.callbacks if callback.method == method)
+        return next(found) if method else self.callbacks[0]
 
 
 @dataclass
@@ -114,6 +129,11 @@ class World:
     hidden: str = ""
     comment: str = ""
     folder: str = "."
+    answer: tuple[int, str] | None = None
+    """What a server on a port of this machine answers, while the run goes on."""
+
+    working_folder: str = ""
+    """Below its folder, where the run is made."""
 
     def copy(self) -> World:
         return copy.deepcopy(self)
@@ -124,7 +144,14 @@ class World:
     def entry(self, name: str) -> dict[str, Any]:
         """Return the entry of a node in the job."""
         module = self.node(name).module
-        return next(e for e in self.job["nodes"] if e["node"].startswith(f"{module}:"))
+        return next(e for e in self.job["nodes"] if next(iter(e.values())).startswith(f"{module}:"))
+
+    def add(self, *nodes: NodePlan) -> None:
+        """Add nodes at the end of the job."""
+        for node in nodes:
+            target = f"{node.module}:main" if node.bottom else f"{node.module}:{node.class_name}"
+            self.nodes.append(node)
+            self.job["nodes"].append({"main" if node.bottom else "node": target})
 
     def write(self, folder: Path) -> Path:
         """Write modules, bag and job below ``folder``; return the job."""
@@ -132,6 +159,7 @@ class World:
         for node in self.nodes:
             (folder / f"{node.module}.py").write_text(node.source(), encoding="utf-8")
         for name, text in self.files.items():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
             (folder / name).write_text(text, encoding="utf-8")
         job = dict(self.job)
         if self.bag:

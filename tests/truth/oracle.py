@@ -178,6 +178,7 @@ def _mirror(word: str) -> str:
 
 
 def _bag_of_words(text: str) -> Counter[str]:
+    text = re.sub(r"\bjob\.yaml:\d+", "job.yaml", text)  # its line in one of the two
     found = (word.strip(".:") for word in re.findall(r"[\w./:'-]+", text.lower()))
     words = (_SAME_WORDS.get(word, word) for word in found)
     return Counter(word for word in words if word)

@@ -30,14 +30,14 @@ def wrong(outcomes: list[Outcome]) -> str:
 
 
 def test_there_are_classes_enough() -> None:
-    assert len(NAMES) >= 200
+    assert len(NAMES) >= 400
     assert set(faults.FAMILIES.values()) == set(FAMILIES)
 
 
 @pytest.mark.parametrize("part", range(PARTS))
 def test_what_is_said_of_a_third_of_the_classes_is_true(part: int) -> None:
-    """Every class stands in one of the thirds; a quarter of each is tried here."""
-    outcomes = list(try_cases((name, SEED) for name in NAMES[part :: 4 * PARTS]))
+    """Every class stands in one of the thirds; an eighth of each is tried here."""
+    outcomes = list(try_cases((name, SEED) for name in NAMES[part :: 8 * PARTS]))
     assert not wrong(outcomes), wrong(outcomes)
     keys = [key for outcome in outcomes for key in outcome.keys]
     stale = mended(keys, [outcome.name for outcome in outcomes])
@@ -45,8 +45,8 @@ def test_what_is_said_of_a_third_of_the_classes_is_true(part: int) -> None:
 
 
 @pytest.mark.long
-def test_what_is_said_of_every_class_is_true() -> None:
-    outcomes = list(try_cases((name, 1) for name in NAMES))
+def test_what_is_said_of_every_second_class_is_true() -> None:
+    outcomes = list(try_cases((name, 1) for name in NAMES[1::2]))
     assert not wrong(outcomes), wrong(outcomes)
 
 

@@ -42,13 +42,17 @@ class Run:
     """Whether a delay of 0 ns counts as no delay: the jobs differ in their delays."""
 
 
+OF_THEIR_OWN = (EntityKind.MAIN.label, EntityKind.THREAD.label)
+"""Kinds of entities that keep a state as nodes do."""
+
+
 @dataclass
 class Rows:
     """The events ``first <= index < first + len(stamp)`` of a run, as columns.
 
     ``number`` is the entity, ``owner`` what a difference in this event may change for later ones:
-    the node, for bag messages the topic. ``at_end`` says that nothing follows. Constructing a
-    node counts as an event of that node.
+    the node, for bag messages the topic, for a main that is of no node the main. ``at_end`` says
+    that nothing follows. Constructing a node counts as an event of that node.
     """
 
     run: Run
@@ -112,12 +116,13 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
         for name, values in columns.items():
             values += part[name].tolist()
     nodes = run.matching.nodes
+    stateful = {n: n for n, key in enumerate(run.matching.keys) if key.kind in OF_THEIR_OWN}
     rows = Rows(
         run=run,
         first=first,
         at_end=first + len(numbers) >= run.trace.event_count,
         number=numbers,
-        owner=[nodes[number] for number in numbers],
+        owner=[nodes[number] or stateful.get(number, 0) for number in numbers],
         kind=columns["kind"],
         stamp=columns["stamp"],
         input=columns["input_hash"],

@@ -6,14 +6,18 @@ import re
 from itertools import zip_longest
 
 from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.answers import STARTED_BY, answer_text
 from rsltrace.diff.causes.event_views import node_of
 from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.divergence import CallDifference
 from rsltrace.diff.result.events import EventView
-from rsltrace.model.finding import Finding
+from rsltrace.model.finding import Finding, Mode, Source
+from rsltrace.model.printable import printable, shortened
 
 CALLS_MAX = 20
 EARLIER_MAX = 3
+_CALL_MAX = 60
+_ANSWERED = (Source.SOCKET, Source.PROCESS)
 _FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
 """The folder of an absolute path between quotes."""
 
@@ -35,7 +39,26 @@ def call_differences(
     # Where one run has no such event: up to there the two agree, indexes and all.
     before = _paired(_before(run_a, a or b, node), _before(run_b, b or a, node)) if node else []
     earlier = [call for call in before if call.a != call.b][:EARLIER_MAX]
-    return (*earlier, *inside)[:CALLS_MAX]
+    places = {call.where for call in earlier}
+    programs = [c for c in before if c.call.startswith(STARTED_BY) and c.where in places]
+    programs = [call for call in programs if call not in earlier][:EARLIER_MAX]
+    return (*earlier, *programs, *inside)[:CALLS_MAX]
+
+
+def unrecorded_call(run: Run, view: EventView) -> str:
+    """Say which answer of a socket or a program nobody kept: the last one in an event, else the
+    last one before it in its node; "" if there was none."""
+    found = [*_before(run, view, node_of(view)), *_inside(run, view)]
+    kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
+    one = next(kept, None)
+    if one is None:
+        return ""
+    call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
+    return (
+        f"what came back from {shortened(printable(call), _CALL_MAX)} at "
+        f"{one.stack.partition(' in ')[0]} is not recorded (guard: {{{one.source.value}: record}} "
+        "in the job keeps it)"
+    )
 
 
 def _inside(run: Run, view: EventView | None) -> list[Finding]:
@@ -86,8 +109,8 @@ def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
                     where=stack.partition("\n")[0],
                     event_a=None if x is None else x.event,
                     event_b=None if y is None else y.event,
-                    a=None if x is None else x.value,
-                    b=None if y is None else y.value,
+                    a=None if x is None else answer_text(x),
+                    b=None if y is None else answer_text(y),
                 )
             )
     return calls

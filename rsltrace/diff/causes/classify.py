@@ -25,12 +25,14 @@ from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
 from rsltrace.words.phrases import at_time
 
 _NO_DRAW = "none"
 _QOS_EVENT = "new qos event "
+_NO_CALLBACKS = (EntityKind.MAIN.label, EntityKind.THREAD.label)
 _OF_BAGS = ("bags", "start", "construct_time", "min_time_step")
 """Keys of a job that decide when a bag's message is played."""
 
@@ -177,7 +179,15 @@ def _construction(case: Case) -> Judgement:
         changed = [m for m in case.messages if m.kind is OutputKind.ENTITY]
         if changed:
             where = {"only a": "only in a", "only b": "only in b"}
-            things = [f"{m.topic} {where.get(m.presence, 'differs')}" for m in changed]
+            types: dict[str, list[str]] = {}
+            for m in changed:
+                types.setdefault(m.topic, []).append(m.type)
+            things = [
+                f"{m.topic} of type {m.type} {where[m.presence]}"
+                if m.presence in where and len({*types[m.topic]}) > 1
+                else f"{m.topic} {where.get(m.presence, 'differs')}"
+                for m in changed
+            ]
             sentence = f"the graphs differ: {phrase(one)} made other entities ({listed(things)})"
             if any(m.topic.startswith(_QOS_EVENT) for m in changed):
                 sentence += ", since QoS differs"
@@ -190,11 +200,22 @@ def _construction(case: Case) -> Judgement:
                 f"{phrase(one)} did something else{what_differs(case.messages)}, in the same job "
                 "and environment"
             )
-    why = because or (
+    return Judgement(verdict, root, sentence, because or _why_constructed(case), a, b)
+
+
+def _why_constructed(case: Case) -> str:
+    """Say why a constructor may have done something else in the same job and environment."""
+    parameters = [m.note for m in case.messages if m.topic == PARAMETER_EVENTS and m.note]
+    files = case.relevance.parameter_files
+    if parameters and files:
+        return (
+            f"parameter {listed(parameters)}: a parameter file ({listed(files)}) says something "
+            "else, or the constructor does"
+        )
+    return (
         "job and environment are the same as far as the traces tell: the constructor itself is "
         "not deterministic, or its code changed"
     )
-    return Judgement(verdict, root, sentence, why, a, b)
 
 
 def _schedule(case: Case) -> Judgement:
@@ -233,6 +254,11 @@ def _one_sided(case: Case) -> Judgement:
     cause = case.cause_a if a else case.cause_b
     if case.why is not None:
         root_sentence = ""
+    elif cause is not None and one.kind is EventKind.RESUME:
+        root_sentence = (
+            f"it waited for {phrase(cause)} (event {cause.index}) in {has}, and not in {has_not}"
+        )
+        root_sentence += f"; {case.because() or f'{_itself(one)} is not deterministic'}"
     elif cause is not None:
         root_sentence = (
             f"what it should have received was sent in both runs (event {cause.index}, "
@@ -251,6 +277,8 @@ def _one_sided(case: Case) -> Judgement:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
         if because := case.because():
             root_sentence = f"nothing before it differs, but {because}"
+        elif one.entity.kind in _NO_CALLBACKS:
+            root_sentence += f": {_itself(one)} is not deterministic"
         elif one.entity.node:
             root_sentence += f": {one.entity.node} is not deterministic"
     return Judgement(verdict, root, sentence, root_sentence, case.a, case.b)
@@ -268,7 +296,7 @@ def _exception(case: Case, a: EventView, b: EventView) -> Judgement:
         Verdict.EXCEPTION,
         Root.EXCEPTION,
         sentence,
-        _hidden(case, f"{phrase(a)} itself", inside=True),
+        _hidden(case, _itself(a), inside=True),
         a,
         b,
     )
@@ -358,7 +386,8 @@ def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDiffere
     because = case.because(drawn=True)
     what = f"{first.topic}: {_drawn(was_a, was_b)} in a, {_drawn(was_b, was_a)} in b"
     if first.topic == drawn_for(a.entity) and not is_clock:
-        what = f"{was_a} in a and {was_b} in b".replace("takes", "took")
+        took = (text.replace("takes ", "").replace(_NO_DRAW, "no time") for text in (was_a, was_b))
+        what = "took {} in a and {} in b".format(*took)
     if _NO_DRAW in (was_a, was_b) and not is_clock and not because:
         has, has_not = ("b", "a") if was_a == _NO_DRAW else ("a", "b")
         what = f"what it sent goes to {first.topic} only in {has}"
@@ -387,20 +416,22 @@ def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
         )
         root = Root.EXTERNAL_INPUT
         return Judgement(Verdict.DIFFERENT_INPUT, root, sentence, _DRIVEN_DIFFERENTLY, a, b)
-    same = "the same input" if a.input_hash else "no input"
-    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} got {same} in both runs"
+    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} "
+    if a.input_hash:
+        sentence += "got the same input in both runs and "
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
-        sentence += " and sent the same, but left its node in another state"
+        sentence += "sent the same, but left its node in another state"
         sentence += state_text(case.state)
-    elif case.slept:
+    elif case.slept and all(message.note for message in case.messages):
         sentence = f"{phrase(a)} {at_time(a.stamp_ns)} {case.slept}{what_differs(case.messages)}"
     else:
-        sentence += f" and did something else{what_differs(case.messages)}"
+        sentence += f"did something else{what_differs(case.messages)}"
+        sentence += f", and {case.slept}" if case.slept else ""
     return Judgement(
         Verdict.SAME_INPUT_DIFFERENT_OUTPUT,
         Root.CALLBACK,
         sentence,
-        _hidden(case, "the callback itself", inside=not _suspended(a, b)),
+        _hidden(case, _itself(a), inside=not _suspended(a, b)),
         a,
         b,
     )
@@ -424,6 +455,11 @@ def _hidden(case: Case, what: str, *, inside: bool = False) -> str:
     if case.relevance.guard_is_off:
         text += "; with guard: false nobody saw what it read from outside"
     return text
+
+
+def _itself(view: EventView) -> str:
+    what = view.entity.kind if view.entity.kind in _NO_CALLBACKS else "callback"
+    return f"the {what} itself"
 
 
 def _suspended(a: EventView, b: EventView) -> bool:

@@ -120,4 +120,4 @@ def _order(block: AlignedBlock, item: EventPair) -> tuple[int, bool, int, str]:
             stamps.append(-1 if rows.kind[place] == CONSTRUCT else rows.stamp[place])
             indexes.append(index)
             name = str(rows.run.matching.keys[rows.number[place]])
-    return min(stamps), len(indexes) == 2, min(indexes), name
+    return min(stamps), len(indexes) == 2 and not item.inverted, min(indexes), name

@@ -61,7 +61,8 @@ def effect_text(found: Divergence) -> str:
     assert one is not None
     message = sent[0]
     values = field_text(message.fields, message.more_fields)
-    text = f"{node_of(one) or 'the run'} {_done(message)} {_when(one.kind, one.stamp_ns)}"
+    who = node_of(one) or (f"{one.entity.kind} {one.entity.name}" if one.entity.name else "the run")
+    text = f"{who} {_done(message)} {_when(one.kind, one.stamp_ns)}"
     more = f" and {len(sent) - 1} more" if len(sent) > 1 else ""
     return f"{text}{f' ({values})' if values else ''}{more}"
 

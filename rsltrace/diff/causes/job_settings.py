@@ -101,6 +101,9 @@ class _JobText:
         line = 0
         for depth, step in enumerate(path):
             found = _child(node, step)
+            if found is None and path[0] == "nodes" and depth < 2:
+                found = _child(self._root, "launch")  # whose nodes come after those of the job
+                return (1, found[0].start_mark.line + 1) if found else (depth, line)
             if found is None:
                 return depth, line
             place, node = found

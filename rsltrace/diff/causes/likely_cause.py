@@ -7,17 +7,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rsltrace.diff.alignment.rows import Run
+from rsltrace.diff.causes.answers import STARTED_BY, answers_apart
+from rsltrace.diff.causes.call_differences import unrecorded_call
 from rsltrace.diff.causes.classify import Judgement
 from rsltrace.diff.causes.event_views import node_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.set_order import set_behind
 from rsltrace.diff.causes.wording import MADE_DIFFERENTLY, NAMED_MAX
 from rsltrace.diff.result.divergence import CallDifference, MessageDifference
+from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.verdicts import Root
 from rsltrace.model.finding import Source
-from rsltrace.model.printable import printable, shortened
+from rsltrace.model.printable import printable
 
+NOT_DETERMINISTIC = "not deterministic"
 _ANSWER_MAX = 60
+_OF_PROGRAMS = ("os.read()", "os.waitpid()")
+"""What ``subprocess`` asks of the system about the program that it has started."""
+
+_CHANGED = re.compile(r"(\d+ bytes), changed \d+")
 _VARIABLE = re.compile(r"os\.environ\[(['\"])(.+)\1\]")
 _FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1")
 _CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
@@ -54,11 +62,21 @@ def with_likely_cause(
     else:
         text = set_behind(run, view, messages, calls, relevance)
     if not text:
-        return judgement
+        return _with_unrecorded(judgement, run, view)
     _, made_differently, others = judgement.root_sentence.partition(MADE_DIFFERENTLY)
     why = f"{text}; and {made_differently}{others}" if made_differently else text
     sentence = f"{judgement.sentence}; likely cause: {text}"
     return replace(judgement, sentence=sentence, root_sentence=why, likely_cause=text)
+
+
+def _with_unrecorded(judgement: Judgement, run: Run, view: EventView) -> Judgement:
+    """Name the answer that nobody kept, where nothing that is known explains a divergence."""
+    if NOT_DETERMINISTIC not in judgement.root_sentence:
+        return judgement
+    text = unrecorded_call(run, view)
+    if not text:
+        return judgement
+    return replace(judgement, root_sentence=f"{judgement.root_sentence}; {text}")
 
 
 def calls_sentence(
@@ -67,15 +85,27 @@ def calls_sentence(
     """Return the calls with different answers as a sentence. Of several those whose answers show in
     what differs, if there are such; else all may be the cause."""
     differing = list({(c.call, c.where): c for c in reversed(calls) if c.a != c.b}.values())[::-1]
+    differing = [c for c in differing if not _is_touched(c)] or differing
     if len(differing) > 1:
         shown = _shown(messages)
         telling = [c for c in differing if {_unquoted(v) for v in (c.a, c.b) if v} & shown]
         differing = telling or differing
-    told = list(dict.fromkeys(call_sentence(call, node) for call in differing))
+    programs = {c.where: c.call for c in calls if c.call.startswith(STARTED_BY)}
+    of_programs = [
+        replace(c, call=programs[c.where]) if c.call in _OF_PROGRAMS and c.where in programs else c
+        for c in differing
+    ]
+    told = list(dict.fromkeys(call_sentence(call, node) for call in of_programs))
     first, *others = told[:NAMED_MAX]
     more = len(told) - NAMED_MAX
     text = "; ".join([first, *(other.removeprefix(f"{node} ") for other in others)])
     return f"{text}; and {more} more" if more > 0 else text
+
+
+def _is_touched(call: CallDifference) -> bool:
+    """Whether nothing of a file differs but when it was written."""
+    files = [_CHANGED.fullmatch(value or "") for value in (call.a, call.b)]
+    return bool(files[0] and files[1] and files[0][1] == files[1][1])
 
 
 def _shown(messages: Sequence[MessageDifference]) -> set[str]:
@@ -113,10 +143,12 @@ def _answers(source: Source, a: str, b: str) -> tuple[str, str]:
     contents = _CONTENT.fullmatch(a), _CONTENT.fullmatch(b)
     if contents[0] and contents[1] and contents[0][1] == contents[1][1]:
         a, b = contents[0][2], contents[1][2]
+    sizes = _CHANGED.fullmatch(a), _CHANGED.fullmatch(b)
+    if sizes[0] and sizes[1] and sizes[0][1] != sizes[1][1]:
+        a, b = sizes[0][1], sizes[1][1]
     if source is Source.ENVIRONMENT:
         a, b = _unquoted(a), _unquoted(b)
-    a, b = (shortened(printable(value), _ANSWER_MAX) for value in (a, b))
-    return a, b
+    return answers_apart(a, b, _ANSWER_MAX)
 
 
 def _unquoted(text: str, quote: str = "'") -> str:

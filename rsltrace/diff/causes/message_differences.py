@@ -9,7 +9,12 @@ from rsltrace.diff.alignment.outputs import matched_outputs
 from rsltrace.diff.alignment.rows import OutputRow, Run, counts, outputs_of
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import drawn_for
-from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER, OutputNotes, parameters_text
+from rsltrace.diff.causes.output_notes import (
+    IN_ANOTHER_ORDER,
+    OutputNotes,
+    parameter_changes,
+    parameters_text,
+)
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import ALL_IGNORED, MessageDifference
 from rsltrace.diff.result.events import EventView
@@ -23,12 +28,14 @@ from rsltrace.model.printable import printable, shortened
 from rsltrace.trace.format import TOPIC_DETAILS, TOPIC_ROSOUT
 from rsltrace.words.code import output_places, place_here
 from rsltrace.words.entities import EntityKey
+from rsltrace.words.logs import LogRecord
 from rsltrace.words.outputs import output_text
 
 MESSAGES_MAX = 50
 """Differing messages of one event that are decoded; one callback can publish thousands."""
 
 _EXCEPTION_MAX = 200
+_LOG_MAX = 100
 _INPUT = -1
 _IN_BOTH, _ONLY_A, _ONLY_B = "both", "only a", "only b"
 _WITH_PAYLOAD = frozenset(
@@ -158,14 +165,16 @@ class _Evidence:
             return replace(base, fields=(FieldDifference("raised", raised[0], raised[1]),))
         if len(values) == 1:
             note = parameters_text(values[0]) if topic == PARAMETER_EVENTS else ""
-            return replace(base, preview=preview(values[0]), note=note)
+            text = _log_text(values[0]) if kind == OutputKind.LOG else ""
+            return replace(base, preview=text or preview(values[0]), note=note)
         fields, more = diff_messages(values[0], values[1], self._options.for_topic(topic))
         reason = ""
         if not fields and self._options.ignore:
             reason = ALL_IGNORED
         elif not fields:
             reason = "its fields are equal, but what the recorder hashed of it is not"
-        return replace(base, fields=fields, more_fields=more, reason=reason)
+        note = parameter_changes(*values) if topic == PARAMETER_EVENTS else ""
+        return replace(base, fields=fields, more_fields=more, reason=reason, note=note)
 
     def _decoded(self, run: Run, row: OutputRow) -> object | None:
         """Return the decoded payload of an output (a text for a detail), None if not recorded."""
@@ -196,6 +205,15 @@ class _Evidence:
 def _last_line(traceback: object) -> str:
     lines = str(traceback).strip().splitlines() or [""]
     return shortened(printable(lines[-1]), _EXCEPTION_MAX)
+
+
+def _log_text(record: object) -> str:
+    """Return a log record as a person reads it: ``WARN "text"``; "" if it is none."""
+    level, text = getattr(record, "level", None), getattr(record, "msg", None)
+    if not isinstance(level, int) or not isinstance(text, str):
+        return ""
+    record = LogRecord(level, "", text)
+    return shortened(f'{record.level_name} "{printable(text)}"', _LOG_MAX)
 
 
 def _topic(kind: int, key: EntityKey) -> str:

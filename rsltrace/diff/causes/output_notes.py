@@ -64,11 +64,13 @@ class OutputNotes:
         """Say whether the other run sends the same later, and from there on as this one."""
         has, has_not = self._rows[::-1] if only_b else self._rows
         mine, theirs = (list(islice(_sent(rows, row), 2)) for rows in (has, has_not))
-        if not mine or not theirs or mine[1:] != theirs[1:]:
-            return ""  # another one, of a sender that often sends the same
-        late_ns = theirs[0][0] - mine[0][0]
-        if late_ns <= 0:
+        if not mine or not theirs:
             return ""
+        late_ns = theirs[0][0] - mine[0][0]
+        moved = [(stamp + late_ns, content) for stamp, content in mine]
+        repeats = len({content for _, content in mine}) < len(mine)
+        if late_ns <= 0 or (mine[1:] != theirs[1:] and (repeats or moved != theirs)):
+            return ""  # another one, of a sender that often sends the same
         return f"{format_duration(late_ns)} later in {'a' if only_b else 'b'}"
 
     def _done_to_timer(self, row: OutputRow, *, only_b: bool) -> str:
@@ -87,15 +89,28 @@ class OutputNotes:
 
 def parameters_text(event: object) -> str:
     """Return the parameters that a ``ParameterEvent`` sets: ``gain = 9.5``."""
-    found = []
+    found = [f"{name} = {value}" for name, value in _parameters(event).items()]
+    return ", ".join(found[:_PARAMETERS_MAX])
+
+
+def parameter_changes(a: object, b: object) -> str:
+    """Return which of the parameters differ that two ``ParameterEvent`` set: ``gain 2 → 2.5``."""
+    of_a, of_b = _parameters(a), _parameters(b)
+    both = [name for name in of_a if name in of_b and of_a[name] != of_b[name]]
+    found = [f"{name} {of_a[name]} → {of_b[name]}" for name in both]
+    return ", ".join(found[:_PARAMETERS_MAX])
+
+
+def _parameters(event: object) -> dict[str, str]:
+    found = {}
     for name in ("new_parameters", "changed_parameters"):
         for parameter in getattr(event, name, ()):
             value = getattr(parameter, "value", None)
             field = _VALUES.get(getattr(value, "type", 0))
             if field is not None:
                 text = shortened(printable(str(getattr(value, field, ""))), _VALUE_MAX)
-                found.append(f"{printable(str(parameter.name))} = {text}")
-    return ", ".join(found[:_PARAMETERS_MAX])
+                found[printable(str(parameter.name))] = text
+    return found
 
 
 def durations(one_ns: int, other_ns: int) -> str:

@@ -16,6 +16,7 @@ from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverte
 from rsltrace.diff.alignment.rows import (
     BAG,
     CONSTRUCT,
+    OF_THEIR_OWN,
     SHUTDOWN,
     SUBSCRIPTION,
     OutputRow,
@@ -103,7 +104,14 @@ class Propagation:
     def found_at(self, item: EventPair, origin: Origin) -> FoundDivergence:
         """Return an item of the last block as what to put in words."""
         reached = self.found[origin.root].reached
-        return FoundDivergence(origin, self._first_stamp(item), *self._places(item), reached)
+        places = self._places(item)
+        if item.inverted:  # where the order changes
+            moment = [i for i in self._block.items if i.inverted and self._is_with(i, item)]
+            places = min(i.a for i in moment), min(i.b for i in moment)
+        return FoundDivergence(origin, self._first_stamp(item), *places, reached)
+
+    def _is_with(self, one: EventPair, other: EventPair) -> bool:
+        return self._block.stamp(one) == self._block.stamp(other)
 
     def take(self, block: AlignedBlock, first: EventPair | None = None) -> None:
         """Go through a block. ``first``, if given, is the divergence the search has found: it
@@ -357,6 +365,11 @@ class Propagation:
                 self._taint(rows.run.matching.nodes[number], origin)
             elif kind in REACHING:
                 self._reach(found, number, self._first_stamp(item), 0)
+        if rows.kind[place] == CONSTRUCT:  # a program and the node that it makes are one
+            keys = rows.run.matching.keys
+            for kind, number, _, _ in rows.outputs(index):
+                if kind == OutputKind.ENTITY and keys[number].kind in OF_THEIR_OWN:
+                    self._taint(number, origin)
         for kind, number, _, _ in self._moved_outputs(item, outputs):
             if kind in REACHING:
                 self._reach(found, number, self._first_stamp(item), self._moved_by(item))

@@ -18,6 +18,7 @@ from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.settings import Setting
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.finding import Mode, Source
+from rsltrace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
 _NEVER = frozenset(("record", "livelock_limit", "stop", "vars"))
@@ -143,6 +144,13 @@ class Relevance:
             and not any(_value(node, "guard") for node in job.get("nodes") or [])
             for job in self._jobs
         )
+
+    @cached_property
+    def parameter_files(self) -> list[str]:
+        """The parameter files of all nodes, whose content is not in the trace."""
+        nodes = [node for job in self._jobs for node in job.get("nodes") or []]
+        files = [_value(node, "parameter_files") or [] for node in nodes]
+        return [printable(str(file)) for of_node in files for file in of_node]
 
     @cached_property
     def _traces(self) -> tuple[Trace, Trace]:

@@ -32,11 +32,13 @@ def _slept_ns(run: Run, view: EventView) -> int | None:
         for place in reversed(range(len(rows))):
             if rows.number[place] == number:
                 suspended = rows.flags[place] & EventFlag.SUSPENDED
-                return view.stamp_ns - rows.stamp[place] if suspended else None
+                slept_ns = view.stamp_ns - rows.stamp[place]
+                return slept_ns or None if suspended else None
     elif view.flags & EventFlag.SUSPENDED:
         rows = load_rows(run, view.index + 1, view.index + 1 + _LOOKED_AT_MAX)
         for place in range(len(rows)):
             if rows.number[place] == number:
                 slept = rows.kind[place] == EventKind.RESUME and rows.cause[place] == NO_EVENT
-                return rows.stamp[place] - view.stamp_ns if slept else None
+                slept_ns = rows.stamp[place] - view.stamp_ns
+                return slept_ns or None if slept else None
     return None

@@ -8,6 +8,7 @@ from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER
 from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
 from rsltrace.diff.result.settings import Setting
+from rsltrace.diff.values.constants import NAMED
 from rsltrace.model.event import OutputKind
 from rsltrace.model.printable import shortened
 
@@ -53,6 +54,7 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
     else:
         a, b = (shortened(value, _VALUE_MAX) for value in (first.a, first.b))
         text = f"{first.path} {a} → {b}"
+        text += f" ({first.note})" if NAMED in first.note else ""
     more = len(fields) - 1 + more_fields
     return f"{text} and {more} more field{'s' if more > 1 else ''}" if more else text
 
@@ -85,6 +87,8 @@ def listed(things: Sequence[str]) -> str:
 def _thing(message: MessageDifference) -> str:
     label = _label(message)
     if message.presence == "both":
+        if message.note:
+            return f"parameter {message.note}"
         fields = field_text(message.fields, message.more_fields)
         return f"{label}: {fields}" if fields else label
     if message.kind is OutputKind.LOG and message.preview:

@@ -91,7 +91,8 @@ def failure_text(a: Trace, b: Trace) -> str:
     if stop_reason(trace) == REPLAY_DIVERGED:
         return ""
     why = error_text(trace) or stop_reason(trace)
-    return f"{name} then failed (exit code {exit_code(trace)}): {why}"
+    verb = "failed" if error_text(trace) or _failed(trace) is not None else "ended"
+    return f"{name} then {verb} (exit code {exit_code(trace)}): {why}"
 
 
 def _failed(trace: Trace) -> Event | None:

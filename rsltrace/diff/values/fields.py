@@ -16,6 +16,7 @@ import numpy as np
 
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
+from rsltrace.diff.values.constants import with_names
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import (
     array_text,
@@ -78,6 +79,11 @@ def fields_of(message: object) -> tuple[tuple[str, str, str], ...]:
     return _fields_of_class(cast(Hashable, type(message)))
 
 
+def _definition(cls: Any) -> Any:
+    definitions = getattr(cls.__init__, "__globals__", {}).get("FIELDDEFS", {})
+    return definitions.get(getattr(cls, "__msgtype__", ""))
+
+
 @lru_cache(maxsize=512)
 def _fields_of_class(cls: Any) -> tuple[tuple[str, str, str], ...]:
     """Look at a message's class.
@@ -86,8 +92,7 @@ def _fields_of_class(cls: Any) -> tuple[tuple[str, str, str], ...]:
     float says no other way whether it was float32. The module is not to be found by its name,
     which the next one takes over.
     """
-    definitions = getattr(cls.__init__, "__globals__", {}).get("FIELDDEFS", {})
-    definition = definitions.get(getattr(cls, "__msgtype__", ""))
+    definition = _definition(cls)
     attributes = {
         field.name: field
         for field in dataclasses.fields(cls)
@@ -152,7 +157,10 @@ def _message_differences(path: str, a: Any, b: Any, rules: FieldRules) -> Iterat
         value = getattr(a, attribute)
         other = of_b.pop(name, None)
         if other is not None:
-            yield from _differences(prefix + name, value, getattr(b, other), base, rules)
+            of_other = getattr(b, other)
+            for found in _differences(prefix + name, value, of_other, base, rules):
+                definition = _definition(type(a)) if isinstance(value, int) else None
+                yield with_names(found, name, value, of_other, definition) if definition else found
         elif not rules.ignored(prefix + name):
             yield FieldDifference(prefix + name, preview(value, 40), _ABSENT, note=_NO_FIELD)
     for name, attribute in of_b.items():

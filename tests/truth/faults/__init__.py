@@ -10,24 +10,32 @@ __all__ = ["FAMILIES", "FAULTS", "Planted", "Truth", "load"]
 def load() -> None:
     """Fill ``FAULTS``."""
     from tests.truth.faults import (
+        actions,
+        answers,
         bags,
         behaviour,
         delivery,
         endings,
         equal,
         graphs,
+        lifecycle,
+        mains,
         messages,
         origins,
         outside,
         pairs,
         recordings,
         rules,
+        sensors,
         settings,
+        timing,
+        unrelated,
         waiting,
     )
 
     families = (
         *(bags, behaviour, delivery, endings, equal, graphs, messages, origins, outside, pairs),
-        *(recordings, rules, settings, waiting),
+        *(recordings, rules, settings, waiting, actions, lifecycle, mains, timing),
+        *(answers, sensors, unrelated),
     )
     assert all(families)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from tests.truth.faults.planting import (
     NOT_DETERMINISTIC,
@@ -30,7 +31,14 @@ class Change:
     lines: list[str]
     truth: Truth
     mark: str = "# before"
-    at: int | None = None
+    at: int | str | None = None
+    method: str = ""
+    """The callback that does it, "" for the first of its node."""
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """Where its lines go."""
+        return {"mark": self.mark, "at": self.at, "method": self.method}
 
 
 Behaviour = Callable[[random.Random, World], Change]
@@ -43,7 +51,7 @@ def behaviour(name: str, **kinds: bool) -> Callable[[Behaviour], Behaviour]:
         def code(rng: random.Random) -> Planted:
             a = random_world(rng, **kinds)
             change = make(rng, a)
-            b = in_code(a, change.node.name, change.lines, mark=change.mark, at=change.at)
+            b = in_code(a, change.node.name, change.lines, **change.where)
             truth = change.truth
             says = (*truth.says, rf"code of module {module_of(change.node)}")
             return Planted(a, b, replace(truth, says=says, never=(*truth.never, NOT_DETERMINISTIC)))
@@ -51,7 +59,7 @@ def behaviour(name: str, **kinds: bool) -> Callable[[Behaviour], Behaviour]:
         def hidden(rng: random.Random) -> Planted:
             a = random_world(rng, **kinds)
             change = make(rng, a)
-            b = in_hiding(a, change.node.name, change.lines, mark=change.mark, at=change.at)
+            b = in_hiding(a, change.node.name, change.lines, **change.where)
             truth = change.truth
             says = (*truth.says, NOT_DETERMINISTIC)
             if truth.verdicts == OUTPUT and "guard" not in a.job:

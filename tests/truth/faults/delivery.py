@@ -109,3 +109,54 @@ def incompatible(rng: random.Random) -> Planted:
             independent=None,
         ),
     )
+
+
+def _changed_setup(
+    name: str, node: str, old: str, new: str, *says: str, same: bool = False
+) -> None:
+    """Register a class: a line of a constructor of the burst or the drain is another one."""
+
+    @fault(name)
+    def planter(rng: random.Random) -> Planted:
+        a, _ = _burst(rng)
+        b = a.copy()
+        setup = b.node(node).setup
+        setup[:] = [line.replace(old, new) for line in setup]
+        assert setup != a.node(node).setup
+        if same:
+            return Planted(a, b, Truth(("identical",), equal=True, never=(), exit_code=0))
+        says_ = (*says, rf"code of module truth_{node}")
+        return Planted(a, b, Truth(says=says_, never=NEVER, independent=None))
+
+
+SUBSCRIBED = '"/burst", self.heard, 10)'
+_changed_setup(
+    "QoS: durability that nobody offers",
+    "drain",
+    SUBSCRIBED,
+    '"/burst", self.heard, QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL))',
+    r"QoS|durability",
+)
+_changed_setup(
+    "QoS: deadline that is missed",
+    "drain",
+    SUBSCRIBED,
+    '"/burst", self.heard, QoSProfile(depth=10, deadline=Duration(seconds=0.03)))',
+    r"QoS|deadline",
+)
+_changed_setup(
+    "QoS: history",
+    "drain",
+    SUBSCRIBED,
+    '"/burst", self.heard, QoSProfile(depth=3, history=HistoryPolicy.KEEP_LAST))',
+    r"queue of 3 overflowed",
+)
+_changed_setup(
+    "another type on a topic",
+    "burst",
+    "Float64, ",
+    "Float32, ",
+    r"Float64 only in a.*Float32 only in b",
+)
+_changed_setup("relative name", "burst", '"/burst"', '"~/burst"', "/burst/burst")
+_changed_setup("depth that is never reached", "drain", ", 10)", ", 12)", same=True)

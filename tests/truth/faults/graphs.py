@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import re
+from dataclasses import replace
 
 from tests.truth.faults.planting import Planted, Truth, fault, one_of
 from tests.truth.faults.settings import NEVER
@@ -209,3 +210,61 @@ def different(rng: random.Random) -> Planted:
         b.entry(node.name)["name"] = f"other{number}"
     truth = Truth(first=(r"different jobs",), never=(), independent=None)
     return Planted(a, b, truth)
+
+
+@fault("two nodes with each other's names")
+def exchanged(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    one, other = a.node("source0"), a.node("sink")
+    a.entry(one.name)["name"], a.entry(other.name)["name"] = "first", "second"
+    b = a.copy()
+    b.entry(one.name)["name"], b.entry(other.name)["name"] = "second", "first"
+    truth = Truth(says=("name", "/first", "/second"), never=NEVER, independent=None)
+    return Planted(a, b, truth)
+
+
+def _declared(name: str, one: str, other: str, *says: str) -> None:
+    """Register a class: a node declares its parameter otherwise, in its code."""
+
+    @fault(name)
+    def planter(rng: random.Random) -> Planted:
+        a = random_world(rng)
+        node = one_of(rng, a, "source")
+        a.entry(node.name).pop("parameters", None)
+        b = a.copy()
+        for world, text in ((a, one), (b, other)):
+            world.node(node.name).setup[0] = f'self.declare_parameter("gain", {text})'
+        cause = rf"code of module {node.module}"
+        truth = Truth((), node.full_name, says=(cause, *says), never=NEVER, independent=None)
+        return Planted(a, b, truth)
+
+
+_declared("default of a parameter", "1.5", "1.75", "/s")
+_declared("type of a parameter", "2", "2.0")
+
+
+@fault("parameter of all nodes")
+def wildcard(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    node = one_of(rng, a, "source")
+    for name in [n.name for n in a.nodes]:
+        a.entry(name).pop("parameters", None)
+    text = "/**:\n  ros__parameters:\n    gain: {}\n"
+    a.files["all.yaml"] = text.format(2.5)
+    a.entry(node.name)["parameter_files"] = ["all.yaml"]
+    b = a.copy()
+    b.files["all.yaml"] = text.format(2.75)
+    truth = Truth(
+        (), node.full_name, says=(r"gain 2\.5 → 2\.75", r"all\.yaml"), never=NEVER, independent=None
+    )
+    return Planted(a, b, truth)
+
+
+@fault("service of another name")
+def service_name(rng: random.Random) -> Planted:
+    a = random_world(rng, service=True)
+    b = a.copy()
+    b.entry("server")["remappings"] = {"/ask": "/ask_me"}
+    first = (r"/ask\b.*/ask_me",)
+    truth = Truth(GRAPH, "/server", first=first, says=("remappings",), never=NEVER)
+    return Planted(a, b, replace(truth, independent=None))

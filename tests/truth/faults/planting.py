@@ -78,34 +78,51 @@ def add(name: str, planter: Planter, made_by: Callable[..., object]) -> None:
 
 
 def insert(callback: Callback, mark: str, lines: list[str]) -> None:
-    """Put lines in front of a mark of a callback."""
-    at = callback.lines.index(mark)
-    callback.lines[at:at] = lines
+    """Put lines in front of a mark of a callback, as far in as the mark."""
+    at = next(i for i, line in enumerate(callback.lines) if line.strip() == mark)
+    indent = callback.lines[at].partition("#")[0]
+    callback.lines[at:at] = [f"{indent}{line}" for line in lines]
 
 
 def in_code(
-    a: World, node: str, lines: list[str], *, mark: str = "# before", at: int | None = None
+    a: World,
+    node: str,
+    lines: list[str],
+    *,
+    mark: str = "# before",
+    at: int | str | None = None,
+    method: str = "",
 ) -> World:
-    """Return a world whose node does something else: its code is another one."""
+    """Return a world whose node does something else: its code is another one.
+
+    ``at`` is the number of the call, or a condition; ``method`` the callback, else the first.
+    """
     b = a.copy()
-    insert(b.node(node).callbacks[0], mark, _guarded(lines, at, ""))
+    insert(b.node(node).callback(method), mark, _guarded(lines, at, ""))
     return b
 
 
 def in_hiding(
-    a: World, node: str, lines: list[str], *, mark: str = "# before", at: int | None = None
+    a: World,
+    node: str,
+    lines: list[str],
+    *,
+    mark: str = "# before",
+    at: int | str | None = None,
+    method: str = "",
 ) -> World:
     """Return a world whose node does something else with the same code; changes ``a``, too."""
-    insert(a.node(node).callbacks[0], mark, _guarded(lines, at, 'hidden() == "fault"'))
+    callback = a.node(node).callback(method)
+    insert(callback, mark, _guarded(lines, at, 'hidden() == "fault"'))
     b = a.copy()
     b.hidden = "fault"
     return b
 
 
-def _guarded(lines: list[str], at: int | None, condition: str) -> list[str]:
+def _guarded(lines: list[str], at: int | str | None, condition: str) -> list[str]:
     conditions = [condition] if condition else []
     if at is not None:
-        conditions.append(f"self.n == {at}")
+        conditions.append(at if isinstance(at, str) else f"self.n == {at}")
     if not conditions:
         return lines
     return [f"if {' and '.join(conditions)}:", *(f"    {line}" for line in lines)]
