@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rsltrace.doors.rclpy.executors.standby import Standby, standby_of
+from rsltrace.doors.rclpy.executors.standby import Ran, Standby, standby_of
 from rsltrace.doors.rclpy.handles.waitables import activate_node
 from rsltrace.doors.rclpy.stacks.blocking_calls import POLL_NS, lose_patience, set_aside, wait
 from rsltrace.doors.rclpy.stacks.callback_groups import begin, is_busy, is_custom
@@ -30,10 +30,12 @@ class Pump:
 
     def __init__(self, stacks: Stacks, executor: Any) -> None:
         from rclpy import executors
+        from rclpy.utilities import timeout_sec_to_nsec
 
         self.stacks = stacks
         self.executor = executor
         self._rclpy: Any = executors
+        self._in_ns: Any = timeout_sec_to_nsec
         self.nodes: dict[Any, Mailbox] = {}
         self.tasks = Mailbox(stacks.loop)
         self.tasks.pump = self
@@ -87,11 +89,9 @@ class Pump:
 
         :raises: rclpy's exceptions for a timeout, a shutdown, and a condition that has come true.
         """
-        from rclpy import executors
-        from rclpy.utilities import timeout_sec_to_nsec
-
+        executors = self._rclpy
         self.stacks.programs.present.spun = True
-        timeout_ns = timeout_sec_to_nsec(getattr(timeout, "timeout", timeout))
+        timeout_ns: int = self._in_ns(getattr(timeout, "timeout", timeout))
         loop = self.stacks.loop
         until_ns = None if timeout_ns < 0 else loop.now_ns + timeout_ns
         looked = False
@@ -107,6 +107,8 @@ class Pump:
             taken = self._take(nodes)
             if taken is not None:
                 return self._handler(*taken)
+            has_limit = until_ns is not None
+            standby = standby_of(self.stacks, self, nodes, condition, has_limit=has_limit)
             if until_ns is None:
                 patient = _is_always(condition) and not self.stacks.dispatcher.in_callback()
                 what = (
@@ -114,17 +116,16 @@ class Pump:
                     if _is_always(condition)
                     else _Awaited(self.stacks.domain.graph, condition)
                 )
-                standby = standby_of(self.stacks, self, nodes, condition)
                 self._wait(None, what=what, patient=patient, standby=standby)
-                if standby is not None and standby.is_over:
-                    return self._rclpy.Task(_go_on, (standby.failure,)), None, None
             elif loop.now_ns < until_ns:
-                self._wait(until_ns - loop.now_ns, what=_WORK)
+                self._wait(until_ns - loop.now_ns, what=_WORK, standby=standby)
             elif timeout_ns or looked:
                 raise executors.TimeoutException
             else:
                 looked = True
-                self._wait(self._look_ns(), what="its turn")
+                self._wait(self._look_ns(), what="its turn", standby=standby)
+            if standby is not None and standby.is_over:
+                return Ran(standby.failure), None, None
 
     def _look_ns(self) -> int:
         """Return how long a look without a timeout takes: nothing, for the first at an instant."""
@@ -210,12 +211,6 @@ class Pump:
         finally:
             if held:
                 self.stacks.groups.end(group, wrapper)
-
-
-def _go_on(failure: BaseException | None) -> None:
-    """Be the last thing that ran, for the spin that goes on."""
-    if failure is not None:
-        raise failure
 
 
 class _Awaited:

@@ -1,10 +1,11 @@
-"""A stack that does nothing but spin: what is ready for its executor runs on it at once.
+"""A stack in rclpy's spin: what is ready for its executor runs on it at once.
 
-Between two callbacks rclpy's ``spin`` only asks whether to go on, and nobody sees it do so, as long
-as a callback has left everything as it was. So the stack stays in its wait; the loop's runner
-switches to it with what is ready, it runs that and waits on. Code runs where it always ran and when
-it did: it may block, spin or raise there as ever. After a callback that leaves anything to see or
-to do for ``spin``, that goes on as usual.
+A stack that waits for work in ``spin_once`` would be woken, take what is ready from a mailbox and
+run it next. So the loop's runner switches to it with what is ready, and it runs that where it
+waits. Between two callbacks rclpy's ``spin`` only asks whether to go on, and nobody sees it do so,
+as long as a callback has left everything as it was: then the stack stays in its wait. Code runs
+where it always ran and when it did: it may block, spin or raise there as ever. After a callback
+that leaves anything to see or to do for ``spin``, that goes on as usual.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from asyncio import _get_running_loop
 from collections.abc import Callable
 from functools import lru_cache
 from types import CodeType, FrameType
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from greenlet import getcurrent
 
@@ -37,9 +38,10 @@ class Waker(Protocol):
 
 
 class Standby:
-    """One stack in a spin. ``future`` is what it spins for, None if for ever."""
+    """One stack in a spin. ``future`` is what it spins for, None if for ever; ``once`` says that it
+    goes on itself after each callback."""
 
-    def __init__(self, stacks: Stacks, pump: Waker, future: Any) -> None:
+    def __init__(self, stacks: Stacks, pump: Waker, future: Any, *, once: bool) -> None:
         self._stacks = stacks
         self._loop = stacks.loop
         self._dispatcher = stacks.dispatcher
@@ -51,6 +53,7 @@ class Standby:
         self._pump = pump
         self._context = pump.executor.context.handle
         self._future = future
+        self._once = once
         self.blocked: Wait
         """The wait of the spin."""
         self.is_over = False
@@ -76,6 +79,7 @@ class Standby:
             or blocked.woken
             or dispatcher.entities.pending
             or (dispatcher.unrecorded if recorder is None else recorder.outputs)
+            or (self._future is not None and self._future.done())
             or not _is_free(item)
         ):
             return False
@@ -96,6 +100,8 @@ class Standby:
         )
         blocked, future, context, waiting = self.blocked, self._future, self._context, self._waiting
         all_blocked, host, program = self._all_blocked, programs.host, blocked.program
+        if self._once:
+            blocked.stop_waiting()  # its time limit means nothing to a callback that blocks
         while True:
             del all_blocked[blocked]
             pump.standby = None
@@ -111,7 +117,8 @@ class Standby:
             except BaseException as error:
                 failure = error
             if (
-                failure is not None
+                self._once
+                or failure is not None
                 or pump.woken
                 or not context.is_up
                 or dispatcher.has_outputs()
@@ -151,9 +158,12 @@ def _is_free(item: Any) -> bool:
 
 
 def standby_of(
-    stacks: Stacks, pump: Waker, nodes: object, condition: Callable[[], bool]
+    stacks: Stacks, pump: Waker, nodes: object, condition: Callable[[], bool], *, has_limit: bool
 ) -> Standby | None:
-    """Return what stands by for the spin that looks for work, None if that is not possible."""
+    """Return what stands by for the spin that looks for work, None if that is not possible.
+
+    ``has_limit`` says that it waits for some time only.
+    """
     event = stacks.event
     if (
         nodes is not None
@@ -165,41 +175,72 @@ def standby_of(
         or event.on_end is not None
         or not isinstance(event.handle, OutsideEvent)
         or _get_running_loop() is not None
-        or not _only_spins(sys._getframe(3))
     ):
         return None
-    done = _rclpy_codes()[2]
-    future = getattr(condition, "__self__", None)
-    if future is not None and getattr(condition, "__func__", None) is not done:
+    own = _rclpys_own()
+    frame: FrameType | None = sys._getframe(3)
+    if frame is None or frame.f_code is not own.one_turn:
         return None
-    return Standby(stacks, pump, future)
-
-
-def _only_spins(frame: FrameType | None) -> bool:
-    """Say whether what looks for work is rclpy's own spin, with nobody in between."""
-    parts, whole, _ = _rclpy_codes()
-    while frame is not None and frame.f_code in parts:
+    future = None
+    if condition is not own.never:
+        future = getattr(condition, "__self__", None)
+        if future is None or getattr(condition, "__func__", None) is not own.done:
+            return None
+    while frame is not None and frame.f_code in own.turns:
         frame = frame.f_back
-    return frame is not None and frame.f_code in whole
+    is_endless = not has_limit and frame is not None and frame.f_code in own.spins
+    return Standby(stacks, pump, future, once=not is_endless)
+
+
+class _RclpysOwn(NamedTuple):
+    """Code of rclpy's ``SingleThreadedExecutor``: what runs one callback, those who call it, and
+    those who do so again and again; the condition that is never met, and ``Future.done``."""
+
+    one_turn: CodeType | None
+    turns: frozenset[CodeType]
+    spins: frozenset[CodeType]
+    never: Any
+    done: Any
 
 
 @lru_cache(maxsize=1)
-def _rclpy_codes() -> tuple[frozenset[CodeType], frozenset[CodeType], Any]:
-    """Return the code by which one callback is run, that which does so again and again, and
-    ``Future.done``."""
+def _rclpys_own() -> _RclpysOwn:
     import rclpy
     from rclpy.executors import Executor, SingleThreadedExecutor
     from rclpy.task import Future
 
     names = ("_spin_once_impl", "spin_once", "spin_once_until_future_complete")
     single = vars(SingleThreadedExecutor)
-    parts = {single[name].__code__ for name in names if name in single}
-    whole = {
-        Executor.spin.__code__,
-        Executor.spin_until_future_complete.__code__,
-        rclpy.spin.__code__,
-    }
-    return frozenset(parts), frozenset(whole), Future.done
+    spins = (Executor.spin, Executor.spin_until_future_complete, rclpy.spin)
+    one_turn = single.get(names[0])
+    return _RclpysOwn(
+        getattr(one_turn, "__code__", None),
+        frozenset(single[name].__code__ for name in names if name in single),
+        frozenset(spin.__code__ for spin in spins),
+        (getattr(one_turn, "__defaults__", None) or (None,))[-1],
+        Future.done,
+    )
 
 
-__all__ = ["Standby", "standby_of"]
+class Ran:
+    """What rclpy's executor is given as a Task that it has run: the callback has run already."""
+
+    def __init__(self, failure: BaseException | None = None) -> None:
+        self._failure = failure
+
+    def __call__(self) -> None:
+        """Do as a Task does: only what is no Exception comes out at once."""
+        if self._failure is not None and not isinstance(self._failure, Exception):
+            raise self._failure
+
+    def exception(self) -> BaseException | None:
+        """Return what the callback raised."""
+        return self._failure
+
+    def result(self) -> None:
+        """Raise what the callback raised."""
+        if self._failure is not None:
+            raise self._failure
+
+
+__all__ = ["Ran", "Standby", "standby_of"]

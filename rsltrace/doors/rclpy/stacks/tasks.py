@@ -19,15 +19,16 @@ _is_coroutine: WeakKeyDictionary[FunctionType, bool] = WeakKeyDictionary()
 
 
 def is_coroutine_function(callback: object) -> bool:
-    """Return whether calling ``callback`` gives a coroutine; about a method, look only once.
+    """Return whether calling ``callback`` gives a coroutine; about a function, look only once.
 
     Looking costs a microsecond, and more where an audit hook is told of each look at code.
     """
-    if type(callback) is not MethodType or type(callback.__func__) is not FunctionType:
+    function = callback.__func__ if type(callback) is MethodType else callback
+    if type(function) is not FunctionType:
         return inspect.iscoroutinefunction(callback)
-    known = _is_coroutine.get(callback.__func__)
+    known = _is_coroutine.get(function)
     if known is None:
-        known = _is_coroutine[callback.__func__] = inspect.iscoroutinefunction(callback)
+        known = _is_coroutine[function] = inspect.iscoroutinefunction(callback)
     return known
 
 
