@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import re
 import shutil
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 from rsltrace.campaign.processes import Done, Processes
 from rsltrace.guard.pin import THREADS
@@ -47,6 +49,9 @@ _LOCALES = ("C", "C.UTF-8", "de_DE.UTF-8", "tr_TR.UTF-8", "POSIX", "ja_JP.UTF-8"
 _ZONES = ("UTC", "Asia/Kathmandu", "America/St_Johns", "Pacific/Apia", "XYZ+5:17")
 _KERNELS = {"sse3": "Nehalem", "avx": "Sandybridge", "avx2": "Haswell", "avx512f": "SkylakeX"}
 """By a flag of the processor, the oldest core type of OpenBLAS that uses it."""
+
+_RESULT_MAX = 1 << 20
+"""How far from the end of what a run has printed its result can begin."""
 
 # What a process does to its heap before anything else, so that fresh memory is never zero and
 # addresses are others.
@@ -213,9 +218,8 @@ def record_words(arguments: Sequence[str], path: Path) -> list[str]:
 
 def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
     """Return what came of a run, from what its process has printed."""
-    last = done.output.strip().splitlines()[-1:] or [""]
+    result = _result_in(done.output)
     try:
-        result = json.loads(last[0])
         digest, events = str(result["digest"]), int(result["events"])
         failure = str(result["error"] or "")
         path = Path(result["path"])  # a trace that was there stays if no run comes about
@@ -228,6 +232,20 @@ def recorded(around: Surroundings, path: Path, done: Done) -> Recorded:
     elif not digest and not failure:
         failure = f"it ended with exit status {done.exit_code} and no trace"
     return Recorded(around, path, digest, events, done.exit_code, failure, done.errors)
+
+
+def _result_in(output: str) -> dict[str, Any]:
+    """Return the JSON object that ``record --json`` has printed, which may stand in the middle of a
+    line: nodes print there, too (a prompt, say)."""
+    end = output[-_RESULT_MAX:]
+    for found in reversed(list(re.finditer(r'\{"', end))):
+        try:
+            value, _ = json.JSONDecoder().raw_decode(end, found.start())
+        except ValueError:
+            continue
+        if "digest" in value and "events" in value:
+            return dict(value)
+    return {}
 
 
 def _environment(values: Mapping[str, str], cwd: Path) -> dict[str, str]:

@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.campaign.perturb import KINDS, surroundings
+from rsltrace.campaign.perturb import KINDS, recorded, surroundings
+from rsltrace.campaign.processes import Done
 
 pytestmark = pytest.mark.ros
 
@@ -35,11 +36,37 @@ def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None
 
 def test_one_digest_is_stated_as_what_was_tried(rsltrace: Command, job: WriteJob) -> None:
     kinds = surroundings(1).values
-    done = rsltrace("verify", job(ORDER_OF_A_SET, AS_IT_IS), "--runs", "3", "--jobs", "2")
+    asks = ORDER_OF_A_SET + ", print('Input {x}: ', end='')"  # where the result is printed, too
+    done = rsltrace("verify", job(asks, AS_IT_IS), "--runs", "3", "--jobs", "2")
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     assert first.startswith(f"3 runs, {len(kinds)} perturbations, one digest ")
     assert "hash seed" in second
+
+
+@pytest.mark.parametrize("before", ["", "Input x: ", '{"digest": 1\n{"', "many\nlines {}\n"])
+@pytest.mark.parametrize("after", ["\n", "", " bye", '\nbye {"\n{"a": 1}\n'])
+def test_the_result_is_found_in_what_nodes_print(before: str, after: str) -> None:
+    result = {
+        "digest": "12ab",
+        "events": 7,
+        "error": None,
+        "path": "o.mcap",
+        "more": {"a": {"": 1}},
+    }
+    done = Done(0, before + json.dumps(result) + after, "")
+    found = recorded(surroundings(0), Path("run.mcap"), done)
+    assert (found.digest, found.events, found.path, found.failure) == (
+        "12ab",
+        7,
+        Path("o.mcap"),
+        "",
+    )
+
+
+def test_a_run_without_a_result_has_failed() -> None:
+    found = recorded(surroundings(0), Path("run.mcap"), Done(0, 'no {"digest": result', ""))
+    assert found.failure == "it ended with exit status 0 and no trace"
 
 
 @pytest.mark.long
