@@ -100,6 +100,17 @@ def _logs(path: Path) -> list[tuple[int, str]]:
         return [(stamp, record.msg) for stamp, record in decoded]  # type: ignore[attr-defined]
 
 
+def test_callbacks_of_a_process_take_the_time_that_the_job_gives_them(
+    counter: Path, tmp_path: Path
+) -> None:
+    more = "policy: permutation\nexecution: {nodes: {/counter: 10ms}}\n"
+    results = [
+        run(_job(tmp_path, counter, "'50'", more=more), tmp_path / f"{n}.mcap") for n in range(2)
+    ]
+    assert results[0].digest == results[1].digest
+    assert [stamp for stamp, _ in _logs(tmp_path / "0.mcap")[:2]] == [70_000_000, 120_000_000]
+
+
 def _number(count: int) -> bytes:
     return b"\0\1\0\0" + count.to_bytes(8, "little")
 

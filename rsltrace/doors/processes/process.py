@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -34,7 +35,7 @@ from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.events.event import Door
 from rsltrace.middleware.interface import MessageType, ServiceType
-from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.participant import Participant, full_name
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
@@ -43,7 +44,6 @@ from rsltrace.trace.format import TOPIC_ROSOUT
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
-_ROS_TIME = 1
 _GRACE_S = 5.0
 """How long a process may take (in real time) to end when it is told to."""
 _WAITER = struct.Struct("<IIqI")
@@ -349,7 +349,10 @@ class Process:
 
     def _node(self, fields: Fields) -> None:
         number, name, namespace = fields.number(), fields.text(), fields.text()
+        graph = self.door.domain.graph
+        taken = {other.number for other in graph.nodes_named(full_name(namespace, name))}
         node = self.door.domain.join(name, namespace, self.door)
+        node.number = next(count for count in itertools.count(1) if count not in taken)
         node.process = self
         self.things[number] = node
         self._nodes.append(node)
@@ -391,11 +394,11 @@ class Process:
         domain.graph.add_client(end)
 
     def _timer(self, fields: Fields) -> None:
-        number, clock, period_ns = fields.unpack(_TIMER)
+        number, may_be_an_executors, period_ns = fields.unpack(_TIMER)
         timer = ProcessTimer(self.dispatcher, self, number, period_ns)
         timer.cancel()  # until the process says when it is due
         self.things[number] = timer
-        if clock == _ROS_TIME and self._nodes:  # a node's own: executors use other clocks
+        if not may_be_an_executors:
             self.own(timer)
 
     def own(self, timer: ProcessTimer) -> None:

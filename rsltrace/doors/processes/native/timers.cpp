@@ -1,5 +1,6 @@
 #include "timers.h"
 
+#include <dlfcn.h>
 #include <rcl/time.h>
 
 #include <unordered_map>
@@ -54,13 +55,19 @@ std::int64_t deadline_of(const Timer &timer) {
   return deadline_ns;
 }
 
+// rclpy's executors make timers of their own for waits with a time, with clocks that are no node's.
+bool may_be_an_executors(const rcl_clock_t &clock) {
+  static const bool has_python = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
+  return has_python && clock.type != RCL_ROS_TIME;
+}
+
 void made(const rcl_timer_t *handle, rcl_clock_t *clock, std::int64_t period_ns) {
   const std::uint32_t id = new_id();
   timers()[id] = {handle, period_ns, now_ns(), UNKNOWN_NS, false};
   ids()[handle] = id;
   Writer body;
   body.number(id);
-  body.number(static_cast<std::uint32_t>(clock->type));
+  body.number(static_cast<std::uint32_t>(may_be_an_executors(*clock)));
   body.number(period_ns);
   say(Say::TIMER, body);
 }
