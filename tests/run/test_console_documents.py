@@ -101,6 +101,7 @@ def test_every_command_does_what_it_shows(document: Path, tmp_path: Path) -> Non
 def test_the_documents_that_show_results_are_run() -> None:
     names = {path.name for path in DOCUMENTS}
     assert names >= {"README.md", "recipes.md", "debugging.md", "what-if.md", "verify.md"}
+    assert names >= {"audit.md", "guard.md", "launch.md"}
 
 
 def test_a_line_that_is_stale_is_noticed() -> None:
