@@ -9,7 +9,7 @@ import os
 import re
 import shutil
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -25,6 +25,7 @@ from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.rosbag2 import BagTopic, bag_metadata_yaml
 
+_TOLD_EVERY = 1000
 _QOS, _HASH = "offered_qos_profiles", "topic_type_hash"
 
 
@@ -56,8 +57,11 @@ def export_bag(
     topics: Sequence[str] = ("*",),
     exclude: Sequence[str] = (),
     force: bool = False,
+    progress: Callable[[int, int], None] = lambda written, total: None,
 ) -> int:
     """Write the messages of a trace as the bag ``folder``; return how many there are.
+
+    ``progress`` is told now and then how many it has written, and of how many.
 
     ``topics`` and ``exclude`` are globs, in which ``*`` matches ``/`` too. The folder appears when
     it is complete: a failure leaves nothing, and what was there before.
@@ -80,7 +84,9 @@ def export_bag(
     name = f"{folder.name}_0.mcap"
     with _replacing(folder) as work:
         kept = [channel for channel in channels if counts[channel.id]]
-        start_ns, end_ns = _write(trace, work / name, channels, kept)
+        start_ns, end_ns = _write(
+            trace, work / name, channels, kept, lambda done: progress(done, sum(counts.values()))
+        )
         listed = [
             BagTopic(
                 name=channel.topic,
@@ -104,7 +110,11 @@ def export_bag(
 
 
 def _write(
-    trace: Path, path: Path, channels: Sequence[ChannelInfo], kept: Sequence[ChannelInfo]
+    trace: Path,
+    path: Path,
+    channels: Sequence[ChannelInfo],
+    kept: Sequence[ChannelInfo],
+    progress: Callable[[int], None],
 ) -> tuple[int, int]:
     """Write the MCAP file; return the times of its first and last message, 0 if it has none."""
     with path.open("wb") as file:
@@ -125,7 +135,9 @@ def _write(
             with open_bag(trace, topics=[_literal(c.topic) for c in kept], recover=True) as bag:
                 sequences = dict.fromkeys(ids, 0)
                 start_ns = bag.start_ns
-                for end_ns, number, data in bag.messages():
+                for written, (end_ns, number, data) in enumerate(bag.messages()):
+                    if written % _TOLD_EVERY == 0:
+                        progress(written)
                     topic = bag.topics[number].name
                     sequences[topic] += 1
                     writer.add_message(

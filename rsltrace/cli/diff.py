@@ -231,14 +231,16 @@ def _compare(a: str, b: str, options: DiffOptions, *, check: bool, check_a: bool
         return diff_bags(a, b, options)
     if options.by != BY_ORDER:
         raise click.UsageError("--by is for recordings; the events of two traces are aligned")
+    from rsltrace.cli.output.progress import working
     from rsltrace.diff.traces.diff import diff_traces
     from rsltrace.trace.contents import check_contents
 
     with _opened(a) as trace_a, _opened(b) as trace_b:
         for trace, wanted in ((trace_a, check_a), (trace_b, check)):
             if wanted:
-                trace.check()
-                check_contents(trace)
+                with working(f"checking {trace.name}"):
+                    trace.check()
+                    check_contents(trace)
         return diff_traces(trace_a, trace_b, options)
 
 

@@ -37,11 +37,20 @@ def export(
     then ends where the trace does.
     """
     from rsltrace.bag.export import export_bag
+    from rsltrace.cli.output.progress import working
     from rsltrace.trace.reader import Trace
 
     with Trace.open(trace) as opened:
         whole, events, end = opened.complete, opened.event_count, format_seconds(opened.end_ns)
-    count = export_bag(trace, bag, topics=topics or ("*",), exclude=exclude, force=force)
+    with working(f"writing {bag}") as progress:
+        count = export_bag(
+            trace,
+            bag,
+            topics=topics or ("*",),
+            exclude=exclude,
+            force=force,
+            progress=progress,
+        )
     tell(f"wrote {bag}: {count} messages")
     if whole:
         return 0

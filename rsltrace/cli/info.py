@@ -45,10 +45,12 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
     """
     with Trace.open(trace) as opened:
         if check:
+            from rsltrace.cli.output.progress import working
             from rsltrace.trace.contents import check_contents
 
-            opened.check()
-            check_contents(opened)
+            with working(f"checking {opened.name}"):
+                opened.check()
+                check_contents(opened)
         counts = count(opened)
         if as_json:
             say(json.dumps(_as_json(opened, counts), indent=2))

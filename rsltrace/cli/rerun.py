@@ -52,11 +52,14 @@ def rerun(
     from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME
     from rsltrace_viewer.rerun_export.export import export
 
+    from rsltrace.cli.output.progress import working
+
     timeline = EVENT if by_event else SIM_TIME
     how = show.choose(spawn=spawn, web=web, output=output)
     traces = [trace] if other is None else [trace, other]
     if output is not None:
-        done = export(traces, output, force=force, timeline=timeline)
+        with working(f"writing {output}"):
+            done = export(traces, output, force=force, timeline=timeline)
         _tell_what_is_left_out(done.left_out)
         if not quiet:
             say(
@@ -67,7 +70,9 @@ def rerun(
             show.open_viewer(output, how)
     elif how is not None:
         with show.temporary_recording() as target:
-            _tell_what_is_left_out(export(traces, target, timeline=timeline).left_out)
+            with working("making the recording"):
+                done = export(traces, target, timeline=timeline)
+            _tell_what_is_left_out(done.left_out)
             show.open_viewer(target, how)
 
 
