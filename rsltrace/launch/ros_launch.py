@@ -11,11 +11,13 @@ import os
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError
+from rsltrace.job.values.times import parse_time
 from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, LaunchedNode, Unsupported
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.launch.scope import ParameterFile, Parameters
@@ -49,6 +51,7 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
             source = AnyLaunchDescriptionSource(str(path))
             given = list(arguments.items())
             visitor.visit(IncludeLaunchDescription(source, launch_arguments=given))
+            visitor.finish()
         except JobError:
             raise
         except Exception as error:
@@ -72,6 +75,17 @@ class _Visitor:
         self.launched = Launched()
         self._context = context
         self._path = path
+        self._delay_ns = 0
+        self._after: tuple[str, int] | None = None
+        self._later: list[tuple[tuple[str, int], list[Any]]] = []
+        self._kept: list[Any] = []  # so that no other gets an id that is somebody's number
+
+    def finish(self) -> None:
+        """Do what event handlers bring, after everything else: as they would."""
+        while self._later:
+            self._after, actions = self._later.pop(0)
+            for action in actions:
+                self.visit(action)
 
     def where(self) -> str:
         """Return the launch file that is being evaluated: launch keeps no lines."""
@@ -118,16 +132,53 @@ class _Visitor:
             command = getattr(action, "cmd", None) or [["?"]]
             words = " ".join(self._text(word) for word in command)
             self._refuse(f"process {words!r}", _PROCESS)
-        elif isinstance(
-            action,
-            (actions.TimerAction, RosTimer, actions.RegisterEventHandler, actions.EmitEvent),
-        ):
-            self._refuse(type(action).__name__, _NOT_IN_A_RUN)
+        elif isinstance(action, (actions.TimerAction, RosTimer)):
+            self._timer(action)
+        elif isinstance(action, actions.RegisterEventHandler):
+            self._handler(action.event_handler)
+        elif isinstance(action, actions.EmitEvent):
+            if isinstance(action, actions.Shutdown) and self._after is not None:
+                self.launched.ignored.append(f"{self.where()}: shutdown: {_NOT_IN_A_RUN}")
+            else:
+                self._refuse(type(action).__name__, _NOT_IN_A_RUN)
         elif isinstance(action, actions.OpaqueCoroutine):
             self._refuse("OpaqueCoroutine", "it runs beside processes, which there are none of")
         else:
             return False
         return True
+
+    def _timer(self, timer: Any) -> None:
+        from launch.utilities.type_utils import perform_typed_substitution
+
+        seconds = perform_typed_substitution(self._context, timer.period, float)
+        delay_ns = parse_time(float(seconds))
+        self._delay_ns += delay_ns
+        for action in timer.actions:
+            self.visit(action)
+        self._delay_ns -= delay_ns
+
+    def _handler(self, handler: Any) -> None:
+        from launch import Action
+        from launch.event_handlers import (
+            OnExecutionComplete,
+            OnProcessExit,
+            OnProcessStart,
+            OnShutdown,
+        )
+
+        name = type(handler).__name__
+        if isinstance(handler, OnShutdown):
+            self.launched.ignored.append(f"{self.where()}: {name}: nothing starts after a run")
+            return
+        if isinstance(handler, (OnExecutionComplete, OnProcessExit, OnProcessStart)):
+            target = getattr(handler, "_OnActionEventBase__action_matcher", None)
+            actions = getattr(handler, "_OnActionEventBase__actions_on_event", None)
+            if isinstance(target, Action) and actions:
+                moment = "started" if isinstance(handler, OnProcessStart) else "ended"
+                self._kept.append(target)
+                self._later.append(((moment, id(target)), list(actions)))
+                return
+        self._refuse(name, "it is not for one process, or calls a function with the event")
 
     def _refuse(self, what: str, why: str) -> None:
         self.launched.unsupported.append(Unsupported(self.where(), what, why))
@@ -146,6 +197,11 @@ class _Visitor:
         if package is None:
             self._refuse(f"process {executable!r}", "it belongs to no package")
             return
+        earlier = next((one for one in self.launched.nodes if one.number == id(node)), None)
+        if earlier is not None:  # it is what it was when it was first made
+            again = replace(earlier, delay_ns=self._delay_ns, after=self._after)
+            self.launched.nodes.append(again)
+            return
         node._perform_substitutions(self._context)
         name = node._Node__expanded_node_name
         own_name = None if name == node.UNSPECIFIED_NODE_NAME else name.lstrip("/")
@@ -156,9 +212,13 @@ class _Visitor:
                 f"autostart of {package}/{executable}",
                 "nobody changes the states of lifecycle nodes here: let a node of the job do it",
             )
+        self._kept.append(node)
         self.launched.nodes.append(
             LaunchedNode(
                 where=self.where(),
+                delay_ns=self._delay_ns,
+                after=self._after,
+                number=id(node),
                 package=package,
                 executable=executable,
                 name=own_name,
@@ -212,6 +272,8 @@ class _Visitor:
         self.launched.nodes.append(
             LaunchedNode(
                 where=self.where(),
+                delay_ns=self._delay_ns,
+                after=self._after,
                 package=self._text(description.package),
                 plugin=self._text(description.node_plugin),
                 name=self._optional(description.node_name),

@@ -101,8 +101,8 @@ def test_everything(write: Callable[..., Path], prefix: Path) -> None:
         ("demo/listener", None, "opaque_jackal"),
         ("demo.nodes:Filter", None, "f"),
         ("demo/talker", None, "sub_jackal"),
-        ("demo/talker", None, "talk"),
-        ("demo/talker", None, "talk"),
+        ("demo/talker", "/jackal", "talk"),
+        ("demo/talker", "/jackal", "talk"),
     ]
     talk, component = specs[0], specs[4]
     assert talk.parameters == {

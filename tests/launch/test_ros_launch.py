@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from rsltrace.errors import JobError
+from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.launch import ros_launch
 from rsltrace.launch.model import Launched
 from rsltrace.launch.reader import read_launch_file
@@ -52,7 +53,11 @@ def test_a_python_launch_file(evaluate: Any) -> None:
         ("demo/listener", None, "opaque_jackal"),
         ("demo.nodes:Filter", None, "f"),
         ("demo/talker", None, "sub_jackal"),
+        ("demo/talker", "/jackal", "talk"),
+        ("demo/talker", "/jackal", "talk"),
     ]
+    assert specs[6].start_after == StartAfterSpec.after(1_000_000_000)
+    assert specs[7].start_after == StartAfterSpec(ended=0)
     talk, component = specs[0], specs[4]
     # The file gives rate once more, after the values.
     assert talk.parameters == {
@@ -67,8 +72,6 @@ def test_a_python_launch_file(evaluate: Any) -> None:
     assert (component.parameters, component.remappings) == ({"shared": 7, "gain": 3}, {"in": "out"})
     assert {item.what for item in launched.unsupported} == {
         "process 'echo jackal'",
-        "TimerAction",
-        "RegisterEventHandler",
         "demo/demo::Fast",
     }
     assert list(launched.arguments) == ["robot", "camera", "who"]

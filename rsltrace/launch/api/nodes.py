@@ -97,6 +97,7 @@ class Node(ExecuteLocal):
         self._description = _Description(name, namespace, parameters, remappings)
         self._ros_arguments = list(ros_arguments or ())
         self._arguments = list(arguments or ())
+        self._values: dict[str, Any] = {}
 
     def execute(self, context: LaunchContext) -> None:
         """Note the node."""
@@ -105,14 +106,15 @@ class Node(ExecuteLocal):
         if package is None:
             context.refuse(self.where, f"process {executable!r}", "it belongs to no package")
             return
-        values = self._description.values(context, self.where)
-        if not values.get("fault"):
+        values = self._values or self._description.values(context, self.where)
+        if not self._values and not values.get("fault"):
             try:
                 values["arguments"] = tuple(context.text(word) for word in self._arguments)
                 values["ros_arguments"] = tuple(context.text(w) for w in self._ros_arguments)
                 _check_paths([*values["arguments"], *values["ros_arguments"]])
             except Exception as error:
                 values["fault"] = str(as_job_error(error, self.where))
+        self._values = values  # should it be started again
         note(context, self, package=package, executable=executable, **values)
         self._started(context)
 
