@@ -56,6 +56,8 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
             raise
         except Exception as error:
             raise JobError(f"{type(error).__name__}: {error}", where=visitor.where()) from error
+        finally:
+            visitor.clean()
     return visitor.launched
 
 
@@ -78,7 +80,13 @@ class _Visitor:
         self._delay_ns = 0
         self._after: tuple[str, int] | None = None
         self._later: list[tuple[tuple[str, int], list[Any]]] = []
+        self._scratch: set[str] = set()
         self._kept: list[Any] = []  # so that no other gets an id that is somebody's number
+
+    def clean(self) -> None:
+        """Remove the files that launch has written: nodes may share one."""
+        for file in self._scratch:
+            Path(file).unlink(missing_ok=True)
 
     def finish(self) -> None:
         """Do what event handlers bring, after everything else: as they would."""
@@ -244,10 +252,8 @@ class _Visitor:
                 found.append({key: yaml_value(value)})
             elif Path(text).parent == Path(tempfile.gettempdir()):
                 # What was given as values, launch has written to a file of its own.
-                try:
-                    found.append(parameters_for(text, full_name))
-                finally:
-                    Path(text).unlink(missing_ok=True)
+                found.append(parameters_for(text, full_name))
+                self._scratch.add(text)
             else:
                 found.append(ParameterFile(text))
         return tuple(found)

@@ -36,11 +36,12 @@ class Scope:
 
 
 def absolute_namespace(base: str, own: str | None) -> str | None:
-    """Return the namespace of a node below another one; None if there is neither."""
+    """Return the namespace of a node below another one; None if there is neither. An empty one
+    is the root, if there is no other."""
     namespace = joined_namespace(base, own)
     if namespace and not namespace.startswith("/"):
         namespace = f"/{namespace}"
-    return namespace or None
+    return namespace or (None if own is None else "/")
 
 
 def joined_namespace(base: str, own: str | None) -> str:

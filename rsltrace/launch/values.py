@@ -12,7 +12,17 @@ from rsltrace.model.nesting import nested_too_deep
 
 
 class _Constructor(SafeConstructor):
-    """Reads what ROS's launch writes, too: it has tuples where a file has lists."""
+    """Reads what ROS's launch writes, too: it has tuples where a file has lists.
+
+    Names are text, even if they are ``n`` or ``on``.
+    """
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> Any:
+        """Return a mapping."""
+        for key, _ in node.value:
+            if key.tag == "tag:yaml.org,2002:bool":
+                key.tag = "tag:yaml.org,2002:str"
+        return super().construct_mapping(node, deep)
 
 
 _Constructor.add_constructor(

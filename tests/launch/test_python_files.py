@@ -138,6 +138,7 @@ def test_everything(write: Callable[..., Path], prefix: Path) -> None:
     [
         ("1", 1),
         ("'1'", "1"),
+        ("'1e-3'", 0.001),
         ("EqualsSubstitution('1', 'true')", True),
         ("[1, 2.5]", (1.0, 2.5)),
         ("['a', 'b']", ("a", "b")),
@@ -207,19 +208,21 @@ return LaunchDescription([
         event=launch.events.Shutdown())])),
     RegisterEventHandler(OnProcessExit(target_action=a, on_exit=lambda event, context: [e])),
     RegisterEventHandler(OnShutdown(on_shutdown=[LogInfo(msg='bye')])),
-    a, gone])
+    a, gone, Node(package='demo', executable='talker', namespace='',
+                  on_exit=LaunchConfiguration('z'))])
 """
     )
-    a, b, c = specs_of(launched)
-    assert (a.name, a.start_after) == ("a", None)
+    a, root, b, c = specs_of(launched)
+    assert (a.name, a.start_after, a.namespace, root.namespace) == ("a", None, None, "/")
     assert (b.name, b.start_after) == ("b", StartAfterSpec(started=0, delay="500ms"))  # type: ignore[arg-type]
-    assert (c.name, c.start_after) == ("c", StartAfterSpec(ended=1))
+    assert (c.name, c.start_after) == ("c", StartAfterSpec(ended=2))
     left_out = [str(item) for item in launched.unsupported]
     assert sum("it starts when something has ended that is left out itself" in t for t in left_out)
     assert sum("it is a function that is called with the event" in text for text in left_out) == 1
     assert len(left_out) == 4
     assert [text.partition(": ")[2].partition(":")[0] for text in launched.ignored] == [
         "OnShutdown",
+        "what follows when the Node of a.launch.py",
         "shutdown",
     ]
 

@@ -142,6 +142,10 @@ def later(context: LaunchContext, where: str, moment: str, target: Action, actio
         return
     listed = list(actions) if isinstance(actions, Iterable) else [actions]
     evaluation = context.evaluation
+    if not all(isinstance(action, LaunchDescriptionEntity) for action in listed):
+        what = f"what follows when {_title(target)} has {moment}"
+        evaluation.launched.ignored.append(f"{where}: {what}: it is no action")
+        return
     evaluation.kept.append(target)
 
     def do() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,7 @@ from rsltrace.launch.parameter_files import parameters_for, substituted_paramete
 from rsltrace.launch.values import typed, yaml_value
 
 _SCALARS = (bool, int, float, str)
+_NUMBER = re.compile(r"[-+]?[0-9]+[eE][-+]?[0-9]+")
 _STRING = "if it is meant as text: ParameterValue(…, value_type=str)"
 
 
@@ -129,6 +131,8 @@ def plain_value(context: LaunchContext, value: Any, name: str) -> Any:
     """
     if isinstance(value, ParameterValue):
         return value.evaluate(context)
+    if isinstance(value, str) and _NUMBER.fullmatch(value):
+        return float(value)  # launch writes it without quotes, and rcl reads a number
     if isinstance(value, (*_SCALARS, bytes)):
         return value
     if _is_text(value):
