@@ -329,6 +329,6 @@ def test_the_reproducer_does_it_again(tmp_path: Path) -> None:
     )
     (line,) = (tmp_path / "cases.jsonl").read_text().splitlines()
     verdict = campaign.from_json(line)
-    assert (verdict.family, verdict.seed, verdict.attack) == ("texts", 5, "logs")
+    assert (verdict.family, verdict.seed, verdict.attack) == ("texts", 5, "code-lines")
     assert verdict.reproducer == "python -m tests.attack --family texts --seed 5"
     assert done.returncode in (0, 1)
