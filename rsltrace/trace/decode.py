@@ -2,8 +2,9 @@
 
 rosbags generates a Python decoder per type from schema text. A trace may come from anybody, so its
 schemas are checked before they reach that generator: only the parsed structure goes on, every name
-in it is a plain identifier, sizes and nesting are bounded, and of constants only whole numbers with
-names in capitals stay. Opening a trace runs none of this; only decoding a message does.
+in it is a plain identifier, sizes and nesting are bounded, and constants (which decoding does not
+need) are left out. Those that name whole numbers are kept beside the classes, to be shown. Opening
+a trace runs none of this; only decoding a message does.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ class Decoder:
         try:
             types = get_types_from_msg(channel.schema_text, self.name)
             self.types: dict[str, Any] = {
-                name: (_constants(types[name]), _checked_fields(name, types)) for name in types
+                name: ([], _checked_fields(name, types)) for name in types
             }
             self.items = sum(map(_unrolled, self.types.values()))
             if self.items > limits.SCHEMA_ITEMS_MAX:
@@ -72,6 +73,9 @@ class Decoder:
             self._store = Typestore()
             self._store.register(self.types)
             self._store.get_msgdef(self.name)
+            for name in types:  # once the classes are made, which would have them as fields
+                made = self._store.types[name].__init__.__globals__["FIELDDEFS"]
+                made[name][0].extend(_constants(types[name]))
         except (TypesysError, _UnsafeSchema, RecursionError, KeyError) as error:
             raise self._unusable(error) from error
 

@@ -14,6 +14,8 @@ from hypothesis import strategies as st
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
 
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.values.fields import diff_messages
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoder, to_plain
 from rsltrace.trace.index import ChannelInfo
@@ -95,6 +97,20 @@ def test_an_empty_message_is_an_empty_object() -> None:
 def test_constants_are_not_part_of_a_message() -> None:
     plain = to_plain(decoder("uint8 A=3\nstring B='x'\nuint8 c\n").decode(CDR + b"\7"))
     assert plain == {"c": 7}
+
+
+def test_names_of_whole_numbers_are_kept_beside_the_message() -> None:
+    made = decoder("uint8 LOW=3\nuint8 HIGH=4\nuint8 c\n")
+    (found,), _ = diff_messages(made.decode(CDR + b"\3"), made.decode(CDR + b"\4"), DiffOptions())
+    assert (found.path, found.a, found.b, found.note) == ("c", "3", "4", "LOW → HIGH")
+
+
+def test_names_that_may_mean_another_field_are_not_told() -> None:
+    made = decoder("uint8 LOW=3\nuint8 HIGH=4\nuint8 c\nuint8 d\n")
+    (found,), _ = diff_messages(
+        made.decode(CDR + b"\3\3"), made.decode(CDR + b"\4\3"), DiffOptions()
+    )
+    assert found.note == ""
 
 
 def test_fields_may_have_names_that_python_reserves() -> None:
