@@ -22,7 +22,7 @@ _LOOK_S = 0.2
 _GRACE_S = 2.0
 _NO_RANDOM_ADDRESSES = 0x0040000
 _PRESENT = 0xFFFFFFFF
-_USUAL_THREADS = 3
+_USUAL_THREADS = 4
 _LOST_LINK = 120  # of native/link.cpp
 
 
@@ -129,7 +129,7 @@ class Child:
         return memoryview(whole)[_HEAD_SIZE:size]
 
     def has_threads(self) -> bool:
-        """Return whether there are threads in it beside the first and the two of LTTng."""
+        """Return whether it has threads beside the first, the library's and the two of LTTng."""
         return len(list(Path(f"/proc/{self.pid}/task").iterdir())) > _USUAL_THREADS
 
     def give_up_after(self, seconds: float) -> None:

@@ -240,6 +240,7 @@ class Process:
         event = self.dispatcher.event
         waits = []
         self._waking_soon = False
+        timed = set()
         for _ in range(fields.number()):
             thread, number, deadline_ns, size = fields.unpack(_WAITER)
             fields.unpack(struct.Struct(f"{size}s"))
@@ -250,6 +251,9 @@ class Process:
                 self._waking_soon = True
             if deadline_ns != NEVER_NS:
                 self._wake_at(thread, deadline_ns, asleep=number == 0)
+                timed.add(thread)
+        for thread in self._waking.keys() - timed:  # another thread has woken it
+            self._waking[thread].off()
         if self._waits != tuple(waits):
             self._waits = tuple(waits)
             self._wanted = {
@@ -464,9 +468,13 @@ class WakingTimer:
             0, dispatcher.loop.now_ns, order=dispatcher.entities.new_id(), owner=self
         )
         self._asleep: tuple[int, Any, int] | None = None
+        self._at_ns: int | None = None
 
     def at(self, deadline_ns: int, *, asleep: bool) -> None:
         """Wake it at a time; ``asleep`` says that the event under way goes on then."""
+        if deadline_ns == self._at_ns:  # it sleeps on, whoever ran in between
+            return
+        self._at_ns = deadline_ns
         dispatcher = self._process.dispatcher
         event = dispatcher.event
         self._asleep = (event.entity, event.node, dispatcher.loop.events) if asleep else None
@@ -475,6 +483,7 @@ class WakingTimer:
 
     def off(self) -> None:
         """Forget it: the thread goes on."""
+        self._at_ns = None
         self._process.dispatcher.loop.timers.remove(self._state)
 
     def dispatch(self) -> None:

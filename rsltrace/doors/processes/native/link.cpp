@@ -3,6 +3,7 @@
 #include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
+#include <poll.h>
 #include <pthread.h>
 #include <signal.h>
 #include <stdio.h>
@@ -10,9 +11,13 @@
 #include <sys/prctl.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
+#include <time.h>
 #include <unistd.h>
 
+#include <algorithm>
+
 #include "endpoints.h"
+#include "threads.h"
 
 namespace rsltrace {
 
@@ -163,6 +168,7 @@ void say(Say kind, const Writer &body) {
 }
 
 std::vector<std::uint8_t> ask(Say kind, const Writer &body) {
+  const Asking asking;
   say(kind, body);
   send_batch();
   const Message message = listen();
@@ -170,27 +176,64 @@ std::vector<std::uint8_t> ask(Say kind, const Writer &body) {
   return std::vector<std::uint8_t>(message.body, message.body + message.size);
 }
 
-void idle(Waiter *const *waiters, std::size_t count) {
+namespace {
+
+// While a thread is outside, simulated time is let go on in steps of this, and only as fast as real
+// time: in between the loop runs whatever else is due.
+constexpr std::int64_t PACE_NS = 10'000'000;
+constexpr std::uint32_t PACER = UINT32_MAX;  // the number of no thread
+
+std::int64_t real_ns() {
+  timespec now{};
+  syscall(SYS_clock_gettime, CLOCK_MONOTONIC, &now);
+  return now.tv_sec * 1'000'000'000 + now.tv_nsec;
+}
+
+// Wait in real time until simulated time may go on by a step; true if the bell has rung instead.
+bool pace(bool was_outside) {
+  static std::int64_t ahead_ns;  // of simulated time, to what a real clock shows
+  if (!was_outside || time_ns - real_ns() < ahead_ns) ahead_ns = time_ns - real_ns();
+  const std::int64_t left = std::max<std::int64_t>(time_ns + PACE_NS - ahead_ns - real_ns(), 0);
+  const timespec limit{0, static_cast<long>(std::min(left, PACE_NS))};
+  pollfd bell{bell_fd(), POLLIN, 0};
+  return syscall(SYS_ppoll, &bell, 1, &limit, nullptr, 8) != 0;
+}
+
+void say_wait(const std::vector<const Waiter *> &waiters) {
   Writer body;
-  body.number(static_cast<std::uint32_t>(count));
-  for (std::size_t i = 0; i < count; i++) {
-    const Waiter &waiter = *waiters[i];
-    body.number(waiter.thread);
-    body.number(waiter.set == nullptr ? 0U : waiter.set->set);
-    body.number(waiter.deadline_ns);
-    body.text(waiter.what);
+  body.number(static_cast<std::uint32_t>(waiters.size()));
+  for (const Waiter *waiter : waiters) {
+    body.number(waiter->thread);
+    body.number(waiter->set == nullptr ? 0U : waiter->set->set);
+    body.number(waiter->deadline_ns);
+    body.text(waiter->what);
   }
   say(Say::WAIT, body);
+}
+
+}  // namespace
+
+void idle(Waiter *const *waiters, std::size_t count, bool outside) {
+  static bool was_outside = false;
+  const bool rung = outside && pace(was_outside);
+  was_outside = outside;
+  if (rung) return;
+  std::vector<const Waiter *> told(waiters, waiters + count);
+  Waiter pacer;
+  pacer.thread = PACER;
+  pacer.deadline_ns = time_ns + PACE_NS;
+  pacer.what = "a call that blocks outside";
+  if (outside) told.push_back(&pacer);
+  say_wait(told);
   send_batch();
   const Message message = listen();
   if (message.kind == Told::STOP) {
+    raise_in_main(SIGINT);  // as whoever starts nodes does; without a handler, the process ends here
     for (std::size_t i = 0; i < count; i++) {
-      if (waiters[i]->thread == 0 || count == 1) {
-        waiters[i]->woken = true;
-        waiters[i]->ready = {Wake::STOP, 0};
-      }
+      if (waiters[i]->woken || (waiters[i]->thread != 0 && count > 1)) continue;
+      waiters[i]->woken = true;
+      waiters[i]->ready = {Wake::STOP, 0};
     }
-    raise(SIGINT);  // as whoever starts nodes does; without a handler, the process ends here
     return;
   }
   if (message.kind != Told::GO) lost();

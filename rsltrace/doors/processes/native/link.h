@@ -48,8 +48,10 @@ std::uint64_t seed();
 void say(Say kind, const Writer &body);
 // Send the batch with a question at its end, and return the answer.
 std::vector<std::uint8_t> ask(Say kind, const Writer &body);
-// No thread can run: send the batch with what is waited for, and return when one may go on.
-void idle(Waiter *const *waiters, std::size_t count);
+// No thread can run: send the batch with what is waited for, and return when one may go on, or
+// nobody but the bell has rung (threads.h). While a thread is `outside`, simulated time goes no
+// faster than real time.
+void idle(Waiter *const *waiters, std::size_t count, bool outside);
 // Tell the user something about this process.
 void report(const std::string &text);
 

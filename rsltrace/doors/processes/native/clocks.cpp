@@ -1,0 +1,136 @@
+// Every clock shows simulated time, and sleeping is waiting for it.
+#include <sched.h>
+#include <sys/time.h>
+#include <sys/times.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "real.h"
+#include "scheduler.h"
+
+namespace rsltrace {
+
+constexpr std::int64_t SECOND_NS = 1'000'000'000;
+
+bool valid(const timespec *when) { return when->tv_nsec >= 0 && when->tv_nsec < SECOND_NS; }
+
+std::int64_t deadline_of(const timespec &when) {
+  if (when.tv_sec >= NEVER_NS / SECOND_NS) return NEVER_NS;
+  return when.tv_sec < 0 ? 0 : when.tv_sec * SECOND_NS + when.tv_nsec;
+}
+
+std::int64_t deadline_after(const timespec &span) {
+  const std::int64_t length = deadline_of(span);
+  const std::int64_t now = now_ns();
+  return length >= NEVER_NS - now ? NEVER_NS : now + length;
+}
+
+namespace {
+
+timespec to_timespec(std::int64_t ns) {
+  return {static_cast<time_t>(ns / SECOND_NS), static_cast<long>(ns % SECOND_NS)};
+}
+
+// Returns 0, or EINTR with what is left.
+int sleep_until(Thread &thread, std::int64_t deadline_ns, timespec *left, const char *what) {
+  pthread_testcancel();
+  if (deadline_ns <= now_ns()) {
+    yield(thread);
+    return 0;
+  }
+  Outcome outcome;
+  {
+    Inside inside(thread);
+    outcome = wait_at(thread, Kind::SLEEP, nullptr, deadline_ns, what, true);
+  }
+  if (outcome != Outcome::INTERRUPTED) return 0;
+  pthread_testcancel();
+  if (left != nullptr) *left = to_timespec(deadline_ns - now_ns());
+  return EINTR;
+}
+
+std::int64_t look_at_clock(Thread &thread) {
+  look(thread, 1);
+  return now_ns();
+}
+
+}  // namespace
+}  // namespace rsltrace
+
+using namespace rsltrace;
+
+RSLTRACE_EXPORT int clock_gettime(clockid_t clock, timespec *out) noexcept {
+  Thread *thread = me();
+  if (thread == nullptr && !linked()) return REAL(clock_gettime)(clock, out);
+  timespec resolution;
+  if (clock > CLOCK_TAI && REAL(clock_getres)(clock, &resolution) != 0) return -1;  // there is none
+  *out = to_timespec(thread == nullptr ? now_ns() : look_at_clock(*thread));
+  return 0;
+}
+
+RSLTRACE_EXPORT int gettimeofday(timeval *__restrict out, void *__restrict zone) noexcept {
+  timespec now;
+  if (!linked()) return REAL(gettimeofday)(out, zone);
+  clock_gettime(CLOCK_REALTIME, &now);
+  *out = {now.tv_sec, now.tv_nsec / 1000};
+  return 0;
+}
+
+RSLTRACE_EXPORT time_t time(time_t *out) noexcept {
+  if (!linked()) return REAL(time)(out);
+  timespec now;
+  clock_gettime(CLOCK_REALTIME, &now);
+  if (out != nullptr) *out = now.tv_sec;
+  return now.tv_sec;
+}
+
+RSLTRACE_EXPORT int timespec_get(timespec *out, int base) noexcept {
+  if (!linked() || base != TIME_UTC) return REAL(timespec_get)(out, base);
+  clock_gettime(CLOCK_REALTIME, out);
+  return base;
+}
+
+RSLTRACE_EXPORT clock_t clock() noexcept {
+  if (!linked()) return REAL(clock)();
+  timespec now;
+  clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &now);
+  return now.tv_sec * CLOCKS_PER_SEC + now.tv_nsec / 1000;
+}
+
+RSLTRACE_EXPORT int clock_nanosleep(clockid_t clock, int flags, const timespec *when, timespec *left) {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(clock_nanosleep)(clock, flags, when, left);
+  if (!valid(when) || (when->tv_sec < 0 && (flags & TIMER_ABSTIME) == 0)) return EINVAL;
+  if ((flags & TIMER_ABSTIME) != 0) return sleep_until(*thread, deadline_of(*when), nullptr, "clock_nanosleep");
+  return sleep_until(*thread, deadline_after(*when), left, "clock_nanosleep");
+}
+
+RSLTRACE_EXPORT int nanosleep(const timespec *span, timespec *left) {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(nanosleep)(span, left);
+  const bool good = valid(span) && span->tv_sec >= 0;
+  const int failure = good ? sleep_until(*thread, deadline_after(*span), left, "nanosleep") : EINVAL;
+  if (failure == 0) return 0;
+  errno = failure;
+  return -1;
+}
+
+RSLTRACE_EXPORT int usleep(useconds_t span) {
+  const timespec time{span / 1'000'000, static_cast<long>(span % 1'000'000) * 1000};
+  return nanosleep(&time, nullptr);
+}
+
+RSLTRACE_EXPORT unsigned sleep(unsigned seconds) {
+  const timespec time{static_cast<time_t>(seconds), 0};
+  timespec left{};
+  if (nanosleep(&time, &left) == 0) return 0;
+  return static_cast<unsigned>(left.tv_sec + (left.tv_nsec >= SECOND_NS / 2 ? 1 : 0));
+}
+
+RSLTRACE_EXPORT int sched_yield() noexcept {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(sched_yield)();
+  yield(*thread);
+  return 0;
+}
+

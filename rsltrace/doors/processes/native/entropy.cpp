@@ -1,0 +1,132 @@
+// Chance comes from the job's seed.
+#include <fcntl.h>
+#include <stdio.h>
+#include <sys/mman.h>
+#include <sys/random.h>
+#include <unistd.h>
+
+#include <cstdarg>
+#include <cstdlib>
+#include <cstring>
+#include <random>
+
+#include "real.h"
+#include "scheduler.h"
+
+namespace rsltrace {
+namespace {
+
+// How much one who opens /dev/urandom finds there.
+constexpr std::size_t DEVICE_BYTES = std::size_t{1} << 20;
+
+// SplitMix64 (Steele, Lea, Flood 2014): any seed will do.
+std::uint64_t draw() {
+  static std::uint64_t state = seed();
+  std::uint64_t z = state += 0x9e3779b97f4a7c15;
+  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9;
+  z = (z ^ (z >> 27)) * 0x94d049bb133111eb;
+  return z ^ (z >> 31);
+}
+
+void fill(void *out, std::size_t length) {
+  auto *bytes = static_cast<char *>(out);
+  while (length > 0) {
+    const std::uint64_t word = draw();
+    const std::size_t count = length < sizeof word ? length : sizeof word;
+    std::memcpy(bytes, &word, count);
+    bytes += count;
+    length -= count;
+  }
+}
+
+bool is_device(const char *path) {
+  return path != nullptr && (std::strcmp(path, "/dev/urandom") == 0 || std::strcmp(path, "/dev/random") == 0);
+}
+
+// A file with what the device would give; -1 if this process is not simulated or it cannot be made.
+int open_device(const char *path) {
+  if (!is_device(path) || me() == nullptr) return -1;
+  const int file = memfd_create("rsltrace-random", MFD_CLOEXEC);
+  if (file < 0) return -1;
+  std::string bytes(DEVICE_BYTES, '\0');
+  fill(bytes.data(), bytes.size());
+  if (REAL(write)(file, bytes.data(), bytes.size()) != static_cast<ssize_t>(bytes.size()) ||
+      lseek(file, 0, SEEK_SET) != 0) {
+    close(file);
+    return -1;
+  }
+  return file;
+}
+
+}  // namespace
+}  // namespace rsltrace
+
+using namespace rsltrace;
+
+RSLTRACE_EXPORT ssize_t getrandom(void *out, size_t length, unsigned flags) {
+  if (me() == nullptr) return REAL(getrandom)(out, length, flags);
+  fill(out, length);
+  return static_cast<ssize_t>(length);
+}
+
+RSLTRACE_EXPORT int getentropy(void *out, size_t length) {
+  if (me() == nullptr || length > 256) return REAL(getentropy)(out, length);
+  fill(out, length);
+  return 0;
+}
+
+// libc has these three since 2.36; a program that calls them was made for one that has them.
+RSLTRACE_EXPORT std::uint32_t arc4random() noexcept {
+  using Function = std::uint32_t();
+  static auto *libc = reinterpret_cast<Function *>(real("arc4random"));
+  if (me() == nullptr && libc != nullptr) return libc();
+  return static_cast<std::uint32_t>(draw());
+}
+
+RSLTRACE_EXPORT void arc4random_buf(void *out, size_t length) noexcept {
+  using Function = void(void *, size_t);
+  static auto *libc = reinterpret_cast<Function *>(real("arc4random_buf"));
+  if (me() == nullptr && libc != nullptr) return libc(out, length);
+  fill(out, length);
+}
+
+RSLTRACE_EXPORT std::uint32_t arc4random_uniform(std::uint32_t bound) noexcept {
+  if (bound < 2) return 0;
+  const std::uint32_t least = -bound % bound;  // so that all results are equally likely
+  std::uint32_t drawn;
+  do drawn = arc4random();
+  while (drawn < least);
+  return drawn % bound;
+}
+
+// std::random_device asks the processor (rdrand), or opens the device.
+RSLTRACE_EXPORT unsigned rsltrace_random_device(std::random_device *device) __asm__("_ZNSt13random_device9_M_getvalEv");
+
+RSLTRACE_EXPORT unsigned rsltrace_random_device(std::random_device *device) {
+  using Function = unsigned(std::random_device *);
+  static auto *original = reinterpret_cast<Function *>(real("_ZNSt13random_device9_M_getvalEv"));
+  return me() == nullptr ? original(device) : static_cast<unsigned>(draw());
+}
+
+#define RSLTRACE_OPEN(name, ...)                                            \
+  if (const int file = open_device(path); file >= 0) return file;           \
+  va_list rest;                                                             \
+  va_start(rest, flags);                                                    \
+  const mode_t mode = (flags & (O_CREAT | O_TMPFILE)) != 0 ? va_arg(rest, mode_t) : 0; \
+  va_end(rest);                                                             \
+  return REAL(name)(__VA_ARGS__, flags, mode)
+
+RSLTRACE_EXPORT int open(const char *path, int flags, ...) { RSLTRACE_OPEN(open, path); }
+RSLTRACE_EXPORT int open64(const char *path, int flags, ...) { RSLTRACE_OPEN(open64, path); }
+RSLTRACE_EXPORT int openat(int folder, const char *path, int flags, ...) { RSLTRACE_OPEN(openat, folder, path); }
+RSLTRACE_EXPORT int openat64(int folder, const char *path, int flags, ...) { RSLTRACE_OPEN(openat64, folder, path); }
+
+RSLTRACE_EXPORT FILE *fopen(const char *path, const char *mode) {
+  const int file = open_device(path);
+  return file >= 0 ? fdopen(file, "r") : REAL(fopen)(path, mode);
+}
+
+RSLTRACE_EXPORT FILE *fopen64(const char *path, const char *mode) {
+  const int file = open_device(path);
+  return file >= 0 ? fdopen(file, "r") : REAL(fopen64)(path, mode);
+}

@@ -1,0 +1,209 @@
+// Threads that block outside of the simulation: in calls that are known to (waiting for a child
+// process), and in others, which a service thread finds. It also idles for the process if the
+// thread that ran last went outside or ended.
+#include <linux/futex.h>
+#include <linux/membarrier.h>
+#include <signal.h>
+#include <stdio.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <cstdlib>
+#include <cstring>
+#include <fstream>
+#include <set>
+
+#include "real.h"
+#include "scheduler.h"
+#include "threads.h"
+
+namespace rsltrace {
+namespace {
+
+constexpr long LOOK_EVERY_NS = 250'000'000;
+
+struct Call {
+  long number;
+  const char *name;
+  bool descriptor;  // its first argument is one
+};
+constexpr Call CALLS[] = {
+    {SYS_read, "read", true},          {SYS_readv, "readv", true},     {SYS_write, "write", true},
+    {SYS_writev, "writev", true},      {SYS_ioctl, "ioctl", true},     {SYS_recvfrom, "recv", true},
+    {SYS_recvmsg, "recvmsg", true},    {SYS_sendto, "send", true},     {SYS_sendmsg, "sendmsg", true},
+    {SYS_accept, "accept", true},      {SYS_accept4, "accept", true},  {SYS_connect, "connect", true},
+    {SYS_flock, "flock", true},        {SYS_fcntl, "fcntl", true},     {SYS_openat, "open", false},
+    {SYS_futex, "a lock of libc", false}, {SYS_wait4, "wait", false},  {SYS_msgrcv, "msgrcv", false},
+    {SYS_rt_sigsuspend, "sigsuspend", false}, {SYS_rt_sigtimedwait, "sigwait", false},
+};
+
+std::string target_of(long descriptor) {
+  char path[256] = "";
+  const std::string link = "/proc/self/fd/" + std::to_string(descriptor);
+  if (readlink(link.c_str(), path, sizeof path - 1) < 0) return "descriptor " + std::to_string(descriptor);
+  return "descriptor " + std::to_string(descriptor) + ", " + path;
+}
+
+std::string name_of_call(const std::string &line) {
+  char *rest = nullptr;
+  const long number = std::strtol(line.c_str(), &rest, 10);
+  for (const Call &call : CALLS)
+    if (call.number == number)
+      return std::string(call.name) + (call.descriptor ? " (" + target_of(std::strtol(rest, nullptr, 16)) + ")" : "");
+  return "system call " + std::to_string(number);
+}
+
+// What a thread does in the kernel, empty if it does not sleep in a call: with how often it has
+// slept so far, so that two equal ones mean that it did not run in between.
+std::string asleep(const Thread &thread) {
+  const std::string folder = "/proc/self/task/" + std::to_string(thread.tid) + "/";
+  std::string call, line, text;
+  std::getline(std::ifstream(folder + "syscall"), call);
+  if (call.empty() || call[0] == 'r' || call[0] == '-') return "";
+  std::ifstream status(folder + "status");
+  while (std::getline(status, line)) {
+    if (line.rfind("State:", 0) == 0 && line.find('S') == std::string::npos) return "";
+    if (line.rfind("State:\tS", 0) != 0 && line.rfind("State:", 0) == 0) return "";
+    if (line.find("ctxt_switches") != std::string::npos) text += line;
+  }
+  return call + "\n" + text;
+}
+
+long membarrier(int command) { return REAL(syscall)(SYS_membarrier, command, 0, 0); }
+
+struct Seen {
+  Thread *thread = nullptr;
+  std::uint64_t turn = 0;
+  std::string sleep;
+};
+
+// Take the baton from a thread that sleeps in the kernel for two looks. It may return at any moment:
+// it is marked first, and only if it still sleeps when every processor has seen that is it left
+// behind. A mark it finds when it comes back it takes away itself (enter()).
+bool take_from(Thread &thread, const std::string &sleep) {
+  if (!thread.open.load()) return false;
+  thread.seized.store(1);
+  thread.open.store(false);
+  if (membarrier(MEMBARRIER_CMD_PRIVATE_EXPEDITED) != 0 || asleep(thread) != sleep) return false;
+  std::uint8_t marked = 1;
+  if (!thread.seized.compare_exchange_strong(marked, 2)) return false;
+  seize(thread, "a call that blocks");
+  tell_outside(thread, name_of_call(sleep));
+  return true;
+}
+
+bool look_at_holder(Seen &seen) {
+  Thread *thread = holder();
+  const std::uint64_t turn = turns();
+  const std::string sleep = thread == nullptr || !thread->open.load() ? "" : asleep(*thread);
+  if (!sleep.empty() && seen.thread == thread && seen.turn == turn && seen.sleep == sleep)
+    return take_from(*thread, sleep);
+  seen = {thread, turn, sleep};
+  return false;
+}
+
+void *serve(void *) {
+  self = &service;
+  service.tid = static_cast<pid_t>(REAL(syscall)(SYS_gettid));
+  const bool seizes = membarrier(MEMBARRIER_CMD_REGISTER_PRIVATE_EXPEDITED) == 0;
+  Seen seen;
+  for (;;) {
+    timespec pause{0, LOOK_EVERY_NS};
+    if (service.gate.load() == 0)
+      REAL(syscall)(SYS_futex, &service.gate, FUTEX_WAIT_PRIVATE, 0, &pause, nullptr, 0);
+    if (service.gate.load() != 0) {
+      stand(service);
+      turn_over(service);
+    } else if (seizes && look_at_holder(seen)) {
+      turn_over(service);
+    }
+  }
+  return nullptr;
+}
+
+}  // namespace
+
+void start_service() {
+  if (service.service) return;
+  service.service = true;
+  sigset_t everything, before;
+  sigfillset(&everything);
+  pthread_sigmask(SIG_SETMASK, &everything, &before);
+  pthread_t handle;
+  if (REAL(pthread_create)(&handle, nullptr, serve, nullptr) == 0) REAL(pthread_detach)(handle);
+  pthread_sigmask(SIG_SETMASK, &before, nullptr);
+}
+
+void tell_outside(Thread &thread, const std::string &what) {
+  static auto *told = new std::set<std::string>;
+  if (!told->insert(what).second) return;
+  report("thread " + std::to_string(thread.number) + " blocks outside of the simulation, in " + what +
+         ": what comes from there, and when, is not determined");
+}
+
+Outside::Outside(Thread &thread, const char *what) : thread_(thread) {
+  thread_.open.store(false);
+  tell_outside(thread, what);
+  leave(thread_, what);
+}
+
+Outside::~Outside() {
+  const int error = errno;
+  come_back(thread_);
+  thread_.open.store(true);
+  errno = error;
+}
+
+Asking::Asking() : open_(self != nullptr && self->open.exchange(false)) {}
+
+Asking::~Asking() {
+  if (open_) self->open.store(true);
+}
+
+}  // namespace rsltrace
+
+using namespace rsltrace;
+
+RSLTRACE_EXPORT pid_t waitpid(pid_t pid, int *status, int options) {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(waitpid)(pid, status, options);
+  const pid_t ended = REAL(waitpid)(pid, status, options | WNOHANG);
+  if (ended != 0) return ended;
+  if ((options & WNOHANG) != 0) {
+    look(*thread, 100);
+    return 0;
+  }
+  Outside outside(*thread, "waitpid");
+  return REAL(waitpid)(pid, status, options);
+}
+
+RSLTRACE_EXPORT pid_t wait(int *status) { return waitpid(-1, status, 0); }
+
+RSLTRACE_EXPORT pid_t wait4(pid_t pid, int *status, int options, rusage *usage) noexcept {
+  Thread *thread = me();
+  if (thread == nullptr || (options & WNOHANG) != 0) return REAL(wait4)(pid, status, options, usage);
+  Outside outside(*thread, "wait4");
+  return REAL(wait4)(pid, status, options, usage);
+}
+
+RSLTRACE_EXPORT int waitid(idtype_t type, id_t id, siginfo_t *information, int options) {
+  Thread *thread = me();
+  if (thread == nullptr || (options & WNOHANG) != 0) return REAL(waitid)(type, id, information, options);
+  Outside outside(*thread, "waitid");
+  return REAL(waitid)(type, id, information, options);
+}
+
+RSLTRACE_EXPORT int system(const char *command) {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(system)(command);
+  Outside outside(*thread, "system");
+  return REAL(system)(command);
+}
+
+RSLTRACE_EXPORT int pclose(FILE *stream) {
+  Thread *thread = me();
+  if (thread == nullptr) return REAL(pclose)(stream);
+  Outside outside(*thread, "pclose");
+  return REAL(pclose)(stream);
+}
