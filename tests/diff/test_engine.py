@@ -322,7 +322,7 @@ def test_a_trace_is_not_identical_to_its_own_beginning(tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     data = (tmp_path / "a.mcap").read_bytes()
     verdicts = set()
-    for size in range(len(data) - 1, 2000, -len(data) // 40):
+    for size in range(len(data) - 1, 3000, -len(data) // 40):  # its job is before that
         (tmp_path / "b.mcap").write_bytes(data[:size])
         for a, b in (("a", "b"), ("b", "a"), ("b", "b")):
             diff = rsltrace.diff(tmp_path / f"{a}.mcap", tmp_path / f"{b}.mcap")
