@@ -237,7 +237,7 @@ class ActionReader(Evaluation):
     def _push_namespace(self, element: Element) -> None:
         element.check(["namespace"])
         own = self.needed(element, "namespace")
-        self.scope.namespace = joined_namespace(self.scope.namespace, own)
+        self.scope.namespace = joined_namespace(self.scope.namespace, own) or "/"
 
     def _set_parameter(self, element: Element) -> None:
         element.check(["name", "value", "type"])

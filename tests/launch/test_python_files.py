@@ -173,7 +173,8 @@ inner = PythonLaunchDescriptionSource([ThisLaunchFileDir(), '/sub/inner.launch.p
 outer = launch.launch_description_sources.AnyLaunchDescriptionSource(
     PathJoinSubstitution([ThisLaunchFileDir(), 'sub', 'outer.launch.xml']))
 a = GroupAction([
-    launch_ros.actions.PushRosNamespace('n'), launch_ros.actions.SetRemap('a', 'b'),
+    launch_ros.actions.PushRosNamespace(''), launch_ros.actions.PushRosNamespace('n'),
+    launch_ros.actions.SetRemap('a', 'b'),
     SetParameter('p', LaunchConfiguration('v', default='1')),
     IncludeLaunchDescription(inner, launch_arguments={'who': 'one'}.items())])
 b = IncludeLaunchDescription(outer, launch_arguments=[('who', 'two')],

@@ -201,7 +201,7 @@ class PushRosNamespace(Action):
     def execute(self, context: LaunchContext) -> None:
         """Go into the namespace."""
         scope = context.evaluation.scope
-        scope.namespace = joined_namespace(scope.namespace, context.text(self._namespace))
+        scope.namespace = joined_namespace(scope.namespace, context.text(self._namespace)) or "/"
 
 
 class SetParameter(Action):
