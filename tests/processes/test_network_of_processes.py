@@ -27,8 +27,14 @@ MAIN = """
 import sys
 import nodes, rclpy
 
+from rclpy.executors import ExternalShutdownException
+
 rclpy.init()
-rclpy.spin(getattr(nodes, sys.argv[1])())
+node = getattr(nodes, sys.argv[1])()
+try:
+    rclpy.spin(node)
+except (KeyboardInterrupt, ExternalShutdownException):
+    print('final state', getattr(node, 'state', 0), flush=True)
 """
 SETTINGS = """
 construct_time: 0s
@@ -96,7 +102,7 @@ def test_c_programs_run_the_network_as_python_nodes_do(
 
 @pytest.mark.long
 def test_python_processes_run_the_network_as_nodes_of_this_process_do(
-    in_one_process: Path, compiled: object, tmp_path: Path
+    in_one_process: Path, compiled: object, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "main.py").write_text(MAIN)
     names = ("NodeA", "NodeB", "NodeC", "NodeD", "Monitor")
@@ -106,3 +112,5 @@ def test_python_processes_run_the_network_as_nodes_of_this_process_do(
     path = _record(tmp_path, "python", entries)
     assert _callbacks(path) == _callbacks(in_one_process)
     assert _messages(path) == _messages(in_one_process)
+    states = [int(line.split()[-1]) for line in capfd.readouterr().out.splitlines()]
+    assert states == [*FINAL_STATES, 0]

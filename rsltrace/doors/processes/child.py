@@ -22,7 +22,6 @@ _LOOK_S = 0.2
 _GRACE_S = 2.0
 _NO_RANDOM_ADDRESSES = 0x0040000
 _PRESENT = 0xFFFFFFFF
-_USUAL_THREADS = 4
 _LOST_LINK = 120  # of native/link.cpp
 
 
@@ -127,10 +126,6 @@ class Child:
         whole = b"".join(parts)
         self._there = whole[size:]
         return memoryview(whole)[_HEAD_SIZE:size]
-
-    def has_threads(self) -> bool:
-        """Return whether it has threads beside the first, the library's and the two of LTTng."""
-        return len(list(Path(f"/proc/{self.pid}/task").iterdir())) > _USUAL_THREADS
 
     def give_up_after(self, seconds: float) -> None:
         """Kill the process if it says nothing for so long (real time)."""

@@ -312,10 +312,9 @@ class Process:
         """Tell it as whoever starts nodes does that the run is over (Ctrl-C), and end it once it
         waits again."""
         self._is_stopping = True
-        if not self.child.has_threads():  # theirs, which handle signals, would race with the end
-            self.child.give_up_after(_GRACE_S)
-            self.child.send(RECORD.pack(0, Told.STOP))
-            self._converse()
+        self.child.give_up_after(_GRACE_S)
+        self.child.send(RECORD.pack(0, Told.STOP))
+        self._converse()
         if self.ended is None:
             self.child.dismiss()
             self.vanish()
