@@ -12,11 +12,14 @@ import re
 import subprocess
 import sys
 from collections.abc import Mapping
+from contextlib import redirect_stderr, suppress
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from rsltrace.errors import JobError, SetupError
+from rsltrace.terminal import tell
 from rsltrace.workspace.cache import cached_folder, key_of
 from rsltrace.workspace.packages import SourcePackage
 
@@ -118,7 +121,7 @@ def _versions() -> str:
     return " ".join(found)
 
 
-def _make(order: Mapping[str, object], into: Path) -> None:
+def _make(order: Mapping[str, Any], into: Path) -> None:
     missing = [name for name in _NEEDED if find_spec(name) is None]
     templates = _templates()
     if missing or templates is None:
@@ -127,6 +130,7 @@ def _make(order: Mapping[str, object], into: Path) -> None:
             f"ROS's rosidl ({', '.join(missing) or 'rosidl_generator_py'} cannot be found): "
             "pip install ros-jazzy-common-interfaces, or source a ROS 2 that has rosidl"
         )
+    _say_what_takes_long(order)
     done = subprocess.run(
         [sys.executable, "-c", _RUN, json.dumps(sys.path)],
         input=json.dumps({**order, "into": str(into), "templates": str(templates)}),
@@ -136,6 +140,15 @@ def _make(order: Mapping[str, object], into: Path) -> None:
     )
     if done.returncode:
         raise _failure(order, done.stderr)
+
+
+def _say_what_takes_long(order: Mapping[str, Any]) -> None:
+    """Say what is being made, past what a node may have put in the place of ``sys.stderr``."""
+    with suppress(OSError, ValueError), redirect_stderr(sys.__stderr__):
+        tell(
+            f"rsltrace: note: making Python classes of the interfaces of {order['package']} "
+            f"(interface files: {len(order['files'])}), which takes a while, once"
+        )
 
 
 def _failure(order: Mapping[str, object], said: str) -> JobError | SetupError:

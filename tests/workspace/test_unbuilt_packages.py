@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import sys
@@ -155,7 +156,12 @@ def test_nothing_of_it_is_left_behind(runs: tuple[Path, list[Any]]) -> None:
     assert not [f for f in sys.meta_path if type(f).__module__.startswith("rsltrace.workspace")]
 
 
-def test_classes_and_hashes_are_those_that_a_build_makes(tmp_path: Path, caches: Path) -> None:
+def test_classes_and_hashes_are_those_that_a_build_makes(
+    tmp_path: Path,
+    caches: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     share = Path(sys.prefix, "share", "std_srvs")
     if not (share / "srv" / "SetBool.json").is_file():
         pytest.skip("needs the definitions of std_srvs")
@@ -163,7 +169,12 @@ def test_classes_and_hashes_are_those_that_a_build_makes(tmp_path: Path, caches:
     (tmp_path / "srv").mkdir()
     (tmp_path / "srv" / "SetBool.srv").write_bytes((share / "srv" / "SetBool.srv").read_bytes())
     packages = source_packages([tmp_path])
+    of_node = io.StringIO()  # what a node prints is the same in the first run and the next
+    monkeypatch.setattr(sys, "stderr", of_node)
     made = interface_prefix(packages["std_srvs"], packages)
+    assert "the interfaces of std_srvs (interface files: 1)" in capfd.readouterr().err
+    assert made == interface_prefix(packages["std_srvs"], packages)
+    assert (capfd.readouterr().err, of_node.getvalue()) == ("", "")
     (site,) = import_module("std_srvs").__path__
     for ours, built in (
         (made / "site-packages/std_srvs/srv/_set_bool.py", Path(site, "srv", "_set_bool.py")),
