@@ -183,3 +183,28 @@ def test_a_main_that_raises_in_one_run_is_no_early_end(tmp_path: Path) -> None:
         run(job, tmp_path / name)
     diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
     assert diff.verdict is Verdict.EXCEPTION, diff.sentence
+
+
+@pytest.mark.parametrize("kept", ["a", "b"])
+def test_a_run_that_ended_since_its_last_timer_is_gone_tells_the_timer(
+    tmp_path: Path, kept: str
+) -> None:
+    class Ending(Talker):
+        def tick(self) -> None:
+            super().tick()
+            if self.count == 3 and gone:
+                self.destroy_timer(next(self.timers))
+
+    for name in ("a", "b"):
+        gone = name != kept
+        job = rsltrace.Job(
+            nodes=[rsltrace.NodeSpec(node=Ending, arguments={"name": "ending", "period_s": 0.1})],
+            stop=rsltrace.StopSpec(duration="1s"),
+        )
+        run(job, tmp_path / f"{name}.mcap")
+    diff = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    assert diff.verdict is (Verdict.ENDED_EARLY if kept == "a" else Verdict.RAN_LONGER)
+    why = diff.divergences[0].root_sentence
+    assert "nothing left to do: timer " in why, why
+    assert f"Ending.tick of /ending at 0.4 s happened only in {kept}; " in why, why
+    assert why.endswith("/ending is not deterministic"), why

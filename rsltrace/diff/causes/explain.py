@@ -103,6 +103,17 @@ class Explainer:
         )
         return self._with_context(bare, index, index)
 
+    def alone(self, index: int, *, of_b: bool) -> Judgement | None:
+        """Return the verdict on an event that the other run, which is over, does not have; None if
+        its own run is over there, too."""
+        view = self.view(index, of_b=of_b)
+        if view is None or view.kind is EventKind.SHUTDOWN:
+            return None
+        item = EventPair(-1 if of_b else index, index if of_b else -1, same=False)
+        origin = Origin(item, root=0, why=None, previous=None)
+        found = FoundDivergence(origin, view.stamp_ns, item.a, item.b)
+        return self._judge(found, *self._differing(found))
+
     def view(self, index: int, *, of_b: bool) -> EventView | None:
         """Return an event of one of the runs, or None if it has none of that index."""
         run, viewer = (self.run_b, self._viewer_b) if of_b else (self.run_a, self._viewer_a)

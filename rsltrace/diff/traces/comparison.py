@@ -31,7 +31,13 @@ from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.counts import EventCounts
-from rsltrace.diff.traces.ended_runs import failure_text, failures, judge_end, who_ended
+from rsltrace.diff.traces.ended_runs import (
+    failure_text,
+    failures,
+    had_nothing_left,
+    judge_end,
+    who_ended,
+)
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.errors import TraceError, did_you_mean
@@ -141,8 +147,10 @@ class _Comparison:
 
     def _ended(self, over: Trace) -> Divergence:
         explainer = self._explainer([])
-        view = explainer.view(self._start, of_b=over is self._a)
-        judgement = judge_end(self._a, self._b, over, view, self._job)
+        of_b = over is self._a
+        view = explainer.view(self._start, of_b=of_b)
+        alone = explainer.alone(self._start, of_b=of_b) if had_nothing_left(over) else None
+        judgement = judge_end(self._a, self._b, over, view, self._job, alone)
         return explainer.ended(self._start, judgement)
 
     def _aligned(self) -> list[Divergence]:

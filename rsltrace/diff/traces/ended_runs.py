@@ -50,13 +50,18 @@ def _why_ended(over: Trace, name: str, job: Sequence[Setting]) -> str:
         how = f"{name} failed (exit code {exit_code(over)}): {how}"
     elif exit_code(over):
         how = f"{name} ended with exit code {exit_code(over)} ({stop_reason(over)})"
-    elif stop_reason(over) == NOTHING_LEFT:
+    elif had_nothing_left(over):
         how = f"{name} had nothing left to do"
     else:
         how = f"{name} ended because of this: {stop_reason(over)}"
     others = [s for s in job if s.key.partition(".")[0] not in ("stop", "record", "livelock_limit")]
     because = because_of(others)
     return f"both do the same until then; {how}{f'; {because}' if because else ''}"
+
+
+def had_nothing_left(trace: Trace) -> bool:
+    """Whether a run ended since no timer, wait or message was left in it."""
+    return trace.complete and not exit_code(trace) and stop_reason(trace) == NOTHING_LEFT
 
 
 def exit_code(trace: Trace) -> int:
@@ -123,10 +128,16 @@ def _is_over(trace: Trace, other: Trace, start: int) -> bool:
 
 
 def judge_end(
-    a: Trace, b: Trace, over: Trace, view_a: EventView | None, job: Sequence[Setting]
+    a: Trace,
+    b: Trace,
+    over: Trace,
+    view_a: EventView | None,
+    job: Sequence[Setting],
+    alone: Judgement | None = None,
 ) -> Judgement:
     """Put it in words. ``view_a`` is the event that only the other run has, or None; ``job`` is
-    what differs in the jobs."""
+    what differs in the jobs; ``alone`` says why that event is missing in a run that had nothing
+    left to do."""
     verdict = Verdict.ENDED_EARLY if over is b else Verdict.RAN_LONGER
     name, other_name, other = ("b", "a", a) if over is b else ("a", "b", b)
     where = f" {at_time(over.end_ns)}" if over.event_count else ""
@@ -145,6 +156,9 @@ def judge_end(
         root = Root.JOB
         differs = "; ".join(f"{s.key}: {s.a or '-'} in a, {s.b or '-'} in b" for s in told)
         why = f"both do the same as long as they last, and their jobs differ in {differs}"
+    elif alone is not None:
+        told = list(alone.settings)
+        why = f"{name} had nothing left to do: {alone.sentence}; {alone.root_sentence}"
     else:
         why = _why_ended(over, name, job)
     a_view, b_view = (view_a, None) if over is b else (None, view_a)

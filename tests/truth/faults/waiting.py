@@ -62,7 +62,8 @@ def new_publisher(rng: random.Random, world: World) -> Change:
 @behaviour("destroyed timer")
 def destroyed_timer(rng: random.Random, world: World) -> Change:
     node = one_of(rng, world, "source")
-    truth = Truth((*OUTPUT, "missing"), node.full_name, says=(r"timer",), independent=None)
+    verdicts = (*OUTPUT, "missing", "ended-early")
+    truth = Truth(verdicts, node.full_name, says=(r"timer",), independent=None)
     lines = ["self.destroy_timer(self.timer)"]
     return Change(node, lines, truth, "# after", rng.randint(1, 6))
 
