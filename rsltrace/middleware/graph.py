@@ -21,11 +21,13 @@ EndT = TypeVar("EndT", bound=DomainEntity)
 
 
 class Graph:
-    """The nodes and endpoints of one world. ``joined`` are called with each new node and server."""
+    """The nodes and endpoints of one world. ``joined`` are called with each new node and server,
+    ``changed`` after whatever has joined or left."""
 
     def __init__(self) -> None:
         self.nodes: list[Participant] = []
         self.joined: list[Callable[[DomainEntity], None]] = []
+        self.changed: list[Callable[[], None]] = []
         self._named: dict[str, list[Participant]] = {}
         self._publishers: dict[str, list[Publisher]] = {}
         self._subscriptions: dict[str, list[Subscription]] = {}
@@ -76,6 +78,7 @@ class Graph:
         publisher.graph = self
         for subscription in self.subscriptions(publisher.topic):
             self._connect(publisher, subscription)
+        self._has_changed()
 
     def add_subscription(self, subscription: Subscription) -> None:
         """Connect a new subscription; it gets what transient-local publishers kept for it."""
@@ -84,11 +87,13 @@ class Graph:
         subscription.graph = self
         for publisher in self.publishers(subscription.topic):
             self._connect(publisher, subscription)
+        self._has_changed()
 
     def add_client(self, client: Client) -> None:
         """Make a client known."""
         self._clients.setdefault(client.service, []).append(client)
         client.graph = self
+        self._has_changed()
 
     def add_service(self, service: Service) -> None:
         """Make a server known."""
@@ -99,6 +104,11 @@ class Graph:
     def _tell_of(self, member: DomainEntity) -> None:
         for listener in self.joined:
             listener(member)
+        self._has_changed()
+
+    def _has_changed(self) -> None:
+        for listener in self.changed:
+            listener()
 
     def remove(self, member: DomainEntity) -> None:
         """Forget a member, and disconnect it from its peers."""
@@ -122,6 +132,7 @@ class Graph:
         elif isinstance(member, Participant):
             self.nodes.remove(member)
             self._named[member.fully_qualified_name].remove(member)
+        self._has_changed()
 
     def settled_request(self, topic: str, requested: Qos) -> Qos:
         """Return what a new subscription's QoS comes to, given the publishers that are there."""

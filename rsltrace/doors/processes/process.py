@@ -19,6 +19,7 @@ from rsltrace.doors.processes.endpoints import (
 )
 from rsltrace.doors.processes.wire import (
     GO,
+    GRAPH_ID,
     HEAD,
     NEVER_NS,
     RECORD,
@@ -105,6 +106,8 @@ class Process:
         self._waking_soon = False
         self._last: Endpoint | ProcessTimer | None = None
         self._is_stopping = False
+        self._graph = GraphChange(self)
+        door.domain.graph.changed.append(self._graph.note)
         self._questions: dict[int, Question] = {
             Say.HELLO: self._hello,
             Say.TAKE: self._take,
@@ -157,6 +160,11 @@ class Process:
         self.child = child()
         self._converse()
 
+    @property
+    def waits_for_graph(self) -> bool:
+        """Whether one of its threads waits for a change of the graph now."""
+        return GRAPH_ID in self._wanted
+
     def wants(self, thing: Endpoint | ProcessTimer) -> bool:
         """Return whether one of its threads waits for a thing now."""
         return thing.number in self._wanted
@@ -174,6 +182,10 @@ class Process:
     def wake(self, thread: int) -> None:
         """Let a thread go on whose time has come."""
         self._go(thread, Ready.TIMEOUT, 0, b"")
+
+    def see_graph(self) -> None:
+        """Let those threads go on that wait for a change of the graph."""
+        self._go(self._wanted[GRAPH_ID], Ready.GRAPH, GRAPH_ID, b"")
 
     def was_no_callback(self) -> None:
         """Say that the event under way is no callback's: an executor's own timer was due."""
@@ -264,6 +276,7 @@ class Process:
             }
         if self._held:
             self._release()
+        self._graph.look()
 
     def _wake_at(self, thread: int, deadline_ns: int, *, asleep: bool) -> None:
         waking = self._waking.get(thread)
@@ -496,3 +509,38 @@ class WakingTimer:
     def describe(self) -> str:
         """Name it for people."""
         return f"{self._process.name}: the end of a wait"
+
+
+class GraphChange:
+    """Wakes a process that waits for the graph to change; what changes before it waits, counts."""
+
+    def __init__(self, process: Process) -> None:
+        self._process = process
+        self._is_due = False
+        self._is_queued = False
+
+    def note(self) -> None:
+        """The graph has changed."""
+        self._is_due = True
+        self.look()
+
+    def look(self) -> None:
+        """Wake the process if it waits for a change that there was."""
+        if self._is_due and not self._is_queued and self._process.waits_for_graph:
+            self._is_queued = True
+            self._process.dispatcher.loop.ready.append(self)
+
+    def dispatch(self) -> None:
+        """Let the process go on, as an event, if it still waits."""
+        self._is_queued = False
+        process = self._process
+        if not process.waits_for_graph:
+            return
+        self._is_due = False
+        process.dispatcher.execute(
+            self, process.entity_id, None, _RESUME, process.see_graph, (), NO_EVENT, 0, 0
+        )
+
+    def describe(self) -> str:
+        """Name it for people."""
+        return f"{self._process.name}: a change of the graph"

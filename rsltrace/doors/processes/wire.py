@@ -18,6 +18,8 @@ from rsltrace.middleware.qos.policies import (
 
 GID_BYTES = 16
 NEVER_NS = 2**63 - 1
+GRAPH_ID = 2**32 - 1
+"""Stands for changes of the graph among the numbers that a process waits for."""
 
 HEAD = struct.Struct("<I")
 RECORD = struct.Struct("<II")
@@ -71,6 +73,7 @@ class Ready(IntEnum):
     TIMEOUT = 0
     ENTITY = 1
     TIMER = 2
+    GRAPH = 4
 
 
 class Fields:

@@ -26,7 +26,9 @@ rmw_guard_condition_t *graph_condition(std::uint32_t node) {
   if (found == nullptr) {
     found = new rmw_guard_condition_t{};
     found->implementation_identifier = IDENTIFIER;
-    found->data = new GuardCondition;
+    auto *condition = new GuardCondition;
+    condition->is_of_graph = true;
+    found->data = condition;
   }
   return found;
 }
@@ -40,7 +42,14 @@ void forget_graph_condition(std::uint32_t node) {
 }
 
 void graph_has_changed() {
-  for (auto &[node, handle] : graph_conditions()) trigger(guard_condition(handle));
+  for (auto &[node, handle] : graph_conditions()) {
+    GuardCondition &condition = guard_condition(handle);
+    condition.is_triggered = true;
+    for (Waiter *waiter : condition.waiters) {
+      waiter->woken = true;
+      waiter->ready = {Wake::GRAPH, GRAPH_ID};
+    }
+  }
 }
 
 }  // namespace rsltrace

@@ -1,4 +1,4 @@
-// Guard conditions: the process wakes itself with them, so the loop does not hear of most of them.
+// Guard conditions: the process wakes itself with them, so the loop hears of those of the graph only.
 #pragma once
 
 #include <rmw/types.h>
@@ -11,6 +11,7 @@ namespace rsltrace {
 
 struct GuardCondition {
   bool is_triggered = false;
+  bool is_of_graph = false;
   std::vector<Waiter *> waiters;  // threads that wait for it
 };
 
@@ -23,7 +24,7 @@ void trigger(GuardCondition &condition);
 // The condition of a node that is triggered when the graph has changed.
 rmw_guard_condition_t *graph_condition(std::uint32_t node);
 void forget_graph_condition(std::uint32_t node);
-// The graph has changed since this process ran last.
+// The graph has changed since they were triggered last: whoever waits for them is to be woken.
 void graph_has_changed();
 
 }  // namespace rsltrace

@@ -17,6 +17,7 @@
 #include <algorithm>
 
 #include "endpoints.h"
+#include "guard_conditions.h"
 #include "threads.h"
 
 namespace rsltrace {
@@ -245,6 +246,7 @@ void idle(Waiter *const *waiters, std::size_t count, bool outside) {
   ready.id = reader.number<std::uint32_t>();
   if (ready.kind == Wake::ENTITY) deliver(ready.id, reader);
   if (ready.kind == Wake::TIMER) timer_may_run(ready.id);
+  if (ready.kind == Wake::GRAPH) graph_has_changed();
   for (std::size_t i = 0; i < count; i++) {
     if (waiters[i]->thread == thread) {
       waiters[i]->woken = true;

@@ -15,7 +15,10 @@ namespace rsltrace {
 
 constexpr std::int64_t NEVER_NS = INT64_MAX;
 
-enum class Wake : std::uint32_t { TIMEOUT = 0, ENTITY = 1, TIMER = 2, STOP = 3 };
+enum class Wake : std::uint32_t { TIMEOUT = 0, ENTITY = 1, TIMER = 2, STOP = 3, GRAPH = 4 };
+
+// What stands for all graph conditions among the numbers that are waited for.
+constexpr std::uint32_t GRAPH_ID = UINT32_MAX;
 
 struct Ready {
   Wake kind = Wake::TIMEOUT;

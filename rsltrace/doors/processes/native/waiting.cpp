@@ -20,6 +20,9 @@ const WaitSet &numbered(const Wanted &wanted) {
   ids.clear();
   for (const auto &one : wanted.receivers) ids.push_back(one.endpoint->id);
   ids.insert(ids.end(), wanted.timers.begin(), wanted.timers.end());
+  const auto of_graph = [](const auto &one) { return one.condition->is_of_graph; };
+  if (std::any_of(wanted.conditions.begin(), wanted.conditions.end(), of_graph))
+    ids.push_back(GRAPH_ID);
   if (last.set == 0 || ids != last.ids) {
     last.set = ++count;
     last.ids = ids;
