@@ -5,10 +5,13 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
+
+from rsltrace.errors import SetupError
 
 
 def key_of(parts: Iterable[str | bytes]) -> str:
@@ -24,11 +27,19 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     """Return the folder ``kind/name`` of the cache; if it is not there, ``make`` fills it.
 
     Runs that are made at the same time may both fill one: the first to be ready counts.
+
+    :raises SetupError: if others can write there: what is in it may be run.
     """
     place = _root() / kind / name
+    for folder in (place.parent, place):
+        if folder.is_dir() and not _is_ours(folder):
+            raise SetupError(
+                f"others can change what is in {folder}: remove it, or name another folder for "
+                "caches in XDG_CACHE_HOME"
+            )
     if place.is_dir():
         return place
-    place.parent.mkdir(parents=True, exist_ok=True)
+    place.parent.mkdir(0o755, parents=True, exist_ok=True)
     made = Path(tempfile.mkdtemp(dir=place.parent, prefix=".new-"))
     try:
         make(made)
@@ -48,14 +59,23 @@ def lasting(path: str) -> str:
     return os.path.realpath(path) if Path(path).is_relative_to(_root()) else path
 
 
+def _is_ours(folder: Path) -> bool:
+    """Return whether nobody but this user and root can put something into a folder."""
+    found = folder.stat()
+    return found.st_uid in (os.geteuid(), 0) and not found.st_mode & stat.S_IWOTH
+
+
 @cache
 def _root() -> Path:
-    """Return the user's folder for caches, or one for this process if that cannot be written."""
+    """Return the user's folder for caches, or one for this process if that cannot be written, or
+    not by this user alone."""
     folder = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(folder) if os.path.isabs(folder) else Path("~/.cache").expanduser()
     try:
-        (root / "rsltrace").mkdir(parents=True, exist_ok=True)
+        (root / "rsltrace").mkdir(0o755, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=root / "rsltrace").close()
+        if not _is_ours(root / "rsltrace"):
+            raise PermissionError
     except (OSError, RuntimeError):
         import atexit
 

@@ -162,6 +162,14 @@ def test_a_link_delays_what_goes_to_a_process(counter: Path, tmp_path: Path) -> 
     [
         ("crash", "was killed by SIGSEGV at 0.500000000 s"),
         pytest.param("exit", "ended with exit status 7 at 0.500000000 s", marks=long),
+        (
+            "write",
+            "wrote something of its own to the descriptor by which rsltrace runs it at "
+            "0.500000000 s",
+        ),
+        pytest.param(
+            "exec", "closed the descriptor by which rsltrace runs it at 0.500000000 s", marks=long
+        ),
         pytest.param(
             "close", "closed the descriptor by which rsltrace runs it at 0.500000000 s", marks=long
         ),

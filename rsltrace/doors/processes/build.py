@@ -21,6 +21,7 @@ from rsltrace.workspace.cache import cached_folder, key_of
 SOURCES = Path(__file__).parent / "native"
 _NAME = "librmw_rsltrace.so"
 _STUB = "libpython_symbols.so"
+_DIGEST = "digest"
 _HEADERS = ("rmw/rmw/rmw.h", "rcl/rcl/rcl.h", "fastcdr/Cdr.h")
 _LIBRARIES = ("rmw", "rcutils", "fastcdr", "rosidl_runtime_c")
 _PACKAGES = "rmw, rcl and rmw-fastrtps-cpp"
@@ -131,9 +132,26 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
         )
         stub = str(SOURCES / "python_symbols" / "symbols.cpp")
         _compile([*compiler, *_options(), stub, "-o", str(folder / _STUB)])
+        (folder / _DIGEST).write_text(_digest(folder))
 
     folder = cached_folder("processes", name, make)
+    if not _is_whole(folder):
+        shutil.rmtree(folder, ignore_errors=True)
+        folder = cached_folder("processes", name, make)
     return Library(folder / _NAME, folder / _STUB, ros)
+
+
+def _digest(folder: Path) -> str:
+    return key_of((folder / name).read_bytes() for name in (_NAME, _STUB))
+
+
+def _is_whole(folder: Path) -> bool:
+    """Return whether a folder of the cache has what was built: the dynamic linker leaves out a
+    library that is cut off, and the process would run outside of the run."""
+    try:
+        return (folder / _DIGEST).read_text() == _digest(folder)
+    except OSError:
+        return False
 
 
 def _options() -> list[str]:

@@ -27,21 +27,24 @@ _LOST_LINK = 120  # of native/link.cpp
 
 @dataclass(frozen=True, slots=True)
 class Ended:
-    """How a process ended: its exit status (negative: the signal that killed it), in words."""
+    """How a process ended: its exit status (negative: the signal that killed it), in words.
+
+    ``broken_link`` says what it has done to the link, if that is why it was ended.
+    """
 
     status: int
-    closed_link: bool = False
+    broken_link: str = ""
 
     @property
     def failed(self) -> bool:
         """Whether that was no orderly end."""
-        return self.status != 0 or self.closed_link
+        return self.status != 0 or self.broken_link != ""
 
     @property
     def said(self) -> str:
         """What happened, as the end of a sentence."""
-        if self.closed_link:
-            return "closed the descriptor by which rsltrace runs it"
+        if self.broken_link:
+            return f"{self.broken_link} the descriptor by which rsltrace runs it"
         if self.status >= 0:
             return f"ended with exit status {self.status}"
         with suppress(ValueError):
@@ -103,6 +106,8 @@ class Child:
         there, self._there = self._there, b""
         if not there:
             count = self._read_into(self._room)
+            if not count:
+                return None
             if count >= _HEAD_SIZE:
                 size: int = HEAD.unpack_from(self._room)[0]
                 if count == _HEAD_SIZE + size:  # nearly always
@@ -153,10 +158,10 @@ class Child:
         """Wait for the end of a process that says no more; one that lives on is killed."""
         try:
             status = self._process.wait(_GRACE_S)
-            return Ended(status, closed_link=status == _LOST_LINK)
+            return Ended(status, "closed" if status == _LOST_LINK else "")
         except subprocess.TimeoutExpired:
             self.kill()
-            return Ended(self._process.returncode, closed_link=True)
+            return Ended(self._process.returncode, "closed")
 
     def dismiss(self) -> None:
         """End the process: it is told to, and killed if it does not."""

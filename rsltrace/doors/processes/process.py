@@ -27,6 +27,7 @@ from rsltrace.doors.processes.wire import (
     Ready,
     Say,
     Told,
+    WireError,
     gid_of,
     packed_qos,
 )
@@ -55,6 +56,8 @@ _HELLO = struct.Struct("<qQ")
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(Say.PUBLISH), int(Say.WAIT)
 _number = HEAD.unpack_from
+_NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, struct.error)
+"""What reading raises if something else than the library has written to the link."""
 
 Question = Callable[[Fields], bytes]
 
@@ -209,7 +212,12 @@ class Process:
             if batch is None:
                 self._has_ended()
                 return
-            answer = self._take_batch(batch)
+            try:
+                answer = self._take_batch(batch)
+            except _NOT_A_BATCH:
+                self.child.kill()
+                self._has_ended("wrote something of its own to")
+                return
             if answer is None:
                 return
             if answer:
@@ -301,20 +309,21 @@ class Process:
 
     # -- its end ---------------------------------------------------------------------------------
 
-    def _has_ended(self) -> None:
-        """Take it out of the graph, within the event under way.
+    def _has_ended(self, broken_link: str = "") -> None:
+        """Take it out of the graph, within the event under way; ``broken_link`` as in ``Ended``.
 
         :raises NodeError: if it has failed, and the job does not say to go on.
         """
-        self.ended = self.child.reap()
+        ended = self.child.reap()
+        self.ended = Ended(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.door.has_ended(self)
         if not self.ended.failed or self._is_stopping:
             return
         at = format_seconds(self.dispatcher.loop.now_ns)
         last = "its start" if self._last is None else self._last.describe()
-        ended = f"process {self.name} {self.ended.said} at {at} s"
-        text = f"{ended}; the last that it ran was {last}"
+        happened = f"process {self.name} {self.ended.said} at {at} s"
+        text = f"{happened}; the last that it ran was {last}"
         if self.log_failure:
             self.door.log(40, self.name, text)
         else:

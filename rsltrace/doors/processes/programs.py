@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import struct
 import sys
 from collections.abc import Mapping, Sequence
@@ -31,11 +32,41 @@ def why_not_run(path: Path) -> str:
         if len(head) < _ELF_HEAD.size or head[:6] != own_head[:6] or head[18:20] != own_head[18:20]:
             return "is a program for another machine"
         start, size, count = _ELF_HEAD.unpack(head)
+        if start + size * count > path.stat().st_size:
+            return "is damaged: its headers lie outside of the file"
+        if _has_other_rights(path):
+            return (
+                "runs with other rights than its user's (setuid, setgid or capabilities), so that "
+                "nothing can be put before its middleware"
+            )
         for number in range(count):
             file.seek(start + number * size)
             if file.read(4) == _PT_INTERP:
                 return ""
     return "is linked statically, so that nothing can be put before its middleware"
+
+
+def _has_other_rights(path: Path) -> bool:
+    """Return whether the system gives a program rights that who starts it has not."""
+    found, user = path.stat(), os.geteuid()
+    if found.st_mode & stat.S_ISUID and found.st_uid != user:
+        return True
+    if found.st_mode & stat.S_ISGID and found.st_gid != os.getegid():
+        return True
+    return user != 0 and "security.capability" in os.listxattr(path)
+
+
+def interpreter(path: Path) -> list[str]:
+    """Return the words before the file in the command that a script's ``#!`` line stands for.
+
+    ``env`` is looked through. The list is empty if there is no such line.
+    """
+    with path.open("rb") as file:
+        first = file.readline(256)
+    words = first[2:].decode(errors="replace").split() if first.startswith(b"#!") else []
+    if words and Path(words[0]).name == "env":
+        return [word for word in words[1:] if word != "-S"]
+    return words
 
 
 def is_python(path: Path) -> bool:

@@ -6,7 +6,6 @@ import struct
 from enum import IntEnum
 from typing import Any
 
-from rsltrace.errors import RunError
 from rsltrace.middleware.qos.policies import (
     INFINITE_NS,
     Durability,
@@ -76,10 +75,14 @@ class Ready(IntEnum):
     GRAPH = 4
 
 
+class WireError(Exception):
+    """What a process has sent is none of the library's records."""
+
+
 class Fields:
     """Reads the fields of a record, one after the other.
 
-    :raises RunError: from any of them, if the record is cut off.
+    :raises WireError: from any of them, if the record is cut off.
     """
 
     def __init__(self, data: memoryview) -> None:
@@ -90,7 +93,7 @@ class Fields:
         """Read several numbers."""
         start, self._next = self._next, self._next + layout.size
         if self._next > len(self._data):
-            raise RunError("a process has sent a record that is cut off")
+            raise WireError("a process has sent a record that is cut off")
         return layout.unpack_from(self._data, start)
 
     def number(self) -> int:
@@ -103,7 +106,7 @@ class Fields:
         size = self.number()
         start, self._next = self._next, self._next + size
         if self._next > len(self._data):
-            raise RunError("a process has sent a record that is cut off")
+            raise WireError("a process has sent a record that is cut off")
         return bytes(self._data[start : self._next])
 
     def text(self) -> str:

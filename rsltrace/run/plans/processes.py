@@ -10,7 +10,13 @@ from pathlib import Path
 
 from rsltrace.doors.processes.build import Library, library
 from rsltrace.doors.processes.door import Interfaces, ProcessDoor, Program
-from rsltrace.doors.processes.programs import is_compiled, is_python, program, why_not_run
+from rsltrace.doors.processes.programs import (
+    interpreter,
+    is_compiled,
+    is_python,
+    program,
+    why_not_run,
+)
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.wire.interfaces import (
@@ -23,6 +29,7 @@ from rsltrace.doors.rclpy.world import World
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import Job, NodeSpec
 from rsltrace.middleware.interface import MessageType, ServiceType
+from rsltrace.model.printable import printable
 from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.executables import compiled_file, installed_file
 
@@ -101,15 +108,17 @@ def _executable(path: Path, given: str, where: str) -> list[str]:
         raise JobError(f"{given} cannot be executed: chmod +x it, or build it", where=where)
     if is_compiled(path):
         return _compiled(path, given, where)
-    first = path.open("rb").readline(256)
-    interpreter = (
-        shutil.which(first[2:].split()[-1].decode(errors="replace"))
-        if (first[:2] == b"#!" and first[2:].split())
-        else None
-    )
-    if interpreter is None:
+    words = interpreter(path)
+    if not words:
         raise JobError(f"{given} is neither a compiled program nor a script", where=where)
-    return [interpreter, str(path)]
+    found = shutil.which(words[0]) if "\0" not in words[0] else None
+    if found is None:
+        raise JobError(
+            f"{given} is a script for {printable(words[0])}, which is not there: install it, or "
+            "mend the #! line",
+            where=where,
+        )
+    return [found, *words[1:], str(path)]
 
 
 def _message_type(name: str) -> MessageType:

@@ -138,6 +138,7 @@ __attribute__((constructor(101))) void begin() {
   if (getppid() != parent) return;  // started by a process of the run: outside of it
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
   link_fd = fd;
+  fcntl(fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
   forget_environment();
   pthread_atfork(nullptr, nullptr, forked);
   Writer hello;

@@ -1,0 +1,121 @@
+"""What runs a file as a process, and files that nothing can run so."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rsltrace.doors.processes import build
+from rsltrace.doors.processes.child import Child
+from rsltrace.doors.processes.programs import interpreter, why_not_run
+from rsltrace.errors import SetupError
+from rsltrace.workspace import cache
+
+
+@pytest.fixture
+def caches(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder for caches of this test's own."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    cache._root.cache_clear()
+    yield tmp_path / "rsltrace"
+    cache._root.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("#!/bin/sh -e", ["/bin/sh", "-e"]),
+        ("#! /usr/bin/env ruby", ["ruby"]),
+        ("#!/usr/bin/env -S ruby -w", ["ruby", "-w"]),
+        ("#!", []),
+        ("echo", []),
+        ("", []),
+    ],
+)
+def test_what_runs_a_script(tmp_path: Path, line: str, words: list[str]) -> None:
+    (tmp_path / "script").write_text(f"{line}\n")
+    assert interpreter(tmp_path / "script") == words
+
+
+def _without_headers(file: Path) -> None:
+    data = bytearray(file.read_bytes())
+    data[32:40] = b"\xff" * 8
+    file.write_bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda file: None, "^$"),
+        (lambda file: file.chmod(0o4755), "^$"),
+        (_without_headers, "is damaged"),
+    ],
+)
+def test_why_a_program_is_not_run(
+    tmp_path: Path, change: Callable[[Path], None], reason: str
+) -> None:
+    file = tmp_path / "program"
+    shutil.copy(Path(sys.executable).resolve(), file)
+    change(file)
+    assert re.search(reason, why_not_run(file))
+
+
+def test_a_program_with_the_rights_of_another_user_is_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copy(Path(sys.executable).resolve(), tmp_path / "program")
+    (tmp_path / "program").chmod(0o4755)
+    monkeypatch.setattr("os.geteuid", lambda: 4711)
+    assert "runs with other rights than its user's" in why_not_run(tmp_path / "program")
+
+
+def test_a_process_that_says_nothing_is_given_up() -> None:
+    child = Child(["/bin/sleep", "600"], {}, None, "sleeper")
+    child.give_up_after(0.2)
+    assert child.receive() is None
+    assert child.reap().said == "was killed by SIGKILL"
+
+
+def test_a_library_that_is_cut_off_is_built_anew(
+    caches: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    built = []
+
+    def compile(command: list[str]) -> None:
+        built.append(Path(command[command.index("-o") + 1]).name)
+        Path(command[command.index("-o") + 1]).write_bytes(b"whole")
+
+    pytest.importorskip("rclpy")
+    monkeypatch.setattr(build, "_compile", compile)
+    try:
+        first = build.library(lambda line: None)
+    except SetupError as error:
+        pytest.skip(str(error))
+    assert build.library(lambda line: None) == first
+    assert len(built) == 2
+    first.path.write_bytes(b"who")
+    assert build.library(lambda line: None) == first
+    assert first.path.read_bytes() == b"whole"
+    assert len(built) == 4
+
+
+def test_what_others_can_change_is_not_taken_from_the_cache(caches: Path) -> None:
+    made = cache.cached_folder("things", "a", lambda folder: None)
+    assert cache.cached_folder("things", "a", lambda folder: None) == made
+    for folder in (made, made.parent):
+        folder.chmod(0o777)
+        with pytest.raises(SetupError, match=f"others can change what is in {folder}: remove it"):
+            cache.cached_folder("things", "a", lambda folder: None)
+        folder.chmod(0o755)
+
+
+def test_a_cache_that_others_can_change_is_left_alone(caches: Path) -> None:
+    caches.mkdir(0o755)
+    caches.chmod(0o777)
+    made = cache.cached_folder("things", "a", lambda folder: None)
+    assert caches not in made.parents
