@@ -5,9 +5,11 @@ What they import, print, set and start is none of the run's, nor is it if they e
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import tempfile
@@ -19,6 +21,7 @@ from rsltrace.launch.model import Launched
 from rsltrace.terminal import tell
 
 _OUTPUT_MAX = 1 << 16
+_PR_SET_PDEATHSIG = 1
 _RUN = (
     "import json, sys; order = json.loads(sys.argv.pop()); sys.path[:] = order['path']; "
     "from rsltrace.launch.apart import main; main(order)"
@@ -41,6 +44,7 @@ def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
             "folders": [str(folder) for folder in folders],
             "answer": str(answer),
             "path": sys.path,
+            "reader": os.getpid(),
         }
         with output.open("wb") as stream:
             done = subprocess.run(
@@ -59,17 +63,27 @@ def read_apart(path: Path, arguments: Mapping[str, str], folders: Sequence[Path]
                 f"the launch file ended the process that read it (exit status {done.returncode})",
                 where=str(path),
             )
-        found: Launched | str = pickle.loads(answer.read_bytes())
+        try:
+            found = pickle.loads(answer.read_bytes())
+        except Exception:
+            found = None
+    if isinstance(found, Launched):
+        return found
     if isinstance(found, str):
         raise JobError(found)
-    return found
+    raise JobError(
+        "the launch file has changed Python or rsltrace, so that what it starts cannot be read",
+        where=str(path),
+    )
 
 
 def main(order: Mapping[str, object]) -> None:
     """Do what an order asks, and write the answer: a ``Launched``, or the text of an error."""
+    from rsltrace.launch.api.basics import as_job_error, shown
     from rsltrace.launch.python_file import read_launch_file
     from rsltrace.workspace.imports import unbuilt_packages
 
+    _end_with(int(str(order["reader"])))
     folders = [Path(folder) for folder in order["folders"]]  # type: ignore[attr-defined]
     sys.path[:0] = map(str, folders)
     sys.argv[1:] = []
@@ -77,15 +91,31 @@ def main(order: Mapping[str, object]) -> None:
     try:
         with unbuilt_packages(folders):
             found = read_launch_file(Path(str(order["file"])), order["arguments"])  # type: ignore[arg-type]
-    except JobError as error:
-        found = str(error)
+    except BaseException as error:
+        found = str(as_job_error(error, shown(str(order["file"]))))
     answer = Path(str(order["answer"]))
     ready = answer.with_suffix(".new")
-    ready.write_bytes(pickle.dumps(found))
+    try:
+        data = pickle.dumps(found)
+    except Exception as error:
+        data = pickle.dumps(
+            f"{shown(str(order['file']))}: something that the launch file gives a node is no plain "
+            f"value: {error}"
+        )
+    ready.write_bytes(data)
     ready.rename(answer)
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)  # threads that the launch file has started need not end
+
+
+def _end_with(parent: int) -> None:
+    """Let the system kill this process when the one that wants the answer is gone."""
+    prctl = getattr(ctypes.CDLL(None), "prctl", None)  # Linux
+    if prctl is not None:
+        prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
 
 
 __all__ = ["read_apart"]

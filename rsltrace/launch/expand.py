@@ -72,7 +72,11 @@ def _expand(
         notes += launched.ignored
     if not nodes and not job.bags:
         where = locate(job, ("launch", 0, "file"))
-        raise JobError("the launch file starts nothing that can be simulated", where=where)
+        in_file = where[-1:].isdigit()  # not on the command line, nor made in Python
+        raise JobError(
+            "the launch file starts nothing that can be simulated",
+            where=where if in_file else job.launch[0].file,
+        )
     return Expanded(job.replace(nodes=nodes, launch=()), tuple(notes))
 
 

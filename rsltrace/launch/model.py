@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rsltrace.launch.scope import Parameters
+from rsltrace.model.printable import printable
 
 ENVIRONMENT = (
     "{where}: environment variable {name}: it counts for the launch file only; nodes see the "
@@ -42,7 +43,7 @@ class LaunchedNode:
     def title(self) -> str:
         """How to call it in a message."""
         what = f"{self.package}/{self.executable or self.plugin}"
-        return f"{what} ({self.name})" if self.name else what
+        return printable(f"{what} ({self.name})" if self.name else what)
 
 
 @dataclass(frozen=True, slots=True)

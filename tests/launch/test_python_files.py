@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -285,6 +286,56 @@ return LaunchDescription([])
     read_apart(write_body(write, body), {}, [])
     assert "launch" not in sys.modules
     assert (Path.cwd(), os.environ.get("RSLTRACE_T")) == (tmp_path, None)
+
+
+@pytest.mark.parametrize(
+    ("body", "message"),
+    [
+        ("raise GeneratorExit", f"a.launch.py:{BODY}: GeneratorExit"),
+        (
+            "class E(Exception):\n    def __str__(self): 1 / 0\nraise E",
+            f"a.launch.py:{BODY + 2}: E: (its text could not be made)",
+        ),
+        (
+            "class Q(int): pass\n"
+            "return LaunchDescription([Node(package='a', executable='b', "
+            "parameters=[{'q': Q(4)}])])",
+            "a.launch.py: something that the launch file gives a node is no plain value: ",
+        ),
+        (
+            "import pickle\npickle.dumps = lambda value: b'junk'\nreturn LaunchDescription([])",
+            "a.launch.py: the launch file has changed Python or rsltrace",
+        ),
+    ],
+)
+def test_what_a_launch_file_does_to_its_process_is_no_traceback_of_ours(
+    write: Any, body: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(JobError) as info:
+        read_apart(write_body(write, body), {}, [])
+    assert message in str(info.value)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.long
+def test_a_launch_file_that_hangs_does_not_outlive_who_reads_it(tmp_path: Path) -> None:
+    (tmp_path / "a.launch.py").write_text(
+        "import os, pathlib, time\n"
+        "pathlib.Path('new').write_text(str(os.getpid()))\n"
+        "os.rename('new', 'pid')\n"
+        "time.sleep(1000)\n"
+    )
+    command = [sys.executable, "-m", "rsltrace", "record", "--launch", "a.launch.py"]
+    deadline = time.monotonic() + 100
+    with subprocess.Popen(command, cwd=tmp_path) as started:
+        while not (tmp_path / "pid").exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        started.kill()
+    pid = int((tmp_path / "pid").read_text())
+    while Path(f"/proc/{pid}").exists():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_packages_that_are_not_there(read: Any) -> None:

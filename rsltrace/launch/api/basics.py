@@ -249,7 +249,7 @@ def shown(path: str) -> str:
     return os.path.relpath(path) if below else path
 
 
-def as_job_error(error: Exception, where: str) -> JobError:
+def as_job_error(error: BaseException, where: str) -> JobError:
     """Return what went wrong in a launch file as an error of the job, with file and line.
 
     The line is the last one that is not of rsltrace, Python or a library; else ``where``.
@@ -266,9 +266,14 @@ def as_job_error(error: Exception, where: str) -> JobError:
         if ".launch" in file or file.endswith("_launch.py"):
             where = f"{shown(file)}:{step.tb_lineno}"
         step = step.tb_next
-    if isinstance(error, (SubstitutionFailure, ValueError)) and str(error):
-        return JobError(str(error), where=where)
-    return JobError(f"{type(error).__name__}: {error}", where=where)
+    try:
+        said = str(error)
+    except Exception:
+        said = "(its text could not be made)"
+    if isinstance(error, (SubstitutionFailure, ValueError)) and said:
+        return JobError(said, where=where)
+    name = type(error).__name__
+    return JobError(f"{name}: {said}" if said else name, where=where)
 
 
 __all__ = [
