@@ -119,3 +119,23 @@ def test_a_cache_that_others_can_change_is_left_alone(caches: Path) -> None:
     caches.chmod(0o777)
     made = cache.cached_folder("things", "a", lambda folder: None)
     assert caches not in made.parents
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ('"g++', "is no command: No closing quotation"),
+        ("no-such-compiler -O3", "there is no program 'no-such-compiler'"),
+    ],
+)
+def test_a_compiler_that_is_not_there(
+    monkeypatch: pytest.MonkeyPatch, given: str, message: str
+) -> None:
+    monkeypatch.setenv("CXX", given)
+    with pytest.raises(SetupError, match=message):
+        build.find_compiler()
+
+
+def test_a_compiler_that_fails_and_says_nothing() -> None:
+    with pytest.raises(SetupError, match=r"false cannot build the library[^$]*exit status 1"):
+        build._compile(["/bin/false"])

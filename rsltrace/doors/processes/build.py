@@ -66,12 +66,18 @@ def find_ros() -> Ros:
 def find_compiler() -> list[str]:
     """Return the command of the C++ compiler.
 
-    :raises SetupError: if there is none.
+    :raises SetupError: if there is none, or not the one that is named in ``CXX``.
     """
-    named = shlex.split(os.environ.get("CXX", ""))
+    given = os.environ.get("CXX", "")
+    try:
+        named = shlex.split(given)
+    except ValueError as error:
+        raise SetupError(f"CXX={given!r} is no command: {error}") from error
     for command in (named, ["g++"], ["clang++"]):
         if command and shutil.which(command[0]):
             return command
+        if command and command is named:
+            raise SetupError(f"CXX={given!r}: there is no program {command[0]!r}")
     raise SetupError(
         "processes need a C++ compiler, once, to build the library that they are started with: "
         "install g++ (apt install g++), or name one in CXX"
@@ -170,6 +176,7 @@ def _compile(command: list[str]) -> None:
         lines = [line for line in done.stderr.splitlines() if "error" in line] or (
             done.stderr.splitlines()
         )
+        lines = lines or [f"exit status {done.returncode}"]
         shown = "\n".join(f"  {line}" for line in lines[:_ERROR_LINES])
         raise SetupError(
             f"{command[0]} cannot build the library that processes run with against the headers of "
