@@ -109,4 +109,5 @@ def _check_known(job: Job, index: int, known: Mapping[str, Argument]) -> None:
             f"unknown launch argument {name!r}{of}{did_you_mean(name, known)}\nthere are:{listed}"
         )
         with showing_line(job, loc):
-            raise JobError(wrong, where=where if in_file else spec.file)
+            shown = where if in_file else os.path.relpath(job.resolve(spec.file))
+            raise JobError(wrong, where=shown)

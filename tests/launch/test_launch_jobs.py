@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -94,6 +95,11 @@ def test_record_a_launch_file(rsltrace: Command) -> None:
         "there are:",
         "  word (default 'hi', what to say)",
     ]
+
+    Path("robot/launch").mkdir(parents=True)
+    deeper = shutil.copy("demo.launch.xml", "robot/launch")
+    unknown = rsltrace("check", "--launch", deeper, "wrd:=here")
+    assert unknown.stderr.startswith(f"rsltrace: error: {deeper}: unknown launch argument 'wrd'")
 
 
 def test_print_job_gives_a_job_that_does_the_same(rsltrace: Command, folder: Path) -> None:
