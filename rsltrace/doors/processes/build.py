@@ -115,7 +115,7 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
 
     def make(folder: Path) -> None:
         told(
-            f"building the library that processes run with (once, about ten seconds): "
+            f"building the library that processes run with (once; 15 to 30 seconds): "
             f"{compiler[0]}, {ros.prefix}"
         )
         cpp = [str(path) for path in sources if path.suffix == ".cpp"]
