@@ -190,6 +190,18 @@ def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
     _no_process_of(counter)
 
 
+@long
+def test_a_script_that_another_program_takes_the_place_of_is_named(tmp_path: Path) -> None:
+    """That program, Python here, is none of the run's, and runs as if there were none."""
+    script = tmp_path / "start.sh"
+    script.write_text(f"#!/bin/sh\nexec {sys.executable} -c 'import time; time.sleep(60)'\n")
+    script.chmod(0o755)
+    (tmp_path / "job.yaml").write_text("nodes: [{program: start.sh}]\nstop: {duration: 1s}\n")
+    result = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
+    assert "closed the descriptor by which rsltrace runs it" in str(result.error)
+    assert result.exit_code == 3
+
+
 def test_a_run_goes_on_without_a_process_if_the_job_says_so(counter: Path, tmp_path: Path) -> None:
     job = _job(tmp_path, counter, "'100'", "crash", on_exception="log")
     result = run(job, tmp_path / "t.mcap")

@@ -20,7 +20,7 @@ from rsltrace.workspace.cache import cached_folder, key_of
 
 SOURCES = Path(__file__).parent / "native"
 _NAME = "librmw_rsltrace.so"
-_STUB = "libpython_symbols.so"
+_STUB = "librsltrace_python_symbols.so"
 _DIGEST = "digest"
 _HEADERS = ("rmw/rmw/rmw.h", "rcl/rcl/rcl.h", "fastcdr/Cdr.h")
 _LIBRARIES = ("rmw", "rcutils", "fastcdr", "rosidl_runtime_c")

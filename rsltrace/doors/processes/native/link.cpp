@@ -121,7 +121,9 @@ void forget_environment() {
     const auto end = rest.find(':');
     const std::string name = rest.substr(0, end);
     rest = end == std::string::npos ? "" : rest.substr(end + 1);
-    if (name.find("librmw_rsltrace") == std::string::npos) kept += (kept.empty() ? "" : ":") + name;
+    const std::string file = name.substr(name.rfind('/') + 1);
+    if (file.rfind("librmw_rsltrace", 0) == 0 || file.rfind("librsltrace_", 0) == 0) continue;
+    kept += (kept.empty() ? "" : ":") + name;
   }
   if (kept.empty()) {
     unsetenv("LD_PRELOAD");
