@@ -15,7 +15,7 @@ import os
 import sys
 from _thread import allocate_lock, start_new_thread
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -110,6 +110,8 @@ class Watchdog:
         place = next((f for f in frames if is_user_file(f.f_code.co_filename)), None)
         place = place or next(iter(frames), None)
         where = f", {_place(place)}" if place is not None else ""
+        if process := _process_asked(frames):
+            who, where = f"{process}, in {who},", ""
         _say(
             f"{who} has not come back for {for_s} s of real time; simulated time stands still at "
             f"{format_seconds(domain.loop.now_ns)} s{where}. Ctrl-C ends the run"
@@ -131,6 +133,16 @@ def _frames(frame: FrameType | None) -> Iterator[FrameType]:
 
 def _is_execute(frame: FrameType) -> bool:
     return frame.f_code is Dispatcher.execute.__code__
+
+
+def _process_asked(frames: Iterable[FrameType]) -> str:
+    """Name the process that the run waits for; "" if it waits for none."""
+    door = sys.modules.get("rsltrace.doors.processes.process")  # not loaded: there is none
+    if door is None:
+        return ""
+    asks = door.Process._converse.__code__
+    asked = next((f.f_locals["self"] for f in frames if f.f_code is asks), None)
+    return "" if asked is None else f"process {asked.name} (pid {asked.child.pid})"
 
 
 def _place(frame: FrameType) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from rsltrace.doors.processes.build import find_ros
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.model.event import EventKind
+from rsltrace.run import watchdog
 from rsltrace.run.recording import run
 from rsltrace.trace.reader import Trace
 
@@ -46,6 +48,20 @@ def main():
 
 if __name__ == '__main__':
     main()
+"""
+BUSY = """
+import os
+import rclpy
+
+rclpy.init()
+node = rclpy.create_node('busy')
+
+def look():
+    while not os.path.exists({told!r}):
+        pass
+
+node.create_timer(0.5, look)
+rclpy.spin(node)
 """
 Compiled = Callable[[str], Path]
 
@@ -200,6 +216,28 @@ def test_a_script_that_another_program_takes_the_place_of_is_named(tmp_path: Pat
     result = run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap")
     assert "closed the descriptor by which rsltrace runs it" in str(result.error)
     assert result.exit_code == 3
+
+
+@long
+def test_a_process_that_does_not_come_back_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = tmp_path / "told"
+    (tmp_path / "busy.py").write_text(BUSY.format(told=str(told)))
+    job = "nodes: [{script: busy.py, isolated: true}]\nstop: {duration: 1s}\n"
+    (tmp_path / "job.yaml").write_text(job)
+    notes: list[str] = []
+
+    def say(text: str) -> None:
+        notes.append(text)
+        told.touch()
+
+    monkeypatch.setattr(watchdog, "LOOK_EVERY_S", 0.2)
+    monkeypatch.setattr(watchdog, "_say", say)
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
+    (note,) = (note for note in notes if "/busy" in note)
+    assert re.match(r"process \S*busy\S* \(pid \d+\), in /busy: timer timer 1, has not come", note)
+    assert "stands still at 0.500000000 s. Ctrl-C" in note
 
 
 def test_a_run_goes_on_without_a_process_if_the_job_says_so(counter: Path, tmp_path: Path) -> None:
