@@ -75,6 +75,12 @@ def is_user_file(file: str) -> bool:
     return _kind_of(file) == _USER
 
 
+def is_telling(file: str) -> bool:
+    """Return whether a source file is of the user's code or of what that uses: neither Python's,
+    nor rclpy's, nor ours."""
+    return _kind_of(file) in (_USER, _LIBRARY)
+
+
 def is_of_python(frame: FrameType) -> bool:
     """Return whether a frame is one of Python's own modules (or of the guard)."""
     file = frame.f_code.co_filename

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 import signal
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from tests.attack.model import Case, Command, Complaint, Limits, Ran, Wrong
@@ -28,7 +29,12 @@ _RAW = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
 """Control characters other than tab and newline, and what turns the direction of text around."""
 
 _TRACEBACK = "Traceback (most recent call last)"
-_OURS = re.compile(r'^\s*File "[^"\n]*/(?:rsltrace|rsltrace_viewer)/[^"\n]*\.py"', re.MULTILINE)
+_PACKAGES = "|".join(
+    re.escape(str(Path(str(spec.origin)).parent))
+    for spec in map(find_spec, ("rsltrace", "rsltrace_viewer"))
+    if spec is not None
+)
+_OURS = re.compile(rf'^\s*File "(?:{_PACKAGES})/[^"\n]*\.py"', re.MULTILINE)
 _OF_TOPIC = re.compile(r"messages? on /\S+ ")
 _ERROR = re.compile(r"error", re.IGNORECASE)
 _CPU_SIGNALS = (signal.SIGXCPU, signal.SIGKILL)

@@ -227,7 +227,8 @@ def test_users_tracebacks_are_theirs_unless_ours_are_in_them(tmp_path: Path) -> 
     case = dataclasses.replace(_case(tmp_path), user_code=True)
     command = Command(("record", "x"), oracle.RECORDING, tmp_path)
     theirs = b'error: x.mcap\nTraceback (most recent call last):\n  File "/home/me.py", line 3\n'
-    ours = theirs + b'  File "/opt/rsltrace/run/session.py", line 9, in go\n'
+    place = Path(rsltrace.__file__).parent / "run" / "session.py"
+    ours = theirs + f'  File "{place}", line 9, in go\n'.encode()
     assert oracle.judge(case, [Ran(command, 3, b"", theirs, 0, 1, 0)]) == []
     (found,) = oracle.judge(case, [Ran(command, 3, b"", ours, 0, 1, 0)])
     assert found.wrong is Wrong.TRACEBACK

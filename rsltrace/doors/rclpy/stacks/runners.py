@@ -10,7 +10,6 @@ never meet any of this.
 from __future__ import annotations
 
 import os
-import threading
 import traceback
 from _thread import get_ident
 from collections.abc import Callable
@@ -20,12 +19,12 @@ from greenlet import getcurrent, greenlet
 from rsltrace.doors.rclpy.stacks.callback_groups import CallbackGroups
 from rsltrace.doors.rclpy.stacks.program import Programs
 from rsltrace.doors.rclpy.stacks.wait_reasons import called_service
+from rsltrace.guard.callers import is_telling
 from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.entity import Runnable
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 
 _RESUME = int(EventKind.RESUME)
-_PYTHON = os.path.dirname(threading.__file__) + os.sep
 
 Patience = bool | Callable[[], bool]
 """Whether it is in order to wait for ever, or what says so when somebody asks."""
@@ -203,7 +202,7 @@ class Wait:
     def waits_for(self) -> str:
         """Say who waits for what, with the lines of user code that led there."""
         frames = traceback.extract_stack(self.stack.gr_frame) if self.stack.gr_frame else []
-        own = [frame for frame in frames if _is_telling(frame.filename)]
+        own = [frame for frame in frames if is_telling(frame.filename)]
         where = "".join(f"\n    at {f.filename}:{f.lineno} in {f.name}" for f in own[-4:])
         hint = ""
         if self._group is not None and self._runners.groups.waiting_for(self._group):
@@ -215,10 +214,3 @@ class Wait:
         graph = self._runners.domain.graph
         what = called_service(graph, self.stack.gr_frame) or self.what
         return f"{self.describe()} waits for {what}{hint}{where}"
-
-
-def _is_telling(file: str) -> bool:
-    """Say whether a source file tells the user anything: it is not ours, Python's or rclpy's."""
-    if "/rsltrace/" in file or "/rclpy/" in file:
-        return False
-    return not file.startswith(_PYTHON) or "/site-packages/" in file
