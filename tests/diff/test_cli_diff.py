@@ -18,8 +18,10 @@ from xml.etree import ElementTree
 
 import pytest
 from click.testing import CliRunner
+from mcap.reader import make_reader
 
 from rsltrace.cli.main import cli
+from rsltrace.trace.pieces import metadata_checksum
 
 SAMPLES = Path(__file__).parent.parent.parent / "sample_traces"
 PAIR = SAMPLES / "nondeterministic_callback"
@@ -165,10 +167,20 @@ def test_a_file_that_is_neither_trace_nor_recording(
 
 def test_another_format_version_is_named(diff: Callable[..., Done], tmp_path: Path) -> None:
     data = A.read_bytes()
-    old = struct.pack("<I", len("version")) + b"version" + struct.pack("<I", 1) + b"1"
-    assert data.count(old) == 1
+    name = "rsltrace:format"
+    with A.open("rb") as file:
+        (found,) = [one for one in make_reader(file).iter_metadata() if one.name == name]
+    mapping = {key: value for key, value in found.metadata.items() if key != "checksum"}
+    newer = metadata_checksum(name, {**mapping, "version": "9"})
+    version = struct.pack("<I", len("version")) + b"version" + struct.pack("<I", 1)
+    for old, new in (
+        (version + b"1", version + b"9"),
+        (found.metadata["checksum"].encode(), newer.encode()),
+    ):
+        assert data.count(old) == 1
+        data = data.replace(old, new)
     # cut off, so that the summary (with its checksum) does not matter
-    (tmp_path / "new.mcap").write_bytes(data.replace(old, old[:-1] + b"9")[:-100])
+    (tmp_path / "new.mcap").write_bytes(data[:-100])
     done = diff(A, "new.mcap")
     assert done.returncode == 2
     assert "has trace format 9, this rsltrace reads 1" in done.stderr

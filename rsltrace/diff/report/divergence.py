@@ -100,7 +100,7 @@ def _events_of(sides: list[tuple[str, str, EventView | None]], width: int) -> li
 
 
 def _message(message: MessageDifference, width: int) -> list[Line]:
-    rows = [line(f"  {message_title(message)}")]
+    rows = wrapped(f"  {message_title(message)}", width, indent="    ")
     rows += payload_lines(
         message.fields, message.more_fields, message.preview, message.reason, width
     )
