@@ -11,6 +11,9 @@ from tests.truth.faults.outside import _reads, _truth
 from tests.truth.faults.planting import Planted, Truth, fault
 from tests.truth.graph import World
 
+LEFT_OPEN = "truth_left_open.txt"
+"""A file that a node does not close, as many do; Python warns of it."""
+
 
 def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as server:
@@ -131,7 +134,7 @@ _file(
     "truth.yaml",
     "gain: 1.5\n",
     "gain: 2.5\n",
-    'float(yaml.safe_load(open({path}))["gain"])',
+    'float(yaml.safe_load({path}.read_text())["gain"])',
     "import yaml",
 )
 _file(
@@ -139,8 +142,11 @@ _file(
     "truth.csv",
     "t,gain\n0,1.5\n",
     "t,gain\n0,2.5\n",
-    'float(next(csv.DictReader(open({path})))["gain"])',
+    'float(first_row({path})["gain"])',
     "import csv",
+    "def first_row(path):",
+    "    with open(path) as file:",
+    "        return next(csv.DictReader(file))",
 )
 _file(
     "array of numbers",
@@ -150,6 +156,7 @@ _file(
     "float(np.loadtxt({path})[0])",
     "import numpy as np",
 )
+_file("left open", LEFT_OPEN, "1.5\n", "2.5\n", "float(open({path}).read())")
 _file("size", "truth.bin", "123", "12345", "float({path}.stat().st_size)")
 _file("as bytes", "truth.bin", "a", "b", "float({path}.read_bytes()[0])")
 _file("seed", "truth.txt", "5", "6", "random.Random(int({path}.read_text())).random()")
