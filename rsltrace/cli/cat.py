@@ -51,7 +51,8 @@ class _Time(_IntParam):
 @click.option(
     "--code",
     is_flag=True,
-    help="Add where the function that ran is (module.py:24), and the lines of its outputs.",
+    help="Add where the function that ran is (module.py:24), and the lines of its outputs. "
+    "'or elsewhere': this output was not looked at.",
 )
 @click.option(
     "--topic",

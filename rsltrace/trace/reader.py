@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
@@ -319,6 +320,16 @@ class Trace:
         for _, _, data in self.messages(TOPIC_CODE_LINES):
             line = self._named(unpack_code_line, data)
             lines.setdefault(line.entity, []).append(line)
+        return lines
+
+    @cached_property
+    def sent_from(self) -> dict[tuple[int, int], list[CodeLine]]:
+        """The places from which outputs came, by their entity and the one whose callback ran."""
+        lines: dict[tuple[int, int], list[CodeLine]] = {}
+        for line in chain.from_iterable(self.code_lines.values()):
+            if line.output != NO_SEQUENCE and line.event < self.event_count:
+                key = line.entity, self.event(line.event).entity
+                lines.setdefault(key, []).append(line)
         return lines
 
     @cached_property

@@ -12,6 +12,8 @@ from rsltrace.model.event import NO_SEQUENCE, Event, EventKind, Output, OutputKi
 from rsltrace.trace.reader import Trace
 from rsltrace.words.logs import log_record
 
+ELSEWHERE = "elsewhere"
+"""Beside the places from which an output may have come: it was not looked at."""
 _SENT = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST))
 _LATER = frozenset((EventKind.TASK, EventKind.RESUME, EventKind.CLIENT, EventKind.ACTION))
 """Kinds of events that may run another function than the callback of their entity."""
@@ -19,8 +21,18 @@ _PLACES_SHOWN = 3
 
 
 def code_place(trace: Trace, event: Event) -> str:
-    """Return ``module.py:24`` of the function that an event ran, or "": a constructor's for a node
-    that was made in it, the call's for an answer that somebody awaits."""
+    """Return the one place of ``code_places``, "" if there is none or there are several."""
+    places = code_places(trace, event)
+    return places[0] if len(places) == 1 else ""
+
+
+def code_places(trace: Trace, event: Event) -> list[str]:
+    """Return ``module.py:24`` of the function that an event ran: a constructor's for a node that
+    was made in it, the call's for an answer that somebody awaits.
+
+    There are several where its entity has run several and nobody knows which, none if nobody knows
+    any.
+    """
     entity = event.entity
     if event.kind is EventKind.CONSTRUCT:
         made = (output.entity for output in trace.outputs_of(event.index))
@@ -28,34 +40,44 @@ def code_place(trace: Trace, event: Event) -> str:
     found = trace.entities.get(entity)
     source = "" if found is None else found.source
     if event.kind in _LATER and not (source and event.kind is EventKind.ACTION):
-        return _function(trace.code_lines.get(entity, []), event) or source
-    return source
+        places = _functions(trace.code_lines.get(entity, []), event)
+        if places:
+            return places
+    return [source] if source else []
 
 
-def _function(lines: list[CodeLine], event: Event) -> str:
-    met = [line for line in lines if line.event <= event.index]
+def _functions(lines: list[CodeLine], event: Event) -> list[str]:
+    met = [line for line in lines if line.event <= event.index and line.place]
     of_call = [line for line in met if event.kind is EventKind.CLIENT]
     best = [line for line in met if line.output == NO_SEQUENCE] or of_call
-    return best[-1].place if best else ""
+    now = [line for line in best if line.event == event.index]
+    return list(dict.fromkeys(line.place for line in now or best))
 
 
 def output_places(trace: Trace, output: Output) -> list[str]:
     """Return the lines (``module.py:31``) from which a message, call or log record came.
 
-    There are several where its entity had sent from several until then, none if nobody knows.
+    There are several where its callback had sent from several until then, none if nobody knows.
+    The last is ``ELSEWHERE`` where a run has not looked at the output.
     """
     if output.kind is OutputKind.LOG:
         record = log_record(trace, output)
         return [record.place] if record is not None and record.place else []
     if output.kind not in _SENT:
         return []
-    lines = [
-        line
-        for line in trace.code_lines.get(output.entity, [])
-        if line.event <= output.event and line.output != NO_SEQUENCE
-    ]
-    first = [line for line in lines if line.event == output.event]
-    return list(dict.fromkeys(line.place for line in (first if len(first) == 1 else lines)))
+    running = trace.event(output.event).entity
+    lines = trace.sent_from.get((output.entity, running), [])
+    number = NO_SEQUENCE
+    if any(line.event == output.event for line in lines):
+        outputs = trace.outputs_of(output.event)
+        numbers = [number for number, one in enumerate(outputs) if one == output]
+        exact = [line for line in lines if line.event == output.event and line.output in numbers]
+        if len(numbers) == 1 and exact and exact[0].place:
+            return [exact[0].place]
+        number = numbers[-1] if numbers else number
+    met = [line.place for line in lines if (line.event, line.output) < (output.event, number)]
+    places = list(dict.fromkeys(filter(None, met)))
+    return [*places, ELSEWHERE] if places and "" in met else places
 
 
 def entity_places(trace: Trace, entity: Entity) -> list[str]:

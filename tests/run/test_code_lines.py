@@ -89,6 +89,31 @@ def main():  # main
 """
 
 
+OFTEN = """\
+from rclpy.node import Node
+from std_msgs.msg import String
+
+
+class Often(Node):
+    def __init__(self):
+        super().__init__("often")
+        self.pub = self.create_publisher(String, "x", 10)
+        self.ticks = 0
+        self.create_timer(0.1, self.tick)
+        self.create_timer(5.95, self.end)
+
+    def tick(self):
+        self.ticks += 1
+        if self.ticks == 51:
+            self.pub.publish(String(data="wrong"))  # seldom
+        else:
+            self.pub.publish(String(data="right"))  # usual
+
+    def end(self):
+        self.pub.publish(String(data="end"))  # late
+"""
+
+
 def _line(mark: str) -> str:
     lines = PROGRAM.splitlines()
     return f"marked.py:{1 + next(i for i, line in enumerate(lines) if line.endswith(f'# {mark}'))}"
@@ -118,9 +143,8 @@ def test_outputs_have_the_lines_that_sent_them(trace: Path) -> None:
                 met.setdefault(key, []).append(output_places(opened, output))
     odd, even, helper = (_line(mark) for mark in ("odd", "even", "helper"))
     chat = met["MESSAGE", "/chat"]
-    assert chat[0] == [odd, helper]  # both are new in one event
-    assert chat[3] == [even]  # the only one that is new
-    assert chat[-1] == [odd, helper, even]  # nobody knows
+    assert chat[:4] == [[odd], [helper], [odd, helper], [even]]
+    assert chat[4] == [odd, helper, even]  # all have been met, so nobody knows
     calls = {tuple(places) for places in met["REQUEST", "/go"]}
     assert calls == {(_line("calls"),), (_line("awaits"),)}
     assert met["REQUEST", "/fib/_action/send_goal"] == [[_line("goal")]]
@@ -149,10 +173,36 @@ def test_events_have_the_function_that_ran(trace: Path) -> None:
     } <= met
 
 
+def test_what_was_not_looked_at_is_not_told_as_certain(tmp_path: Path) -> None:
+    import rsltrace
+
+    (tmp_path / "often.py").write_text(OFTEN)
+    (tmp_path / "job.yaml").write_text(
+        "nodes: [{node: 'often:Often'}]\nsearch_path: [.]\nstop: {time: 6 s}\n"
+    )
+    rsltrace.record(rsltrace.load_job(tmp_path / "job.yaml"), tmp_path / "run.mcap")
+    lines = OFTEN.splitlines()
+    usual, seldom, late = (
+        f"often.py:{1 + next(i for i, line in enumerate(lines) if line.endswith(f'# {mark}'))}"
+        for mark in ("usual", "seldom", "late")
+    )
+    with Trace.open(tmp_path / "run.mcap") as opened:
+        told = [
+            output_places(opened, output)
+            for index in range(opened.event_count)
+            for output in opened.outputs_of(index)
+            if opened.entity(output.entity).name == "/x" and output.kind is OutputKind.MESSAGE
+        ]
+    assert told[:32] == [[usual]] * 32
+    assert {tuple(places) for places in told[32:59]} == {(usual, "elsewhere")}
+    assert told[50] == [usual, "elsewhere"] != [seldom]  # it came from there, and nobody has looked
+    assert [late] in told  # another callback is looked at from its own first output on
+
+
 def test_each_place_is_told_once_and_where(trace: Path) -> None:
     with Trace.open(trace) as opened:
         for entity, lines in opened.code_lines.items():
-            assert len({(line.place, line.output) for line in lines}) <= len(lines) <= 4
+            assert len({(line.place, line.output) for line in lines}) <= len(lines) <= 5
             for line in lines:
                 if line.output != 2**32 - 1:
                     output = opened.outputs_of(line.event)[line.output]

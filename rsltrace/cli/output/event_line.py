@@ -9,7 +9,7 @@ from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_place, output_places, places_text
+from rsltrace.words.code import code_places, output_places, places_text
 from rsltrace.words.events import EventWords
 from rsltrace.words.kinds import flag_names
 
@@ -53,7 +53,7 @@ class EventLines:
             f"{_hex(event.input_hash):<16}  {_hex(event.output_hash):<16}"
         )
         if self._code_width:
-            place = printable(code_place(self._trace, event)) or "-"
+            place = printable(places_text(code_places(self._trace, event))) or "-"
             columns += f"  {place:<{self._code_width}}"
         what = ", ".join(self._words.outputs(outputs, self._more))
         flags = "".join(f"  [{flag}]" for flag in flag_names(event.flags))

@@ -12,7 +12,7 @@ from rsltrace.diff.alignment.rows import CONSTRUCT, OutputRow, Run, outputs_of
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
-from rsltrace.words.code import code_place, place_here
+from rsltrace.words.code import code_places, place_here, places_text
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.outputs import output_text
 from rsltrace.words.phrases import event_phrase
@@ -54,7 +54,7 @@ class EventViews:
             outputs=event.outputs,
             position=self._position(index, event.entity) if event.entity else 0,
             summary=self.summary(outputs),
-            code=place_here(run.trace, code_place(run.trace, event)),
+            code=places_text([place_here(run.trace, one) for one in code_places(run.trace, event)]),
         )
 
     def before(self, index: int, count: int) -> tuple[EventView, ...]:

@@ -24,7 +24,7 @@ class MessageDifference:
     order``, ``twice in b``, ``4 ms later in b``, ``cancelled in a``. ``preview`` is the decoded
     message as one short line where only one side has it (of an exception: its last line). A new
     entity has hash 0: it is known by name. ``code`` are the lines it may have come from
-    (``module.py:31``), of both runs.
+    (``module.py:31``), of both runs, ``elsewhere`` the last where the run did not look.
     """
 
     kind: OutputKind | None

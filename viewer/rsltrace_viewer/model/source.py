@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from rsltrace.trace.format import METADATA_SOURCES
 from rsltrace.trace.reader import Trace
-from rsltrace.words.code import code_file, code_place, output_places
+from rsltrace.words.code import code_file, code_places, output_places, places_text
 from rsltrace_viewer.model.run import Run
 
 _LINES_MAX = 400
@@ -36,9 +36,10 @@ def source_of(run: Run, index: int) -> Source | None:
 
     Raises TraceError, IndexError.
     """
-    place = code_place(run.trace, run.event(index))
-    if not place:
+    places = code_places(run.trace, run.event(index))
+    if not places:
         return None
+    place = places[0]
     found = code_file(run.trace, place)
     name, _, line = place.rpartition(":")
     if found is None:
@@ -54,6 +55,8 @@ def source_of(run: Run, index: int) -> Source | None:
     note = "" if _is_that_of(run.trace, name, data) else "changed since this run: it may be others"
     if first > len(lines):
         note = f"changed since this run: it has {len(lines)} lines now"
+    if len(places) > 1:
+        note = "; ".join(filter(None, (f"or it ran {places_text(places[1:])}", note)))
     last = min(_last_line(text, first), first + _LINES_MAX)
     sent = _lines_in(name, run, index)
     return Source(str(path), first, place, tuple(lines[first - 1 : last]), note, sent=sent)

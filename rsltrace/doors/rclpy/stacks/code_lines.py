@@ -35,7 +35,7 @@ class CallSites:
     def __init__(self, dispatcher: Dispatcher, entity: int) -> None:
         self._dispatcher = dispatcher
         self._entity = entity
-        self._told: set[tuple[str, int, int]] = set()
+        self._told: set[tuple[int, str, int, int]] = set()
         self._looks: dict[int, int] = {}
         self.due = 0
         self.running = -1
@@ -51,15 +51,17 @@ class CallSites:
             self.due = sent + _STRIDE // 2 + sent * 7919 % _STRIDE
         self.running = running
         if looks <= _LOOKS_FIRST or is_due:
-            self._look(sys._getframe(3))
+            self._look(sys._getframe(3), running)
+        if looks == _LOOKS_FIRST and (recorder := self._dispatcher.recorder) is not None:
+            _record(self._dispatcher, self._entity, recorder.outputs, "", "")
 
-    def _look(self, frame: FrameType) -> None:
+    def _look(self, frame: FrameType, running: int) -> None:
         recorder = self._dispatcher.recorder
         found = frame if is_user_file(frame.f_code.co_filename) else _caller(frame)
         if recorder is None or found is None:
             return
         code = found.f_code
-        key = code.co_filename, found.f_lineno, found.f_lasti  # hashing code takes long
+        key = running, code.co_filename, found.f_lineno, found.f_lasti  # hashing code takes long
         if key not in self._told and len(self._told) < _PLACES_MAX:
             self._told.add(key)
             output = recorder.outputs
@@ -71,7 +73,7 @@ class Functions:
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._dispatcher = dispatcher
-        self._known: set[tuple[int, object]] = set()
+        self._known: dict[tuple[int, int], object] = {}  # by id: hashing code takes long
         self._told: set[tuple[int, CodeType]] = set()
         self._met = 0
 
@@ -81,16 +83,21 @@ class Functions:
         It may be given to a function of rclpy's in ``args``.
         """
         plain = callback.__func__ if type(callback) is MethodType else callback
-        is_known = type(plain) is FunctionType and not args
-        if is_known and (entity, plain) in self._known:
+        is_plain = type(plain) is FunctionType and not args
+        if is_plain and (
+            (entity, id(plain.__code__)) in self._known or (entity, id(plain)) in self._known
+        ):
             return
         self._met += 1
         if self._met > _LOOKS_FIRST and self._met % _STRIDE:
             return
-        if is_known and len(self._known) < _PLACES_MAX:
-            self._known.add((entity, plain))
         for one in (callback, *args):
             found = function_of(one)
+            if is_plain and len(self._known) < _PLACES_MAX:
+                # A decorator's function has one code, whatever it decorates.
+                is_itself = found is not None and found[0] is plain.__code__
+                kept = plain.__code__ if is_itself else plain
+                self._known[entity, id(kept)] = kept
             if found is not None and is_user_file(found[0].co_filename):
                 self._tell(entity, *found)
                 return
@@ -104,10 +111,14 @@ class Functions:
 def _tell(
     dispatcher: Dispatcher, entity: int, code: CodeType, names: Any, line: int, output: int
 ) -> None:
-    recorder = dispatcher.recorder
-    if recorder is not None and code.co_filename[:1] != "<":
+    if code.co_filename[:1] != "<":
         name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
-        place = f"{file_of(code, names)}:{line}"
+        _record(dispatcher, entity, output, f"{file_of(code, names)}:{line}", name)
+
+
+def _record(dispatcher: Dispatcher, entity: int, output: int, place: str, name: str) -> None:
+    recorder = dispatcher.recorder
+    if recorder is not None:
         told = CodeLine(recorder.index, entity, output, place, name)
         recorder.code_line(told, dispatcher.loop.now_ns)
 
