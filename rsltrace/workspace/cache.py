@@ -7,11 +7,16 @@ import os
 import shutil
 import stat
 import tempfile
+import time
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 
 from rsltrace.errors import SetupError
+
+_NEW = ".new-"
+_LEFT_S = 3600.0
 
 
 def key_of(parts: Iterable[str | bytes]) -> str:
@@ -40,7 +45,8 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     if place.is_dir():
         return place
     place.parent.mkdir(0o755, parents=True, exist_ok=True)
-    made = Path(tempfile.mkdtemp(dir=place.parent, prefix=".new-"))
+    _clear_leftovers(place.parent)
+    made = Path(tempfile.mkdtemp(dir=place.parent, prefix=_NEW))
     try:
         make(made)
         made.chmod(0o755)
@@ -52,6 +58,14 @@ def cached_folder(kind: str, name: str, make: Callable[[Path], None]) -> Path:
     finally:
         shutil.rmtree(made, ignore_errors=True)
     return place
+
+
+def _clear_leftovers(folder: Path) -> None:
+    """Remove what was begun long ago and is not complete: whoever made it was killed."""
+    for left in folder.glob(f"{_NEW}*"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _LEFT_S:
+                shutil.rmtree(left, ignore_errors=True)
 
 
 def lasting(path: str) -> str:

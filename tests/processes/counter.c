@@ -30,7 +30,8 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   message.data = ++counted;
   CHECK(rcl_publish(&count_publisher, &message, NULL));
   if (counted == 5 && strcmp(action, "crash") == 0) raise(SIGSEGV);
-  if (counted == 5 && strcmp(action, "exit") == 0) exit(7);
+  if (counted == 5 && strcmp(action, "kill") == 0) raise(SIGKILL);
+  if (counted == 5 && strcmp(action, "exit") == 0) _exit(7);
   if (counted == 5 && strcmp(action, "leave") == 0) exit(0);
   if (counted == 5 && strcmp(action, "fork") == 0 && fork() == 0) {
     sleep(60);

@@ -177,6 +177,7 @@ def test_a_link_delays_what_goes_to_a_process(counter: Path, tmp_path: Path) -> 
     ("action", "ending"),
     [
         ("crash", "was killed by SIGSEGV at 0.500000000 s"),
+        pytest.param("kill", "was killed by SIGKILL at 0.500000000 s", marks=long),
         pytest.param("exit", "ended with exit status 7 at 0.500000000 s", marks=long),
         (
             "write",
@@ -203,6 +204,9 @@ def test_a_process_that_fails_ends_the_run_and_is_named_with_its_last_callback(
         assert trace.complete
         last = trace.event(result.events - 1)
     assert (last.kind, last.stamp_ns) == (EventKind.TIMER, 500_000_000)
+    # What it said in that callback counts, unless it has written over it.
+    counted = len(_said(tmp_path / "t.mcap", "/count")["/count"])
+    assert counted == (4 if action == "write" else 5)
     _no_process_of(counter)
 
 
@@ -245,7 +249,7 @@ def test_a_run_goes_on_without_a_process_if_the_job_says_so(counter: Path, tmp_p
     result = run(job, tmp_path / "t.mcap")
     assert result.error is None
     assert result.exit_code == 1
-    assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == 4  # the fifth was not sent
+    assert len(_said(tmp_path / "t.mcap", "/count")["/count"]) == 5
 
 
 @long

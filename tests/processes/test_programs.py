@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
+import signal
+import subprocess
 import sys
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -86,22 +90,23 @@ def test_a_library_that_is_cut_off_is_built_anew(
 ) -> None:
     built = []
 
-    def compile(command: list[str]) -> None:
-        built.append(Path(command[command.index("-o") + 1]).name)
-        Path(command[command.index("-o") + 1]).write_bytes(b"whole")
+    def compile(commands: Iterable[list[str]]) -> None:
+        for target in (Path(command[command.index("-o") + 1]) for command in commands):
+            built.append(target.suffix)
+            target.write_bytes(b"whole")
 
     pytest.importorskip("rclpy")
-    monkeypatch.setattr(build, "_compile", compile)
+    monkeypatch.setattr(build, "_run", compile)
     try:
         first = build.library(lambda line: None)
     except SetupError as error:
         pytest.skip(str(error))
     assert build.library(lambda line: None) == first
-    assert len(built) == 2
+    assert built.count(".so") == 2
     first.path.write_bytes(b"who")
     assert build.library(lambda line: None) == first
     assert first.path.read_bytes() == b"whole"
-    assert len(built) == 4
+    assert built.count(".so") == 4
 
 
 def test_what_others_can_change_is_not_taken_from_the_cache(caches: Path) -> None:
@@ -138,4 +143,46 @@ def test_a_compiler_that_is_not_there(
 
 def test_a_compiler_that_fails_and_says_nothing() -> None:
     with pytest.raises(SetupError, match=r"false cannot build the library[^$]*exit status 1"):
-        build._compile(["/bin/false"])
+        build._run([["/bin/false"]])
+
+
+def test_no_compiler_outlives_an_interrupted_build(tmp_path: Path) -> None:
+    """Not even the one that its driver has started, which g++ would leave behind."""
+    script = tmp_path / "compiler"
+    script.write_text(f"#!/bin/sh\necho $$ >> {tmp_path}/pids\nsleep 600 & wait\n")
+    script.chmod(0o755)
+    code = f"from rsltrace.doors.processes import build; build._run([[{str(script)!r}]] * 3)"
+    with subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.DEVNULL) as building:
+        pids = tmp_path / "pids"
+        deadline = time.monotonic() + 100
+        while not (pids.exists() and pids.read_text().endswith("\n")):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        building.send_signal(signal.SIGINT)
+        assert building.wait(100) != 0
+    while any(_group_lives(int(pid)) for pid in pids.read_text().split()):
+        assert time.monotonic() < deadline, "a compiler was left behind"
+        time.sleep(0.02)
+
+
+def _group_lives(pid: int) -> bool:
+    return any(_group_of(path) == pid for path in Path("/proc").glob("[0-9]*/stat"))
+
+
+def _group_of(stat: Path) -> int:
+    """Return the process group of what runs, 0 of what has ended."""
+    try:
+        state, _, group = stat.read_text().rpartition(")")[2].split()[:3]
+    except OSError:
+        return 0
+    return 0 if state == "Z" else int(group)
+
+
+def test_what_was_begun_long_ago_is_cleared_away(caches: Path) -> None:
+    cache.cached_folder("things", "a", lambda folder: None)
+    for name, age_s in ((".new-old", 7200), (".new-now", 0)):
+        left = caches / "things" / name
+        left.mkdir()
+        os.utime(left, (time.time() - age_s,) * 2)
+    cache.cached_folder("things", "b", lambda folder: None)
+    assert sorted(path.name for path in (caches / "things").iterdir()) == [".new-now", "a", "b"]

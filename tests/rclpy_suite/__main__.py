@@ -1,6 +1,6 @@
 """Run rclpy's own tests on rsltrace's middleware, from a checkout of rclpy.
 
-    python tests/rclpy_suite --rclpy ~/src/rclpy [-k test_action] [--native]
+    python tests/rclpy_suite --rclpy ~/src/rclpy [-k test_action] [--processes | --native]
 
 None of rclpy's code is kept here: its folder ``rclpy/test`` is copied to a temporary folder for the
 time of the run. Each module is a job of its own, in a process of its own; a test that hangs or
@@ -34,14 +34,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory(prefix="rclpy_suite_") as temporary:
         folder = copy_tests(options.rclpy, Path(temporary))
         modules = [m for m in module_names(folder) if not options.module or m in options.module]
-        excluded = {} if options.native or options.all else EXCLUDED
+        where = "here" if options.native else "process" if options.processes else "simulation"
+        excluded = {} if options.all else EXCLUDED.get(where, {})
 
         def one(module: str) -> list[Outcome]:
             return run_module(
                 folder,
                 module,
                 excluded,
-                native=options.native,
+                where=where,
                 keyword=options.keyword,
                 limit_s=options.timeout,
             )
@@ -64,7 +65,9 @@ def _report(outcomes: list[Outcome], options: argparse.Namespace) -> int:
     passed = {outcome.test for outcome in outcomes if outcome.passed}
     excluded = {outcome.test for outcome in outcomes if outcome.verdict == "excluded"}
     failed = [o.test for o in outcomes if not o.passed and o.test not in excluded]
-    where = "natively" if options.native else "in the simulation"
+    where = "in the simulation"
+    if options.native or options.processes:
+        where = "natively" if options.native else "in processes of the simulation"
     print(
         f"{len(outcomes)} tests: {len(passed)} pass {where}, {len(excluded)} excluded with a "
         f"reason, {len(failed)} fail"
@@ -88,7 +91,7 @@ def _report(outcomes: list[Outcome], options: argparse.Namespace) -> int:
             excluded=len(excluded),
             failed=len(failed),
         )
-        DOCUMENT.write_text(document(counts, EXCLUDED))
+        DOCUMENT.write_text(document(counts, EXCLUDED["simulation"]))
     return 1 if failed else 0
 
 
@@ -97,7 +100,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rclpy", type=Path, required=True, help="a checkout of rclpy")
     parser.add_argument("-k", dest="keyword", default="", help="as pytest's")
     parser.add_argument("-v", "--verbose", action="store_true", help="print why tests fail")
-    parser.add_argument("--native", action="store_true", help="over DDS, for comparison")
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument(
+        "--processes", action="store_true", help="unmodified, in `isolated:` processes"
+    )
+    way.add_argument("--native", action="store_true", help="over DDS, for comparison")
     parser.add_argument("--all", action="store_true", help="try what is excluded, too")
     parser.add_argument("--baseline", type=Path, help="ids of the tests that pass natively")
     parser.add_argument("--list", type=Path, help="write the ids of the tests that passed")

@@ -16,7 +16,7 @@ _WAIT_SET = (
 _CORES = "expects as many threads as the machine has cores; a run does not depend on the machine"
 _NATIVE = "fails natively, too: it asks a node that does not exist"
 
-EXCLUDED: dict[str, str] = {
+_HERE: dict[str, str] = {
     "test/test_action_server.py::TestActionServer::test_different_feedback_type_raises": _WAIT_SET,
     "test/test_action_server.py::TestActionServer::test_feedback": _WAIT_SET,
     "test/test_executor.py::TestExecutor::test_create_task_dependent_coroutines": _NEWEST,
@@ -24,3 +24,9 @@ EXCLUDED: dict[str, str] = {
     "test/test_type_description_service.py::TestTypeDescriptionService::"
     "test_get_type_description": _NATIVE,
 }
+
+_PROCESS: dict[str, str] = {
+    test: reason for test, reason in _HERE.items() if reason in (_WAIT_SET, _NATIVE)
+}
+EXCLUDED = {"simulation": _HERE, "process": _PROCESS}
+"""By where the tests run: in rsltrace's process, or in processes of the run."""

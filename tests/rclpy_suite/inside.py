@@ -85,4 +85,4 @@ if __name__ == "__main__":
     wanted = json.loads(sys.argv[1])
     sys.path.insert(0, wanted["folder"])
     plugin = Reporter(Path(wanted["report"]), wanted["without"])
-    (run_pytest if wanted["native"] else simulate)(wanted, plugin)
+    (run_pytest if wanted["where"] == "here" else simulate)(wanted, plugin)

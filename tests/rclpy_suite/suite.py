@@ -57,14 +57,17 @@ def run_module(
     module: str,
     excluded: Mapping[str, str],
     *,
-    native: bool = False,
+    where: str = "simulation",
     keyword: str = "",
     limit_s: float = 120,
 ) -> list[Outcome]:
-    """Run the tests of a module and return their outcomes in order."""
+    """Run the tests of a module and return their outcomes in order.
+
+    ``where`` is the ``simulation``, a ``process`` of one, or ``here``: natively, over DDS.
+    """
     done: dict[str, Outcome] = {}
     while True:
-        news = _one_process(folder, module, [*done, *excluded], native, keyword, limit_s)
+        news = _one_process(folder, module, [*done, *excluded], where, keyword, limit_s)
         for test in news.collected:
             if test not in done and test in excluded:
                 done[test] = Outcome(test, "excluded", excluded[test])
@@ -93,12 +96,12 @@ class _News:
 
 
 def _one_process(
-    folder: Path, module: str, without: list[str], native: bool, keyword: str, limit_s: float
+    folder: Path, module: str, without: list[str], where: str, keyword: str, limit_s: float
 ) -> _News:
     report = folder / f"{module}.jsonl"
     report.write_text("")
     request = {
-        "module": module, "without": without, "keyword": keyword, "native": native,
+        "module": module, "without": without, "keyword": keyword, "where": where,
         "report": str(report), "folder": str(folder),
     }  # fmt: skip
     environment = {

@@ -13,10 +13,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from rsltrace.doors.processes.shared import Said, Shared
 from rsltrace.doors.processes.wire import HEAD, RECORD, Told
 from rsltrace.errors import JobError
 
-_ROOM = 1 << 16
+_LARGE = 1 << 14
+"""What is longer is not sent, but laid into memory that both see."""
 _HEAD_SIZE = HEAD.size
 _LOOK_S = 0.2
 _GRACE_S = 2.0
@@ -72,7 +74,9 @@ class Child:
             here.setsockopt(
                 socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, int(_LOOK_S * 1e6))
             )
-            link = f"{there.fileno()}:{os.getpid()}"
+            self._said, self._told = Said("rsltrace-said"), Shared("rsltrace-told")
+            files = (there.fileno(), self._said.fd, self._told.fd)
+            link = f"{files[0]}:{os.getpid()}:{files[1]}:{files[2]}"
             try:
                 with _addresses_as_they_are():
                     self._process = subprocess.Popen(
@@ -80,15 +84,15 @@ class Child:
                         env={**environment, "RSLTRACE_LINK": link},
                         cwd=folder,
                         stdin=subprocess.DEVNULL,
-                        pass_fds=(there.fileno(),),
+                        pass_fds=files,
                         start_new_session=True,
                     )
             except OSError as error:
                 here.close()
+                self._close_files()
                 raise JobError(f"{name} cannot be started: {error.strerror}: {argv[0]}") from error
         self._socket = here
-        self._there = b""
-        self._room = memoryview(bytearray(_ROOM))
+        self._head = memoryview(bytearray(_HEAD_SIZE))
         self._patience = 0
 
     @property
@@ -98,39 +102,34 @@ class Child:
 
     def send(self, data: bytes) -> None:
         """Send to the process; one that is gone is noticed by ``receive``."""
+        if len(data) > _LARGE:
+            self._told.grow(len(data))
+            self._told.data[: len(data)] = data
+            data = RECORD.pack(len(data), Told.SHARED)
         with suppress(BrokenPipeError, ConnectionResetError):
             self._socket.sendall(data)
 
     def receive(self) -> memoryview | None:
-        """Return the next batch, None if the process has ended; it holds until the next call."""
-        there, self._there = self._there, b""
-        if not there:
-            count = self._read_into(self._room)
-            if not count:
-                return None
-            if count >= _HEAD_SIZE:
-                size: int = HEAD.unpack_from(self._room)[0]
-                if count == _HEAD_SIZE + size:  # nearly always
-                    return self._room[_HEAD_SIZE:count]
-            there = bytes(self._room[:count])
-        return self._assembled(there)
+        """Return the next batch, None if the process has ended; it holds until ``taken``.
 
-    def _assembled(self, data: bytes) -> memoryview | None:
-        """Return the batch that begins with ``data``, of which the rest is still to come."""
-        parts, count, size = [data], len(data), -1
-        while size < 0 or count < size:
-            if size < 0 and count >= _HEAD_SIZE:
-                parts = [b"".join(parts)]
-                size = _HEAD_SIZE + HEAD.unpack_from(parts[0])[0]
-                continue
-            more = self._read_into(self._room)
-            if not more:
-                return None
-            parts.append(bytes(self._room[:more]))
-            count += more
-        whole = b"".join(parts)
-        self._there = whole[size:]
-        return memoryview(whole)[_HEAD_SIZE:size]
+        :raises WireError: if the process has written something of its own to the link.
+        """
+        count = self._read_into(self._head)
+        while 0 < count < _HEAD_SIZE:
+            more = self._read_into(self._head[count:])
+            count = count + more if more else 0
+        return self._said.batch(HEAD.unpack(self._head)[0]) if count else None
+
+    def taken(self) -> None:
+        """Let go of a batch: the process writes the next one to the same place."""
+        self._said.taken()
+
+    def left(self) -> memoryview:
+        """Return what a process has said that has ended, after its last batch.
+
+        :raises WireError: if that is nothing that makes sense.
+        """
+        return self._said.left()
 
     def give_up_after(self, seconds: float) -> None:
         """Kill the process if it says nothing for so long (real time)."""
@@ -176,6 +175,15 @@ class Child:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._socket.close()
+
+    def close(self) -> None:
+        """Kill the process, and give back what belongs to it."""
+        self.kill()
+        self._close_files()
+
+    def _close_files(self) -> None:
+        self._said.close()
+        self._told.close()
 
 
 @contextmanager

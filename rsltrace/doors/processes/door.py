@@ -44,7 +44,8 @@ Log = Callable[[int, str, str], None]
 
 
 class ProcessDoor:
-    """The processes of one run. ``on_end`` is called with the key of each that has ended."""
+    """The processes of one run. ``on_end`` is called with the key of each that has ended;
+    ``follows_clock`` says of a node whether /clock drives its ROS time."""
 
     def __init__(self, domain: Domain, interfaces: Interfaces, *, seed: int, log: Log) -> None:
         self.domain = domain
@@ -52,6 +53,7 @@ class ProcessDoor:
         self.message_type = interfaces.message
         self.service_type = interfaces.service
         self.processes: list[Process] = []
+        self.follows_clock: Callable[[str], bool] = lambda node: False
         self.on_end: Callable[[str], None] = lambda key: None
         self._seed = seed
 
@@ -117,7 +119,7 @@ class ProcessDoor:
         """Kill what is left, however the run has ended."""
         for process in self.processes:
             with suppress(AttributeError):  # could not be started
-                process.child.kill()
+                process.child.close()
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
         """End the run because of what an event of a process has raised."""

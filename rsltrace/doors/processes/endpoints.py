@@ -21,16 +21,29 @@ from rsltrace.trace.chain import hash64
 _NO_GID = bytes(16)
 
 
+class Thing(Protocol):
+    """What a process has made and may wait for. ``number`` is what the process calls it."""
+
+    number: int
+    destroyed: bool
+
+    def dispatch(self) -> None:
+        """Hand over what is ready."""
+
+    def describe(self) -> str:
+        """Name it for people."""
+
+
 class Host(Protocol):
     """The process that endpoints and timers are in, as they see it."""
 
     name: str
     dispatcher: Dispatcher
 
-    def wants(self, thing: Endpoint | ProcessTimer) -> bool:
+    def wants(self, thing: Thing) -> bool:
         """Return whether one of its threads waits for a thing now."""
 
-    def hold(self, thing: Endpoint | ProcessTimer) -> None:
+    def hold(self, thing: Thing) -> None:
         """Keep what is ready until the process waits for it."""
 
     def go_on_with(self, number: int, ready: Ready, item: bytes) -> None:
@@ -251,6 +264,3 @@ class ProcessTimer(Timer):
 
     def describe(self) -> str:
         return super().describe() if self.node is not None else f"{self.process.name}: a timer"
-
-
-Endpoint = ProcessSubscription | ProcessService | ProcessClient

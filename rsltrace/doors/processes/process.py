@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import itertools
 import struct
 from collections.abc import Callable
-from typing import Any, Protocol
+from contextlib import suppress
+from typing import Protocol
 
 from rsltrace.doors.processes import graph_answers
 from rsltrace.doors.processes.child import Child, Ended
 from rsltrace.doors.processes.endpoints import (
-    Endpoint,
     ProcessClient,
     ProcessService,
-    ProcessSubscription,
     ProcessTimer,
-    RosoutPublisher,
+    Thing,
 )
+from rsltrace.doors.processes.things import Interfaces, Things
+from rsltrace.doors.processes.waking import GraphChange, WakingTimer
 from rsltrace.doors.processes.wire import (
     GO,
     GRAPH_ID,
@@ -32,24 +32,16 @@ from rsltrace.doors.processes.wire import (
     packed_qos,
 )
 from rsltrace.errors import NodeError
-from rsltrace.loop.timer import TimerState
-from rsltrace.middleware.domain import Domain
-from rsltrace.middleware.entity import DomainEntity
-from rsltrace.middleware.events.event import Door
-from rsltrace.middleware.interface import MessageType, ServiceType
-from rsltrace.middleware.participant import Participant, full_name
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
+from rsltrace.model.event import EventFlag, EventKind
 from rsltrace.model.stamp import format_seconds
-from rsltrace.trace.format import TOPIC_ROSOUT
 
 _RESUME = int(EventKind.RESUME)
 _SUSPENDED = int(EventFlag.SUSPENDED)
 _GRACE_S = 5.0
 """How long a process may take (in real time) to end when it is told to."""
 _WAITER = struct.Struct("<IIqI")
-_TIMER = struct.Struct("<IIq")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
 _HELLO = struct.Struct("<qQ")
@@ -62,13 +54,11 @@ _NOT_A_BATCH = (WireError, LookupError, ValueError, TypeError, AttributeError, s
 Question = Callable[[Fields], bytes]
 
 
-class Surroundings(Door, Protocol):
+class Surroundings(Interfaces, Protocol):
     """What a process finds in its run."""
 
-    domain: Domain
-    message_type: Callable[[str], MessageType]
-    service_type: Callable[[str], ServiceType]
     log: Callable[[int, str, str], None]
+    follows_clock: Callable[[str], bool]
 
     def seed_of(self, key: str) -> int:
         """Return the number from which a process draws what others take for entropy."""
@@ -80,7 +70,7 @@ class Surroundings(Door, Protocol):
 class Process:
     """An executable that runs beside rsltrace; in the trace, a main.
 
-    ``things`` are its nodes, endpoints and timers, by the numbers that it has for them.
+    ``things`` are its nodes, endpoints and timers.
     """
 
     def __init__(self, door: Surroundings, name: str, key: str, *, log_failure: bool) -> None:
@@ -94,20 +84,18 @@ class Process:
         self.begun_ns = 0
         self.child: Child
         self.ended: Ended | None = None
-        self.things: dict[int, Any] = {}
-        self._nodes: list[Participant] = []
-        self._timers_named = 0
+        self.things = Things(door, self)
         self._wanted: dict[int, int] = {}
         """Which thread waits for a thing."""
         self._waits: tuple[tuple[int, int], ...] = ()
         self._sets: dict[int, tuple[int, ...]] = {}
         self._waking: dict[int, WakingTimer] = {}
-        self._held: list[Endpoint | ProcessTimer] = []
+        self._held: list[Thing] = []
         self._running_thread = 0
         self._same_wait = b""
         """What it waited for last, if that has no end."""
         self._waking_soon = False
-        self._last: Endpoint | ProcessTimer | None = None
+        self._last: Thing | None = None
         self._is_stopping = False
         self._graph = GraphChange(self)
         door.domain.graph.changed.append(self._graph.note)
@@ -117,15 +105,11 @@ class Process:
             Say.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
             Say.QOS: self._qos,
             Say.MATCHED: self._matched,
+            Say.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_node)),
             Say.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
         }
         self._records: dict[int, Callable[[Fields], None]] = {
-            Say.NODE: self._node,
-            Say.PUBLISHER: self._publisher,
-            Say.SUBSCRIPTION: self._subscription,
-            Say.SERVICE: self._service,
-            Say.CLIENT: self._client,
-            Say.TIMER: self._timer,
+            **self.things.records,
             Say.GONE: self._gone,
             Say.REQUEST: self._request,
             Say.RESPONSE: self._response,
@@ -168,11 +152,11 @@ class Process:
         """Whether one of its threads waits for a change of the graph now."""
         return GRAPH_ID in self._wanted
 
-    def wants(self, thing: Endpoint | ProcessTimer) -> bool:
+    def wants(self, thing: Thing) -> bool:
         """Return whether one of its threads waits for a thing now."""
         return thing.number in self._wanted
 
-    def hold(self, thing: Endpoint | ProcessTimer) -> None:
+    def hold(self, thing: Thing) -> None:
         """Keep what is ready until the process waits for it."""
         self._held.append(thing)
 
@@ -189,6 +173,10 @@ class Process:
     def see_graph(self) -> None:
         """Let those threads go on that wait for a change of the graph."""
         self._go(self._wanted[GRAPH_ID], Ready.GRAPH, GRAPH_ID, b"")
+
+    def own(self, timer: ProcessTimer) -> None:
+        """Give a timer whose callback has run to a node."""
+        self.things.own(timer)
 
     def was_no_callback(self) -> None:
         """Say that the event under way is no callback's: an executor's own timer was due."""
@@ -208,16 +196,17 @@ class Process:
     def _converse(self) -> None:
         """Take what the process says until it waits again, or has ended."""
         while True:
-            batch = self.child.receive()
-            if batch is None:
-                self._has_ended()
-                return
             try:
-                answer = self._take_batch(batch)
+                batch = self.child.receive()
+                answer = b"" if batch is None else self._take_batch(batch)
             except _NOT_A_BATCH:
                 self.child.kill()
                 self._has_ended("wrote something of its own to")
                 return
+            if batch is None:
+                self._has_ended()
+                return
+            self.child.taken()
             if answer is None:
                 return
             if answer:
@@ -315,6 +304,8 @@ class Process:
         :raises NodeError: if it has failed, and the job does not say to go on.
         """
         ended = self.child.reap()
+        with suppress(*_NOT_A_BATCH):
+            self._take_batch(self.child.left())
         self.ended = Ended(ended.status, broken_link or ended.broken_link)
         self.vanish()
         self.door.has_ended(self)
@@ -345,9 +336,7 @@ class Process:
         """Destroy all that it has made."""
         for waking in self._waking.values():
             waking.off()
-        for thing in reversed(list(self.things.values())):
-            thing.destroy()
-        self.things.clear()
+        self.things.give_all_up()
         self._wanted.clear()
 
     # -- what it asks ----------------------------------------------------------------------------
@@ -370,83 +359,9 @@ class Process:
         others = end.subscriptions if isinstance(end, Publisher) else end.publishers
         return HEAD.pack(len(others))
 
-    # -- what it makes ---------------------------------------------------------------------------
-
-    def _node(self, fields: Fields) -> None:
-        number, name, namespace = fields.number(), fields.text(), fields.text()
-        graph = self.door.domain.graph
-        taken = {other.number for other in graph.nodes_named(full_name(namespace, name))}
-        node = self.door.domain.join(name, namespace, self.door)
-        node.number = next(count for count in itertools.count(1) if count not in taken)
-        node.process = self
-        self.things[number] = node
-        self._nodes.append(node)
-
-    def _publisher(self, fields: Fields) -> None:
-        number, node = fields.number(), self.things[fields.number()]
-        topic, type_name, qos = fields.text(), fields.text(), fields.qos()
-        kind = RosoutPublisher if topic == TOPIC_ROSOUT else Publisher
-        domain = self.door.domain
-        self.things[number] = end = kind(
-            domain.transport, node, topic, self.door.message_type(type_name), qos
-        )
-        domain.graph.add_publisher(end)
-
-    def _subscription(self, fields: Fields) -> None:
-        number, node = fields.number(), self.things[fields.number()]
-        topic, type_name, qos = fields.text(), fields.text(), fields.qos()
-        graph = self.door.domain.graph
-        settled = graph.settled_request(topic, qos)
-        type = self.door.message_type(type_name)
-        end = ProcessSubscription(self, number, node, topic, type, settled)
-        self.things[number] = end
-        graph.add_subscription(end)
-
-    def _service(self, fields: Fields) -> None:
-        domain = self.door.domain
-        number, node = fields.number(), self.things[fields.number()]
-        name, type, qos = fields.text(), self.door.service_type(fields.text()), fields.qos()
-        end = ProcessService(self, number, domain.transport, node, name, type, qos)
-        self.things[number] = end
-        domain.graph.add_service(end)
-
-    def _client(self, fields: Fields) -> None:
-        domain = self.door.domain
-        number, node = fields.number(), self.things[fields.number()]
-        name, type, qos = fields.text(), self.door.service_type(fields.text()), fields.qos()
-        end = ProcessClient(self, number, domain.transport, node, name, type, qos)
-        self.things[number] = end
-        domain.graph.add_client(end)
-
-    def _timer(self, fields: Fields) -> None:
-        number, may_be_an_executors, period_ns = fields.unpack(_TIMER)
-        timer = ProcessTimer(self.dispatcher, self, number, period_ns)
-        timer.cancel()  # until the process says when it is due
-        self.things[number] = timer
-        if not may_be_an_executors:
-            self.own(timer)
-
-    def own(self, timer: ProcessTimer) -> None:
-        """Give a timer to the node that was made last: no function of rcl says whose it is."""
-        if timer.node is not None or not self._nodes:
-            return
-        self._timers_named += 1
-        timer.name = f"timer {self._timers_named}"
-        timer.node = self._nodes[-1]
-        timer.node.timers.append(timer)
-        self.dispatcher.entities.look_again(timer.node)
-        event = self.dispatcher.event
-        if event.entity == timer.entity_id:
-            event.node = timer.node
-
     def _gone(self, fields: Fields) -> None:
-        thing: DomainEntity = self.things.pop(fields.number())
+        self.things.give_up(fields.number())
         self._waits, self._same_wait = (), b""
-        if isinstance(thing, ProcessTimer) and thing.node is not None:
-            thing.node.timers.remove(thing)
-        elif isinstance(thing, Participant):
-            self._nodes.remove(thing)
-        thing.destroy()
 
     # -- what it does ----------------------------------------------------------------------------
 
@@ -476,80 +391,3 @@ class Process:
 
     def _alive(self, fields: Fields) -> None:
         self.things[fields.number()].assert_liveliness()
-
-
-class WakingTimer:
-    """Wakes a thread of a process when the time is over for which it sleeps or waits."""
-
-    def __init__(self, process: Process, thread: int) -> None:
-        self._process = process
-        self._thread = thread
-        dispatcher = process.dispatcher
-        self._state = TimerState(
-            0, dispatcher.loop.now_ns, order=dispatcher.entities.new_id(), owner=self
-        )
-        self._asleep: tuple[int, Any, int] | None = None
-        self._at_ns: int | None = None
-
-    def at(self, deadline_ns: int, *, asleep: bool) -> None:
-        """Wake it at a time; ``asleep`` says that the event under way goes on then."""
-        if deadline_ns == self._at_ns:  # it sleeps on, whoever ran in between
-            return
-        self._at_ns = deadline_ns
-        dispatcher = self._process.dispatcher
-        event = dispatcher.event
-        self._asleep = (event.entity, event.node, dispatcher.loop.events) if asleep else None
-        self._state.deadline_ns = deadline_ns
-        dispatcher.loop.timers.add(self._state)
-
-    def off(self) -> None:
-        """Forget it: the thread goes on."""
-        self._at_ns = None
-        self._process.dispatcher.loop.timers.remove(self._state)
-
-    def dispatch(self) -> None:
-        """Let the thread go on, as an event."""
-        self.off()
-        entity, node, cause = self._asleep or (self._process.entity_id, None, NO_EVENT)
-        self._process.dispatcher.execute(
-            self, entity, node, _RESUME, self._process.wake, (self._thread,), cause, 0, 0
-        )
-
-    def describe(self) -> str:
-        """Name it for people."""
-        return f"{self._process.name}: the end of a wait"
-
-
-class GraphChange:
-    """Wakes a process that waits for the graph to change; what changes before it waits, counts."""
-
-    def __init__(self, process: Process) -> None:
-        self._process = process
-        self._is_due = False
-        self._is_queued = False
-
-    def note(self) -> None:
-        """The graph has changed."""
-        self._is_due = True
-        self.look()
-
-    def look(self) -> None:
-        """Wake the process if it waits for a change that there was."""
-        if self._is_due and not self._is_queued and self._process.waits_for_graph:
-            self._is_queued = True
-            self._process.dispatcher.loop.ready.append(self)
-
-    def dispatch(self) -> None:
-        """Let the process go on, as an event, if it still waits."""
-        self._is_queued = False
-        process = self._process
-        if not process.waits_for_graph:
-            return
-        self._is_due = False
-        process.dispatcher.execute(
-            self, process.entity_id, None, _RESUME, process.see_graph, (), NO_EVENT, 0, 0
-        )
-
-    def describe(self) -> str:
-        """Name it for people."""
-        return f"{self._process.name}: a change of the graph"

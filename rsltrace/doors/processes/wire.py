@@ -54,7 +54,8 @@ class Say(IntEnum):
     MATCHED = 21
     GRAPH = 22
     ALIVE = 23
-    BELL = 24
+    QOS_EVENT = 24
+    FOLLOWS = 25
 
 
 class Told(IntEnum):
@@ -64,6 +65,7 @@ class Told(IntEnum):
     ANSWER = 2
     STOP = 3
     KILL = 4
+    SHARED = 5
 
 
 class Ready(IntEnum):

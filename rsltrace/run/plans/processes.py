@@ -141,6 +141,7 @@ def process_door(job: Job, world: World) -> ProcessDoor:
     door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
     programs = world.stacks.programs
     door.on_end = lambda key: programs.tell("ended", key)
+    door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
 
     def start(entry: Entry, cause: tuple[int, int]) -> None:
         assert isinstance(entry.program, Program)

@@ -2,6 +2,8 @@
 
 #include <unordered_map>
 
+#include "listeners.h"
+
 namespace rsltrace {
 
 namespace {
@@ -33,6 +35,7 @@ void remember(Endpoint *endpoint) { endpoints()[endpoint->id] = endpoint; }
 
 void forget(std::uint32_t id) {
   endpoints().erase(id);
+  listen_no_more(id);
   Writer body;
   body.number(id);
   if (linked()) say(Say::GONE, body);

@@ -18,13 +18,13 @@
 
 #include "endpoints.h"
 #include "guard_conditions.h"
+#include "shared.h"
 #include "threads.h"
 
 namespace rsltrace {
 
 namespace {
 
-constexpr std::size_t HEAD = 4;  // the length of a batch, before it
 constexpr std::size_t ROOM = 1 << 16;
 
 int link_fd = -1;
@@ -32,12 +32,18 @@ std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
 std::size_t filled = 0;  // bytes of what has been received
 
-// Not static objects: the link is up before these are made, and goes on when they are gone.
-std::vector<std::uint8_t> &batch_there() {
-  static auto *all = new std::vector<std::uint8_t>(HEAD);
-  return *all;
+// What the process has said and the loop has not taken: its length, then whole records. The loop
+// sets the length to zero, and finds here what a process has said that was killed.
+__constinit Shared said;
+__constinit Shared told;
+
+std::atomic<std::uint64_t> &length_said() {
+  return *reinterpret_cast<std::atomic<std::uint64_t> *>(said.data);
 }
 
+constexpr std::size_t LENGTH = sizeof(std::uint64_t);
+
+// Not a static object: the link is up before these are made, and goes on when they are gone.
 std::vector<std::uint8_t> &received_there() {
   static auto *all = new std::vector<std::uint8_t>(ROOM);
   return *all;
@@ -51,26 +57,13 @@ std::vector<std::uint8_t> &received_there() {
 // The loop is gone, or says nothing that makes sense: nothing of this process may outlive the run.
 [[noreturn]] void lost() { leave(120); }
 
-void append(const void *data, std::size_t size) {
-  const auto *first = static_cast<const std::uint8_t *>(data);
-  auto &batch = batch_there();
-  batch.insert(batch.end(), first, first + size);
-}
-
 void send_batch() {
-  auto &batch = batch_there();
-  const auto size = static_cast<std::uint32_t>(batch.size() - HEAD);
-  std::memcpy(batch.data(), &size, HEAD);
-  const std::uint8_t *next = batch.data();
-  std::size_t left = batch.size();
-  while (left > 0) {
-    const auto sent = syscall(SYS_sendto, link_fd, next, left, MSG_NOSIGNAL, nullptr, 0);
-    if (sent < 0 && errno == EINTR) continue;
-    if (sent <= 0) lost();
-    next += sent;
-    left -= static_cast<std::size_t>(sent);
+  const auto size = static_cast<std::uint32_t>(length_said().load());
+  while (true) {
+    const auto sent = syscall(SYS_sendto, link_fd, &size, sizeof size, MSG_NOSIGNAL, nullptr, 0);
+    if (sent == sizeof size) return;
+    if (sent >= 0 || errno != EINTR) lost();
   }
-  batch.resize(HEAD);
 }
 
 // Read until `size` bytes are there.
@@ -98,18 +91,24 @@ Message listen() {
   std::uint32_t head[2];
   receive(sizeof head);
   std::memcpy(head, received_there().data(), sizeof head);
-  receive(sizeof head + head[0]);
+  const bool is_shared = static_cast<Told>(head[1]) == Told::SHARED;
+  receive(sizeof head + (is_shared ? 0 : head[0]));
   const auto kind = static_cast<Told>(head[1]);
   if (kind == Told::KILL) {
     fflush(nullptr);
     leave(0);
   }
-  return {kind, received_there().data() + sizeof head, head[0]};
+  if (!is_shared) return {kind, received_there().data() + sizeof head, head[0]};
+  if (head[0] > told.size && !told.look_again()) lost();
+  std::memcpy(head, told.data, sizeof head);
+  return {static_cast<Told>(head[1]), told.data + sizeof head, head[0]};
 }
 
 void forked() {
   if (link_fd >= 0) syscall(SYS_close, link_fd);
   link_fd = -1;
+  said.forget();
+  told.forget();
 }
 
 // What this process starts itself is no part of the run.
@@ -133,12 +132,14 @@ void forget_environment() {
 }
 
 __attribute__((constructor(101))) void begin() {
-  const char *told = getenv("RSLTRACE_LINK");
+  const char *link = getenv("RSLTRACE_LINK");
   int fd = -1;
   int parent = 0;
-  if (told == nullptr || sscanf(told, "%d:%d", &fd, &parent) != 2) return;
+  int files[2] = {-1, -1};
+  if (link == nullptr || sscanf(link, "%d:%d:%d:%d", &fd, &parent, &files[0], &files[1]) != 4) return;
   if (getppid() != parent) return;  // started by a process of the run: outside of it
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
+  if (!said.open(files[0]) || !told.open(files[1])) leave(120);
   link_fd = fd;
   fcntl(fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
   forget_environment();
@@ -151,11 +152,6 @@ __attribute__((constructor(101))) void begin() {
   seed_of_process = reader.number<std::uint64_t>();
 }
 
-// What was put out after the last wait still counts.
-__attribute__((destructor(101))) void end() {
-  if (linked() && batch_there().size() > HEAD) send_batch();
-}
-
 }  // namespace
 
 bool linked() { return link_fd >= 0; }
@@ -165,10 +161,17 @@ std::int64_t now_ns() { return time_ns; }
 std::uint64_t seed() { return seed_of_process; }
 
 void say(Say kind, const Writer &body) {
+  if (!linked()) return;
   const std::uint32_t head[2] = {static_cast<std::uint32_t>(kind),
                                  static_cast<std::uint32_t>(body.bytes.size())};
-  append(head, sizeof head);
-  append(body.bytes.data(), body.bytes.size());
+  const std::size_t start = LENGTH + length_said().load(std::memory_order_relaxed);
+  if (start > said.size) lost();  // the program has written over it
+  const std::size_t end = start + sizeof head + body.bytes.size();
+  if (end > said.size && !said.grow(2 * end)) lost();
+  std::memcpy(said.data + start, head, sizeof head);
+  if (!body.bytes.empty())
+    std::memcpy(said.data + start + sizeof head, body.bytes.data(), body.bytes.size());
+  length_said().store(end - LENGTH, std::memory_order_release);  // not before it is whole
 }
 
 std::vector<std::uint8_t> ask(Say kind, const Writer &body) {

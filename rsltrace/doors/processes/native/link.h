@@ -47,7 +47,8 @@ bool linked();
 std::int64_t now_ns();
 std::uint64_t seed();
 
-// Append a record to the batch that goes out with the next wait or question.
+// Append a record to the batch that the loop takes with the next wait or question, or if the process
+// ends.
 void say(Say kind, const Writer &body);
 // Send the batch with a question at its end, and return the answer.
 std::vector<std::uint8_t> ask(Say kind, const Writer &body);

@@ -228,21 +228,3 @@ RSLTRACE_EXPORT rmw_ret_t rmw_get_subscriptions_info_by_topic(
   return endpoints_on(node, allocator, topic, result, About::SUBSCRIPTIONS_ON,
                       RMW_ENDPOINT_SUBSCRIPTION);
 }
-
-RSLTRACE_EXPORT rmw_ret_t rmw_qos_profile_check_compatible(
-    const rmw_qos_profile_t publisher, const rmw_qos_profile_t subscription,
-    rmw_qos_compatibility_type_t *compatibility, char *reason, size_t reason_size) {
-  RSLTRACE_NOT_NULL(compatibility);
-  const bool apart =
-      (publisher.reliability == RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT &&
-       subscription.reliability == RMW_QOS_POLICY_RELIABILITY_RELIABLE) ||
-      (publisher.durability == RMW_QOS_POLICY_DURABILITY_VOLATILE &&
-       subscription.durability == RMW_QOS_POLICY_DURABILITY_TRANSIENT_LOCAL) ||
-      (publisher.liveliness == RMW_QOS_POLICY_LIVELINESS_AUTOMATIC &&
-       subscription.liveliness == RMW_QOS_POLICY_LIVELINESS_MANUAL_BY_TOPIC);
-  *compatibility = apart ? RMW_QOS_COMPATIBILITY_ERROR : RMW_QOS_COMPATIBILITY_OK;
-  if (reason != nullptr && reason_size > 0) {
-    snprintf(reason, reason_size, "%s", apart ? "ERROR: policies do not match;" : "");
-  }
-  return RMW_RET_OK;
-}

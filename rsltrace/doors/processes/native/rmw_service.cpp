@@ -1,6 +1,7 @@
 // Services and clients: requests and responses, with the number of the request and who asked.
 #include <rmw/get_service_names_and_types.h>
 
+#include "listeners.h"
 #include "rmw_common.h"
 
 using namespace rsltrace;
@@ -132,10 +133,12 @@ RSLTRACE_EXPORT rmw_ret_t rmw_get_gid_for_client(const rmw_client_t *client, rmw
   return RMW_RET_OK;
 }
 
-RSLTRACE_EXPORT rmw_ret_t rmw_client_set_on_new_response_callback(rmw_client_t *,
+RSLTRACE_EXPORT rmw_ret_t rmw_client_set_on_new_response_callback(rmw_client_t *client,
                                                                   rmw_event_callback_t callback,
-                                                                  const void *) {
-  return callback == nullptr ? RMW_RET_OK : unsupported("executors driven by callbacks of rmw");
+                                                                  const void *data) {
+  RSLTRACE_OURS(client);
+  listen_to(endpoint(client), callback, data);
+  return RMW_RET_OK;
 }
 
 RSLTRACE_EXPORT rmw_service_t *rmw_create_service(const rmw_node_t *node,
@@ -180,8 +183,10 @@ RSLTRACE_EXPORT rmw_ret_t rmw_service_response_publisher_get_actual_qos(
   return qos_of(service, qos);
 }
 
-RSLTRACE_EXPORT rmw_ret_t rmw_service_set_on_new_request_callback(rmw_service_t *,
+RSLTRACE_EXPORT rmw_ret_t rmw_service_set_on_new_request_callback(rmw_service_t *service,
                                                                   rmw_event_callback_t callback,
-                                                                  const void *) {
-  return callback == nullptr ? RMW_RET_OK : unsupported("executors driven by callbacks of rmw");
+                                                                  const void *data) {
+  RSLTRACE_OURS(service);
+  listen_to(endpoint(service), callback, data);
+  return RMW_RET_OK;
 }

@@ -2,6 +2,7 @@
 #include <rmw/dynamic_message_type_support.h>
 #include <rmw/get_network_flow_endpoints.h>
 
+#include "listeners.h"
 #include "rmw_common.h"
 
 using namespace rsltrace;
@@ -224,8 +225,10 @@ RSLTRACE_EXPORT rmw_ret_t rmw_serialization_support_init(
   return unsupported("dynamic messages");
 }
 
-RSLTRACE_EXPORT rmw_ret_t rmw_subscription_set_on_new_message_callback(rmw_subscription_t *,
+RSLTRACE_EXPORT rmw_ret_t rmw_subscription_set_on_new_message_callback(rmw_subscription_t *subscription,
                                                                        rmw_event_callback_t callback,
-                                                                       const void *) {
-  return callback == nullptr ? RMW_RET_OK : unsupported("executors driven by callbacks of rmw");
+                                                                       const void *data) {
+  RSLTRACE_OURS(subscription);
+  listen_to(endpoint(subscription), callback, data);
+  return RMW_RET_OK;
 }

@@ -1,8 +1,10 @@
 // Clocks of ROS show simulated time, whether or not a node has use_sim_time: the loop is where time
-// comes from, so what /clock says changes nothing.
-#include <rcl/time.h>
+// comes from, so what /clock says changes nothing, unless the job says that it does.
+#include "ros_clocks.h"
+
 #include <rcutils/time.h>
 
+#include <map>
 #include <set>
 
 #include "link.h"
@@ -39,35 +41,84 @@ std::set<const rcl_clock_t *> &set_by_topic() {
   return *all;
 }
 
+// Whether what sets a clock counts, for all that somebody has tried to set so far.
+std::map<const rcl_clock_t *, bool> &asked_about() {
+  static auto *all = new std::map<const rcl_clock_t *, bool>;
+  return *all;
+}
+
 rcl_ret_t check(const rcl_clock_t *clock) {
   return clock != nullptr && clock->type == RCL_ROS_TIME ? RCL_RET_OK : RCL_RET_INVALID_ARGUMENT;
 }
 
+// Whether rcl is to do what it does natively with a clock that somebody sets.
+bool is_rcls(const rcl_clock_t *clock) {
+  if (check(clock) != RCL_RET_OK || !linked()) return true;
+  const auto [found, is_new] = asked_about().insert({clock, false});
+  if (is_new) {
+    const auto answer = ask(Say::FOLLOWS, Writer());
+    found->second = Reader(answer.data(), answer.size()).number<std::uint32_t>() != 0;
+  }
+  return found->second;
+}
+
+template <typename Function>
+Function *rcl(const char *name) {
+  return reinterpret_cast<Function *>(original("librcl.so", name));
+}
+
 }  // namespace
 
+namespace rsltrace {
+
+bool may_be_driven(const rcl_clock_t &clock) {
+  const auto found = asked_about().find(&clock);
+  return found != asked_about().end() && found->second;
+}
+
+bool is_driven(const rcl_clock_t &clock) {
+  static const auto real =
+      rcl<decltype(rcl_is_enabled_ros_time_override)>("rcl_is_enabled_ros_time_override");
+  bool is_enabled = false;
+  if (!may_be_driven(clock)) return false;
+  return real(const_cast<rcl_clock_t *>(&clock), &is_enabled) == RCL_RET_OK && is_enabled;
+}
+
+}  // namespace rsltrace
+
 RSLTRACE_EXPORT rcl_ret_t rcl_enable_ros_time_override(rcl_clock_t *clock) {
-  if (check(clock) == RCL_RET_OK) set_by_topic().insert(clock);
-  return check(clock);
+  static const auto real =
+      rcl<decltype(rcl_enable_ros_time_override)>("rcl_enable_ros_time_override");
+  if (is_rcls(clock)) return real(clock);
+  set_by_topic().insert(clock);
+  return RCL_RET_OK;
 }
 
 RSLTRACE_EXPORT rcl_ret_t rcl_disable_ros_time_override(rcl_clock_t *clock) {
+  static const auto real =
+      rcl<decltype(rcl_disable_ros_time_override)>("rcl_disable_ros_time_override");
+  if (is_rcls(clock)) return real(clock);
   set_by_topic().erase(clock);
-  return check(clock);
+  return RCL_RET_OK;
 }
 
 RSLTRACE_EXPORT rcl_ret_t rcl_is_enabled_ros_time_override(rcl_clock_t *clock, bool *is_enabled) {
-  if (is_enabled == nullptr) return RCL_RET_INVALID_ARGUMENT;
-  *is_enabled = set_by_topic().count(clock) > 0;
-  return check(clock);
+  static const auto real =
+      rcl<decltype(rcl_is_enabled_ros_time_override)>("rcl_is_enabled_ros_time_override");
+  if (is_enabled == nullptr || set_by_topic().count(clock) == 0) return real(clock, is_enabled);
+  *is_enabled = true;
+  return RCL_RET_OK;
 }
 
-RSLTRACE_EXPORT rcl_ret_t rcl_set_ros_time_override(rcl_clock_t *clock, rcl_time_point_value_t) {
-  return check(clock);
+RSLTRACE_EXPORT rcl_ret_t rcl_set_ros_time_override(rcl_clock_t *clock,
+                                                    rcl_time_point_value_t time) {
+  static const auto real = rcl<decltype(rcl_set_ros_time_override)>("rcl_set_ros_time_override");
+  return is_rcls(clock) ? real(clock, time) : RCL_RET_OK;
 }
 
 RSLTRACE_EXPORT rcl_ret_t rcl_clock_fini(rcl_clock_t *clock) {
-  using Fini = rcl_ret_t(rcl_clock_t *);
-  static const auto real = reinterpret_cast<Fini *>(original("librcl.so", "rcl_clock_fini"));
+  static const auto real = rcl<decltype(rcl_clock_fini)>("rcl_clock_fini");
   set_by_topic().erase(clock);
+  asked_about().erase(clock);
   return real(clock);
 }

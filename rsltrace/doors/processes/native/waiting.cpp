@@ -43,7 +43,7 @@ Found ready_here(const Wanted &wanted) {
     wanted.conditions[i].condition->is_triggered = false;
     return {Found::Kind::CONDITION, i};
   }
-  for (std::size_t i = 0; i < wanted.receivers.size(); i++) {
+  for (std::size_t i = 0; !wanted.only_new && i < wanted.receivers.size(); i++) {
     if (!wanted.receivers[i].endpoint->inbox.empty()) return {Found::Kind::RECEIVER, i};
   }
   return {};
@@ -112,6 +112,8 @@ RSLTRACE_EXPORT rmw_ret_t rmw_destroy_wait_set(rmw_wait_set_t *wait_set) {
 
 namespace {
 
+constexpr std::uint32_t EVENT = 3;  // the kind after those of the arrays
+
 // The arrays of a wait set of rmw; what is not ready becomes null in them.
 struct Arrays {
   void **items[3];
@@ -147,6 +149,10 @@ RSLTRACE_EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions,
       if (item != nullptr) wanted.receivers.push_back({static_cast<Endpoint *>(item), i, kind});
     }
   }
+  for (std::size_t i = 0; events != nullptr && i < events->event_count; i++) {
+    auto *item = static_cast<rmw_event_t *>(events->events[i]);
+    if (item != nullptr) wanted.receivers.push_back({static_cast<Endpoint *>(item->data), i, EVENT});
+  }
   for (std::size_t i = 0; conditions != nullptr && i < conditions->guard_condition_count; i++) {
     void *item = conditions->guard_conditions[i];
     if (item != nullptr) wanted.conditions.push_back({static_cast<GuardCondition *>(item), i});
@@ -154,8 +160,11 @@ RSLTRACE_EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions,
   const auto timeout_ns =
       timeout == nullptr ? -1 : static_cast<std::int64_t>(rmw_time_total_nsec(*timeout));
   const Found found = wait_for_one(wanted, timeout_ns, "rmw_wait");
+  const bool is_receiver = found.kind == Found::Kind::RECEIVER;
   for (std::size_t i = 0; events != nullptr && i < events->event_count; i++) {
-    events->events[i] = nullptr;
+    const bool is_it = is_receiver && wanted.receivers[found.index].kind == EVENT &&
+                       wanted.receivers[found.index].place == i;
+    if (!is_it) events->events[i] = nullptr;
   }
   const bool is_condition = found.kind == Found::Kind::CONDITION;
   for (std::size_t i = 0; conditions != nullptr && i < conditions->guard_condition_count; i++) {
@@ -163,10 +172,10 @@ RSLTRACE_EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions,
       conditions->guard_conditions[i] = nullptr;
     }
   }
-  if (found.kind == Found::Kind::RECEIVER) {
+  if (is_receiver) {
     clear_others(arrays, wanted.receivers[found.index].kind, wanted.receivers[found.index].place);
   } else {
-    clear_others(arrays, 3, 0);
+    clear_others(arrays, EVENT, 0);
   }
   return found.kind == Found::Kind::NOTHING ? RMW_RET_TIMEOUT : RMW_RET_OK;
 }

@@ -23,6 +23,7 @@ struct Wanted {
   std::vector<Condition> conditions;
   std::vector<Receiver> receivers;
   std::vector<std::uint32_t> timers;
+  bool only_new = false;  // what has been handed over before does not count
 };
 
 struct Found {

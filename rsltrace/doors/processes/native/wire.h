@@ -9,8 +9,9 @@
 
 namespace rsltrace {
 
-// From the library to the loop. A batch is its length, then records of (kind, length, body); the
-// last record says what the process wants: to be answered, or to wait.
+// From the library to the loop. A batch is records of (kind, length, body) in memory that both see
+// (shared.h), and its length is sent; the last record says what the process wants: to be answered,
+// or to wait.
 enum class Say : std::uint32_t {
   HELLO = 1,
   NODE,
@@ -35,11 +36,13 @@ enum class Say : std::uint32_t {
   MATCHED,
   GRAPH,
   ALIVE,
-  BELL,
+  QOS_EVENT,
+  FOLLOWS,
 };
 
-// From the loop to the library: what comes after (length, kind).
-enum class Told : std::uint32_t { GO = 1, ANSWER, STOP, KILL };
+// From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
+// memory that both see.
+enum class Told : std::uint32_t { GO = 1, ANSWER, STOP, KILL, SHARED };
 
 class Writer {
  public:

@@ -1,0 +1,30 @@
+// Memory that the loop sees, too. What the process says lies there until the loop has taken it, so
+// that it is not lost with a process that is killed; large things that the loop says lie there, too.
+#pragma once
+
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+
+namespace rsltrace {
+
+// A file in memory, mapped. Plain data: it is there before constructors run and after destructors.
+class Shared {
+ public:
+  // Map a file; false if that is none.
+  bool open(int fd);
+  // Have room for so many bytes in all; false if there is no memory.
+  bool grow(std::size_t size);
+  // Map what the loop has made it grow by.
+  bool look_again();
+  // Nothing of it remains in a forked copy of this process.
+  void forget();
+  std::uint8_t *data = nullptr;
+  std::size_t size = 0;
+
+ private:
+  bool map(std::size_t size);
+  int fd_ = -1;
+};
+
+}  // namespace rsltrace
