@@ -100,6 +100,13 @@ _LISTING = Rule("directory", _V, "is sorted", "sorted(…)", source=Source.DIREC
 _ENVIRONMENT = Rule(
     "environment", _D, "a finding of the run", "a parameter of the node", source=Source.ENVIRONMENT
 )
+_PID = Rule(
+    "pid",
+    _V,
+    "is a number of the main's own, the same in every run",
+    "a parameter of the node",
+    source=Source.PID,
+)
 _FILE_TIME = Rule(
     "file", _D, "a finding of the run", "what is in the file instead of its age", source=Source.FILE
 )
@@ -300,9 +307,10 @@ RULES: dict[str, Rule] = {
     **_named(
         _ENVIRONMENT,
         "os",
-        "getenv getenvb getpid getppid uname cpu_count process_cpu_count getcwd getlogin "
+        "getenv getenvb getppid uname cpu_count process_cpu_count getcwd getlogin "
         "getloadavg sched_getaffinity",
     ),
+    **_named(_PID, "os", "getpid"),
     **_named(_ENVIRONMENT, "os.path", "expanduser expandvars"),
     **_named(_ENVIRONMENT, "pathlib.Path", "cwd home"),
     **_named(_ENVIRONMENT, "platform", "node uname platform machine processor release version"),

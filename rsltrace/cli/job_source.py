@@ -24,7 +24,13 @@ class RosArgsCommand(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Set the ROS arguments aside before click sees them."""
         own, ctx.meta[_META] = split_ros_arguments(args)
-        return super().parse_args(ctx, own)
+        left = super().parse_args(ctx, own)
+        if ctx.params.get("launch") is not None and not ctx.resilient_parsing:
+            from rsltrace.launch.find import launch_file
+
+            launch, words = launch_file(ctx.params["launch"], ctx.params["words"])
+            ctx.params.update(launch=launch, words=tuple(words))
+        return left
 
 
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -35,7 +41,8 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
             click.option(
                 "--launch",
                 type=click.Path(path_type=Path),
-                help="Run the nodes of a launch file; NAME:=VALUE are its arguments.",
+                help="Run the nodes of a launch file (of a package: --launch PACKAGE FILE); "
+                "NAME:=VALUE are its arguments.",
             ),
             click.option(
                 "--skip-unsupported",

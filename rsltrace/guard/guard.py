@@ -48,6 +48,10 @@ class Context(Protocol):
     def node(self) -> str:
         """Return the node whose code runs, or an empty text."""
 
+    def process(self) -> int:
+        """Return which of the run's processes that is: 0 has the nodes that the job constructs,
+        the mains count from 1 in the order of the job."""
+
     def policy(self) -> Policy | None:
         """Return the policy of that node, or None for the job's."""
 
@@ -233,6 +237,7 @@ ADVICE = {
     Source.DIRECTORY: "sort what is listed",
     Source.FILE: "read the file before the run, or write 'file: record'",
     Source.ENVIRONMENT: "make it a parameter of the node",
+    Source.PID: "name it by a parameter of the node, or write 'pid: virtual'",
     Source.THREAD: "use timers, tasks or callback groups",
     Source.PROCESS: "do it before the run, or write 'process: record'",
     Source.SOCKET: "record what comes from outside into a bag, or write 'socket: record'",

@@ -14,6 +14,7 @@ from rsltrace.guard.virtual.clocks import virtual_clocks
 from rsltrace.guard.virtual.directory_listings import sorted_listings
 from rsltrace.guard.virtual.module_caches import fresh_module_caches
 from rsltrace.guard.virtual.object_texts import numbered_texts
+from rsltrace.guard.virtual.own_process_id import own_process_ids
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.watched.functions import watched_calls
 
@@ -23,6 +24,7 @@ _REPLACEMENTS = (
     virtual_randomness,
     sorted_listings,
     numbered_texts,
+    own_process_ids,
     watched_calls,
     recorded_files,
     recorded_descriptors,

@@ -14,8 +14,8 @@ from rsltrace.launch.apart import read_apart
 from rsltrace.launch.model import Argument, Launched
 from rsltrace.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.launch.specs import node_specs
+from rsltrace.source_packages import source_packages, workspace_of
 from rsltrace.workspace.imports import unbuilt_packages
-from rsltrace.workspace.packages import source_packages, workspace_of
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 from rsltrace.middleware.entity import DomainEntity
@@ -17,6 +17,7 @@ from rsltrace.model.built_in import NODE_SERVICES, NODE_TOPICS
 from rsltrace.model.stamp import format_duration
 
 _ACTION = "/_action/"
+_CLOCK = "/clock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +66,17 @@ class Overview:
         return [link for link in self.links if link.kind == kind]
 
 
-def overview(graph: Graph, waiting: Iterable[str], *, everything: bool = False) -> Overview:
-    """Return the present graph; ``everything`` with what every node has."""
+def overview(
+    graph: Graph,
+    waiting: Iterable[str],
+    *,
+    everything: bool = False,
+    follows: Callable[[str], bool] = lambda node: False,
+) -> Overview:
+    """Return the present graph; ``everything`` with what every node has.
+
+    ``follows`` says whether ``/clock`` drives the time of a node; others listen to it in vain.
+    """
     nodes = tuple(_node(node) for node in graph.nodes)
     links = [*_topics(graph), *_services(graph), *_actions(graph)]
     if not everything:
@@ -76,7 +86,7 @@ def overview(graph: Graph, waiting: Iterable[str], *, everything: bool = False) 
         nodes,
         tuple(links),
         waiting=tuple(waiting),
-        problems=(*_namesakes(nodes), *(one for link in links for one in _problems(link))),
+        problems=(*_namesakes(nodes), *(one for link in links for one in _problems(link, follows))),
     )
 
 
@@ -166,16 +176,31 @@ def _is_everywhere(link: Link) -> bool:
     )
 
 
-def _problems(link: Link) -> Iterator[str]:
+def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:
     for sender, receiver, policy in link.apart:
         yield (
             f"topic {link.name}: {sender.node} and {receiver.node} do not connect: {policy} "
             f"({sender.node} offers {sender.qos}; {receiver.node} asks for {receiver.qos})"
         )
     if link.receivers and not link.senders and link.kind == "topic":
-        names = ", ".join(dict.fromkeys(end.node for end in link.receivers))
-        if link.name not in NODE_TOPICS:
-            yield f"topic {link.name}: {names} subscribes, and nobody publishes"
+        nodes = [end.node for end in link.receivers]
+        if link.name == _CLOCK:
+            waiting = [node for node in nodes if follows(node)]
+            if waiting:
+                yield (
+                    f"topic {_CLOCK}: {_who(waiting, 'goes by it', 'go by it')} (clocks: source: "
+                    "topic), and nobody publishes: ROS time stands still at 0"
+                )
+        elif link.name not in NODE_TOPICS:
+            yield (
+                f"topic {link.name}: {_who(nodes, 'subscribes', 'subscribe')}, and nobody publishes"
+            )
     if link.senders and not link.receivers and link.kind != "topic":
-        names = ", ".join(dict.fromkeys(end.node for end in link.senders))
-        yield f"{link.kind} {link.name}: {names} calls, and nobody serves"
+        who = _who([end.node for end in link.senders], "calls", "call")
+        yield f"{link.kind} {link.name}: {who}, and nobody serves"
+
+
+def _who(nodes: Iterable[str], one: str, several: str) -> str:
+    """Return ``/a subscribes`` or ``/a, /b and /c subscribe``."""
+    *names, last = dict.fromkeys(nodes)
+    return f"{', '.join(names)} and {last} {several}" if names else f"{last} {one}"

@@ -15,6 +15,7 @@ class Source(str, Enum):
     DIRECTORY = "directory"
     FILE = "file"
     ENVIRONMENT = "environment"
+    PID = "pid"
     THREAD = "thread"
     PROCESS = "process"
     SOCKET = "socket"
@@ -46,6 +47,7 @@ MODES: Mapping[Source, tuple[Mode, ...]] = {
     Source.DIRECTORY: (Mode.VIRTUAL, *_ALWAYS),
     Source.FILE: (Mode.RECORD, *_ALWAYS),
     Source.ENVIRONMENT: (Mode.RECORD, *_ALWAYS),
+    Source.PID: (Mode.VIRTUAL, Mode.RECORD, *_ALWAYS),
     Source.THREAD: _ALWAYS,
     Source.PROCESS: (Mode.RECORD, *_ALWAYS),
     Source.SOCKET: (Mode.RECORD, *_ALWAYS),

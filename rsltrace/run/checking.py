@@ -59,9 +59,15 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
             session.stop = session.stop or Stop("checked")
             session.finish()
             raise error
-        found = overview(session.world.domain.graph, session.world.blocked(), everything=everything)
+        world = session.world
+        found = overview(
+            world.domain.graph,
+            world.blocked(),
+            everything=everything,
+            follows=world.clocks.follows if world.clocks is not None else lambda node: False,
+        )
         found = replace(found, problems=(*found.problems, *_played_and_published(found)))
-        graph = session.world.domain.graph
+        graph = world.domain.graph
         never = impossible_starts(session.job, graph, session.start_ns, session.end_ns)
         unused = (*session.unused(), *never)
         session.stop = Stop("checked")

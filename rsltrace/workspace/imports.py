@@ -16,9 +16,9 @@ from types import ModuleType
 from typing import Any
 
 from rsltrace.guard.guard import engage
-from rsltrace.workspace.installs import executables, modules
+from rsltrace.source_packages import SourcePackage, source_packages
+from rsltrace.workspace.installs import compiled_executables, executables, modules
 from rsltrace.workspace.interfaces import interface_prefix
-from rsltrace.workspace.packages import SourcePackage, source_packages
 from rsltrace.workspace.share import share_prefix
 
 _KINDS = ("msg", "srv", "action")
@@ -163,6 +163,12 @@ def unbuilt_executables(package: str) -> dict[str, str | Path]:
     return found
 
 
+def unbuilt_programs(package: str) -> set[str]:
+    """Return the names of what a package would have, were it built: its compiled programs."""
+    sources = [one.packages[package] for one in _open if package in one.packages]
+    return {name for source in sources for name in compiled_executables(source)}
+
+
 def unbuilt_prefix(package: str) -> Path | None:
     """Return a prefix with the ``share`` of a package that is used as if it were built."""
     prefixes = (workspace.prefix(package) for workspace in _open)
@@ -250,4 +256,5 @@ __all__ = [
     "unbuilt_names",
     "unbuilt_packages",
     "unbuilt_prefix",
+    "unbuilt_programs",
 ]

@@ -18,12 +18,17 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rsltrace.workspace.packages import SourcePackage, source_packages
+from rsltrace.source_packages import SourcePackage, source_packages
 
 _COMMENT = re.compile(r"#[^\n]*")
 _INSTALL = re.compile(r"\binstall\s*\(\s*(DIRECTORY|FILES|PROGRAMS)\b([^)]*)\)", re.IGNORECASE)
 _PYTHON_PACKAGE = re.compile(r"\bament_python_install_package\s*\(\s*([\w./-]+)([^)]*)\)")
 _PROJECT = re.compile(r"\bproject\s*\(\s*([\w-]+)", re.IGNORECASE)
+_PROGRAM = re.compile(
+    r"\b(?:ament_auto_)?add_executable\s*\(\s*([^\s)]+)"
+    r"|\brclcpp_components_register_node\s*\([^)]*\bEXECUTABLE\s+([^\s)]+)",
+    re.IGNORECASE,
+)
 _RENAME = re.compile(r"\bRENAME\s+(\S+)")
 _END = re.compile(
     r"\b(?:PATTERN|REGEX|FILES_MATCHING|USE_SOURCE_PERMISSIONS|PERMISSIONS|OPTIONAL|RENAME)\b.*",
@@ -85,6 +90,12 @@ def executables(package: SourcePackage) -> dict[str, str | Path]:
     return found
 
 
+def compiled_executables(package: SourcePackage) -> set[str]:
+    """Return the names of the programs that a package has to be built for, as far as they are
+    written out."""
+    return {(name or other).strip('"') for name, other in _PROGRAM.findall(_cmake(package))}
+
+
 def modules(package: SourcePackage) -> dict[str, Path]:
     """Return the modules that a package would install, by name: files, or folders with modules."""
     setup = _setup(package.folder)
@@ -141,9 +152,7 @@ def _console_scripts(folder: Path) -> dict[str, str]:
         name, equals, target = str(line).partition("=")
         if equals:
             found[name.strip()] = target.partition("[")[0].strip()
-    for name, target in _project(folder).get("scripts", {}).items():
-        found[name] = str(target)
-    return found
+    return {**found, **_pyproject_scripts(folder)}
 
 
 @cache
@@ -176,13 +185,19 @@ def _setup_cfg(folder: Path) -> configparser.ConfigParser:
     return parser
 
 
-def _project(folder: Path) -> dict[str, Any]:
-    """Return ``[project]`` of ``pyproject.toml``; Python 3.10 cannot read it."""
+def _pyproject_scripts(folder: Path) -> dict[str, str]:
+    """Return the scripts of ``pyproject.toml``: the standard's, or those of an older Poetry."""
+    toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
-        text = (folder / "pyproject.toml").read_text("utf-8")
-        found: dict[str, Any] = importlib.import_module("tomllib").loads(text).get("project", {})
-    except (OSError, ImportError, ValueError):
+        table = toml.loads((folder / "pyproject.toml").read_text("utf-8"))
+    except (OSError, ValueError):
         return {}
+    found: dict[str, str] = {}
+    for above in (("tool", "poetry", "scripts"), ("project", "scripts")):
+        scripts: object = table
+        for name in above:
+            scripts = scripts.get(name) if isinstance(scripts, dict) else None
+        found.update(_text_mapping(scripts))
     return found
 
 
@@ -205,4 +220,10 @@ def _cmake(package: SourcePackage) -> str:
     return text
 
 
-__all__ = ["executables", "installed_files", "module_folders", "modules"]
+__all__ = [
+    "compiled_executables",
+    "executables",
+    "installed_files",
+    "module_folders",
+    "modules",
+]

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError, SetupError
+from rsltrace.source_packages import SourcePackage
 from rsltrace.terminal import tell
 from rsltrace.workspace.cache import cached_folder, key_of
-from rsltrace.workspace.packages import SourcePackage
 
 _MADE_BY = "1"
 """Changes when what is made of the same files does."""

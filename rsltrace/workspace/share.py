@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from pathlib import Path, PurePosixPath
 
+from rsltrace.source_packages import SourcePackage
 from rsltrace.workspace.cache import cached_folder, key_of
 from rsltrace.workspace.installs import installed_files
-from rsltrace.workspace.packages import SourcePackage
 
 _INDEX = "share/ament_index/resource_index/packages"
 _NOT_INSTALLED = frozenset(("setup.py", "setup.cfg", "CMakeLists.txt", "test", "src", "include"))

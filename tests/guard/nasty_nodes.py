@@ -341,7 +341,7 @@ def uninitialized(node: Any) -> object:
     return np.empty(1000).tolist()
 
 
-@case(DETECTED, "a generator that is seeded with the process id")
+@case(DETERMINISTIC, "a generator that is seeded with the process id")
 def seeded_by_process(node: Any) -> object:
     return random.Random(os.getpid()).random()
 
@@ -583,7 +583,7 @@ def working_directory(node: Any) -> object:
     return os.getcwd()
 
 
-@case(DETECTED, "the process id")
+@case(DETERMINISTIC, "the process id")
 def process_id(node: Any) -> object:
     return os.getpid()
 

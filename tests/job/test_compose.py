@@ -179,7 +179,7 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
     write(
         "job.yaml",
         """\
-        vars: {robot: husky, size: 3, full: "$(var robot)_$(var size)"}
+        vars: {robot: husky, size: 3, where: src, full: "$(var robot)_$(var size)"}
         nodes:
           - node: m:N
             name: $(var full)
@@ -190,9 +190,12 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
               folder: $(dirname)/maps
               plain: \\$(dirname)
               share: $(find-pkg-share std_msgs)
+              source: $(find-pkg-share not_built)/config
+        search_path: [$(var where)]
         seed: $(var size)
         """,
     )
+    write("src/group/not_built/package.xml", "<package><name>not_built</name></package>")
     job = load_job("job.yaml", overrides=["vars.size=4"])
     node = job.nodes[0]
     assert node.name == "husky_4"
@@ -203,6 +206,7 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
         "folder": f"{folder}/maps",
         "plain": "$(dirname)",
         "share": str(Path(sys.prefix, "share", "std_msgs")),
+        "source": f"{folder}/src/group/not_built/config",
     }
     assert job.seed == 4
     assert "$(" not in job.source_text.replace("plain: \\$(dirname)", "")
@@ -229,7 +233,8 @@ def test_values_are_filled_in(monkeypatch: pytest.MonkeyPatch, folder: Path) -> 
             "$(find-pkg-share no_such_package)",
             7,
             "there is no ROS package 'no_such_package' in "
-            f"AMENT_PREFIX_PATH or {sys.prefix}: install it, or source the workspace that has it",
+            f"AMENT_PREFIX_PATH, {sys.prefix} or the search_path: install it, source the workspace "
+            "that has it, or add its folder to search_path",
         ),
         (
             "$(env",

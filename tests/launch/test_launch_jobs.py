@@ -12,6 +12,7 @@ import pytest
 from rsltrace import Job, Trace
 from rsltrace.errors import JobError
 from rsltrace.job import LaunchSpec, load_job
+from rsltrace.launch.find import launch_file
 from rsltrace.run import run
 
 pytestmark = pytest.mark.ros
@@ -141,11 +142,40 @@ def test_words_that_do_not_fit_together(
         (("a.yaml", "b.yaml"), "one JOB at a time, here are a.yaml and b.yaml"),
         (("job.yaml", "a:=1"), "a:=… is a launch argument: give the launch file with --launch"),
         (("job.yaml", "--skip-unsupported"), "--skip-unsupported: give the launch file"),
-        (("--launch", "no.xml"), "there is no such launch file"),
     ]:
         done = rsltrace("record", *arguments)
         assert done.returncode == 2
         assert message in done.stderr
+
+
+def test_a_launch_file_of_a_package(rsltrace: Command, folder: Path) -> None:
+    robot = folder / "src" / "robot"
+    (robot / "launch").mkdir(parents=True)
+    (robot / "package.xml").write_text("<package><name>robot</name></package>")
+    shutil.copy("demo.launch.xml", robot / "launch" / "demo.launch.xml")
+    for place in ("real/up.launch.xml", "sim/up.launch.xml"):
+        (robot / place).parent.mkdir()
+        (robot / place).write_text("<launch/>")
+    done = rsltrace("record", "--launch", "robot", "demo.launch.xml", "--print-job", "word:=five",
+                    "--skip-unsupported")  # fmt: skip
+    assert "word: five" in done.stdout, done.stderr
+    plain = Path("demo.launch.xml")
+    assert launch_file(plain, ["a:=1"]) == (plain, ["a:=1"])
+    found, words = launch_file(Path("robot"), ["job.yaml", "sim/up.launch.xml", "a:=1"])
+    assert (str(found), words) == ("src/robot/sim/up.launch.xml", ["job.yaml", "a:=1"])
+    for named, given, message in [
+        ("no.xml", [], "--launch: there is no such launch file: no.xml"),
+        ("dmo.launch.xml", [], "dmo.launch.xml; did you mean 'demo.launch.xml'?"),
+        ("src", [], "src is a folder; name a launch file in it: robot/launch/demo.launch.xml"),
+        ("robot", [], "no such launch file: robot (of a package: --launch robot FILE)"),
+        ("rbt", ["up.launch.xml"], "there is no package 'rbt'; did you mean 'robot'?"),
+        ("robot", ["dem.launch.xml"], "no launch file 'dem.launch.xml': did you mean 'demo.launch"),
+        ("robot", ["x.yaml"], "no launch file 'x.yaml': there are demo.launch.xml, up.launch.xml"),
+        ("robot", ["up.launch.xml"], "is several files of robot: real/up.launch.xml, sim/up.laun"),
+    ]:
+        with pytest.raises(JobError) as caught:
+            launch_file(Path(named), given)
+        assert message in str(caught.value)
 
 
 def test_launch_specs_in_python(folder: Path) -> None:

@@ -123,6 +123,34 @@ def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., P
     assert (link["name"], link["senders"][0]["node"]) == ("/numbers", "/talker")
 
 
+@pytest.mark.parametrize(
+    ("clocks", "problems"),
+    [
+        ("[]", ()),
+        (
+            "[{node: /talker, source: topic}]",
+            (
+                "topic /clock: /talker goes by it (clocks: source: topic), and nobody publishes: "
+                "ROS time stands still at 0",
+            ),
+        ),
+        (
+            "{source: topic}",
+            (
+                "topic /clock: /talker and /listener go by it (clocks: source: topic), and nobody "
+                "publishes: ROS time stands still at 0",
+            ),
+        ),
+    ],
+)
+def test_clock_matters_where_it_sets_the_time(
+    clocks: str, problems: tuple[str, ...], job_file: Callable[..., Path]
+) -> None:
+    simulated = "ros_arguments: [-p, 'use_sim_time:=true']"
+    path = job_file(f"{FINE}clocks: {clocks}\n{simulated}\n")
+    assert check_job(load_job(path)).problems == problems
+
+
 MAIN = """
 import rclpy
 

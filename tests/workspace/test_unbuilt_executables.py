@@ -9,8 +9,11 @@ from pathlib import Path
 import pytest
 
 from rsltrace import Trace
+from rsltrace.errors import JobError
+from rsltrace.run.plans.executables import find_executable, why_not
+from rsltrace.source_packages import SourcePackage, workspace_of
+from rsltrace.workspace.imports import unbuilt_packages
 from rsltrace.workspace.installs import executables, modules
-from rsltrace.workspace.packages import SourcePackage, workspace_of
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -158,7 +161,11 @@ def test_what_build_files_say(tmp_path: Path) -> None:
                 "      py_modules=['single'], scripts=['bin/three'], packages=['b', 'b.c'],\n"
                 "      data_files=[('lib/a', ['four.py'])], package_dir={'': 'source'})\n"
             ),
-            "a/pyproject.toml": "[project.scripts]\nfive = 'a.five:main'\n",
+            "a/pyproject.toml": (
+                "[project.scripts]\nfive = 'a.five:main'\n"
+                "[tool.poetry.scripts]\nsix = 'a.six:main'\nfive = 'old:main'\n"
+            ),
+            "b/pyproject.toml": "project = 'no table'\n[tool.poetry]\nscripts = []\n",
             **dict.fromkeys(["a/source/single.py", "a/source/b/__init__.py"], ""),
             **dict.fromkeys(["a/bin/three", "a/four.py", "a/test/__init__.py"], ""),
             "broken/setup.py": "raise SystemExit('no')",
@@ -166,13 +173,14 @@ def test_what_build_files_say(tmp_path: Path) -> None:
         },
     )
     a = SourcePackage("a", tmp_path / "a")
-    found = executables(a)
-    found.pop("five", None)  # Python 3.10 cannot read it
-    assert found == {
+    assert executables(SourcePackage("b", tmp_path / "b")) == {}
+    assert executables(a) == {
         "one": "a.one:main",
         "two": "a.two:main",
         "three": tmp_path / "a" / "bin" / "three",
         "four.py": tmp_path / "a" / "four.py",
+        "five": "a.five:main",
+        "six": "a.six:main",
     }
     source = tmp_path / "a" / "source"
     assert modules(a) == {"single": source / "single.py", "b": source / "b"}
@@ -181,6 +189,36 @@ def test_what_build_files_say(tmp_path: Path) -> None:
         {},
         {"broken": tmp_path / "broken" / "broken"},
     )
+
+
+def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> None:
+    cmake = (
+        "project(driver)\nadd_executable(${PROJECT_NAME}_node src/main.cpp)\n"
+        'rclcpp_components_register_node(parts PLUGIN "d::P"\n  EXECUTABLE part)\n'
+        "# add_executable(old)\ninstall(PROGRAMS run.py DESTINATION lib/${PROJECT_NAME})\n"
+    )
+    _write(
+        tmp_path,
+        {
+            "driver/package.xml": _PACKAGE.format("driver"),
+            "driver/CMakeLists.txt": cmake,
+            "driver/run.py": "",
+            "none/package.xml": _PACKAGE.format("none"),
+        },
+    )
+    with unbuilt_packages([tmp_path]):
+        for target, said in [
+            ("driver/part", "driver/part is a program that nobody has built (CMakeLists.txt of d"),
+            (
+                "driver/driver_nod",
+                "did you mean 'driver_node'?: it has run.py; once it is built",
+            ),
+            ("none/x", "package 'none' has no executable 'x': it has none"),
+        ]:
+            with pytest.raises(JobError) as caught:
+                find_executable(target, where="job.yaml:1:1")
+            assert said in str(caught.value)
+            assert str(caught.value) == f"job.yaml:1:1: {why_not(*target.split('/'))}"
 
 
 def test_the_workspace_around_a_launch_file(tmp_path: Path) -> None:

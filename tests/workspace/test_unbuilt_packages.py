@@ -16,11 +16,11 @@ import pytest
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
 from rsltrace.run import run
+from rsltrace.source_packages import SourcePackage, source_packages
 from rsltrace.trace.reader import Trace
 from rsltrace.workspace import cache
 from rsltrace.workspace.imports import unbuilt_packages
 from rsltrace.workspace.interfaces import interface_prefix
-from rsltrace.workspace.packages import SourcePackage, source_packages
 from rsltrace.workspace.share import share_prefix
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")

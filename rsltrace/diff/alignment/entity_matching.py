@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 from rsltrace.words.entities import EntityKey
 
@@ -28,7 +28,8 @@ class EntityMatching:
 
     ``keys`` and ``nodes`` (the number of the owning node) go by number; ``numbers_a`` and
     ``numbers_b`` give the number of an id, shape (largest id + 1,), -1 where there is no entity.
-    ``same_ids`` says that no id means something else in the other run.
+    ``same_ids`` says that no id means something else in the other run. ``renamed`` are the mains
+    that are called otherwise in b: names in a and b.
     """
 
     keys: tuple[EntityKey, ...]
@@ -39,6 +40,7 @@ class EntityMatching:
     only_b: tuple[int, ...]
     same_ids: bool
     by_key: Mapping[EntityKey, int] = field(repr=False)
+    renamed: tuple[tuple[str, str], ...] = ()
 
     def numbers(self, trace: Trace, ids: npt.NDArray[Any], *, of_b: bool) -> npt.NDArray[np.int64]:
         """Return the numbers of entity ids. Raises TraceError if the trace has no such entity."""
@@ -66,7 +68,8 @@ class EntityMatching:
 def match_entities(a: Trace, b: Trace) -> EntityMatching:
     """Match the entities of two runs. Reads all entities of both."""
     classes_a, classes_b = _classes(a), _classes(b)
-    keys_a, keys_b = _keys(a, classes_b), _keys(b, classes_a)
+    others = _other_names(a, b, same_nodes=classes_a.keys() == classes_b.keys())
+    keys_a, keys_b = _keys(a, classes_b, {}), _keys(b, classes_a, others)
     by_key: dict[EntityKey, int] = {}
     for key in (*keys_a.values(), *keys_b.values()):
         by_key.setdefault(key, len(by_key))
@@ -88,6 +91,7 @@ def match_entities(a: Trace, b: Trace) -> EntityMatching:
         only_b=tuple(number for key, number in by_key.items() if key not in in_a),
         same_ids=bool((numbers_a[:shared] == numbers_b[:shared])[both].all()),
         by_key=by_key,
+        renamed=tuple((name, b.entities[one].name) for one, name in others.items()),
     )
 
 
@@ -97,8 +101,42 @@ def _classes(trace: Trace) -> dict[str, str]:
     return {node.name: node.type for node in nodes}
 
 
-def _keys(trace: Trace, other_classes: Mapping[str, str]) -> dict[int, EntityKey]:
-    """Return the key of every entity, by id, in creation order.
+def _other_names(a: Trace, b: Trace, *, same_nodes: bool) -> dict[int, str]:
+    """Return what mains of ``b`` that ``a`` has not are called there, by id.
+
+    An executable may lie elsewhere, or have another name: two builds of one program, say. It is
+    the one of the same file name; if the nodes are the same in both, the one in the same place
+    among those left over.
+    """
+    mains = [[e for e in t.entities.values() if e.kind is EntityKind.MAIN] for t in (a, b)]
+    names_a, names_b = ({main.name for main in each} for each in mains)
+    left_a = [main for main in mains[0] if main.name not in names_b]
+    left_b = [main for main in mains[1] if main.name not in names_a]
+    found: dict[int, str] = {}
+    for short in (_file_name, _no_name) if same_nodes else (_file_name,):
+        for name in dict.fromkeys(short(main.name) for main in left_b):
+            same_a = [main for main in left_a if short(main.name) == name]
+            same_b = [main for main in left_b if short(main.name) == name]
+            if len(same_a) == len(same_b):
+                found.update((y.id, x.name) for x, y in zip(same_a, same_b, strict=True))
+                left_a = [main for main in left_a if main not in same_a]
+                left_b = [main for main in left_b if main not in same_b]
+    return found
+
+
+def _file_name(name: str) -> str:
+    return name.rpartition("/")[2]
+
+
+def _no_name(name: str) -> str:
+    return ""
+
+
+def _keys(
+    trace: Trace, other_classes: Mapping[str, str], names: Mapping[int, str]
+) -> dict[int, EntityKey]:
+    """Return the key of every entity, by id, in creation order; ``names`` are those to be used in
+    place of entities' own.
 
     A node whose constructor raised has no class in its trace: it is the node of its name.
     """
@@ -108,16 +146,13 @@ def _keys(trace: Trace, other_classes: Mapping[str, str]) -> dict[int, EntityKey
         kind = entity.type
         if entity.kind is EntityKind.NODE and not kind:
             kind = other_classes.get(entity.name, kind)
-        what = (_node_name(trace, entity), entity.kind.label, entity.name, kind)
+        owner = trace.entities.get(entity.node)
+        node = "" if owner is None else names.get(owner.id, owner.name)
+        what = (node, entity.kind.label, names.get(entity.id, entity.name), kind)
         ordinal = seen.get(what, 0)
         seen[what] = ordinal + 1
         keys[entity.id] = EntityKey(*what, ordinal)
     return keys
-
-
-def _node_name(trace: Trace, entity: Entity) -> str:
-    owner = trace.entities.get(entity.node)
-    return owner.name if owner is not None else ""
 
 
 def _table(keys: Mapping[int, EntityKey], by_key: Mapping[EntityKey, int]) -> npt.NDArray[np.int64]:

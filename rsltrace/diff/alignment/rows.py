@@ -138,13 +138,13 @@ def load_rows(run: Run, first: int, last: int) -> Rows:
             rows.number[place] = rows.owner[place] = _constructed(rows, place)
         elif kind == BAG:
             rows.owner[place] = rows.number[place]
-    if not run.matching.same_ids or run.without_zero_delays:
-        rows.content = [
-            hash(tuple(o[:3] for o in rows.outputs(first + place) if counts(run, o)))
-            if count
-            else 0
-            for place, count in enumerate(rows.output_counts)
-        ]
+    anew = not run.matching.same_ids or run.without_zero_delays
+    if anew or run.matching.renamed:  # names are hashed where entities are made
+        for place, count in enumerate(rows.output_counts):
+            if anew or rows.kind[place] == CONSTRUCT:
+                outputs = rows.outputs(first + place) if count else ()
+                content = tuple(o[:3] for o in outputs if counts(run, o))
+                rows.content[place] = hash(content) if count else 0
     return rows
 
 

@@ -31,6 +31,7 @@ _FILE = re.compile(r"\w[\w.]*\((?:PosixPath\()?(['\"])(?:[^'\"]*/)?([^'\"/]+)\1"
 _CONTENT = re.compile(r"(\d+ bytes), (SHA-256 [0-9a-f]+)")
 _VERBS = {
     Source.ENVIRONMENT: "read",
+    Source.PID: "read",
     Source.FILE: "read",
     Source.DIRECTORY: "listed",
     Source.CLOCK: "read",

@@ -38,6 +38,7 @@ from rsltrace.diff.traces.ended_runs import (
     judge_end,
     who_ended,
 )
+from rsltrace.diff.traces.renamed import first_real_difference
 from rsltrace.diff.traces.sides import interruptions, side
 from rsltrace.diff.traces.tolerance import messages_within
 from rsltrace.errors import TraceError, did_you_mean
@@ -97,6 +98,16 @@ class _Comparison:
         self._run_b = Run(b, self._matching, of_b=True, without_zero_delays=delays)
         self._environment = environment_settings(a, b)
         self._notes = list(interruptions(a, b))
+        self._only_names = False
+        """Whether the runs are the same but for names of programs."""
+        if self._matching.renamed:
+            real = first_real_difference(self._run_a, self._run_b, start)
+            self._only_names = real is None
+            self._start = start if real is None else real
+            self._notes += [
+                f"{printable(name_a)} in a is compared with {printable(name_b)} in b"
+                for name_a, name_b in self._matching.renamed
+            ]
         self._counts = EventCounts()
         self._aligned_to = (start, start)
         self._effect: Divergence | None = None
@@ -105,6 +116,8 @@ class _Comparison:
 
     def run(self) -> Diff:
         """Return the answer."""
+        if self._only_names and self._a.complete and self._b.complete:
+            return self._same_but_for_names()
         over = who_ended(self._a, self._b, self._start)
         divergences = [self._ended(over)] if over is not None else self._aligned()
         divergences[0] = first = self._with_failure(divergences[0])
@@ -125,6 +138,20 @@ class _Comparison:
             bytes_read=self._a.bytes_read + self._b.bytes_read,
             notes=tuple(self._notes),
             tolerance=messages_within(self._a, self._b, self._start, self._options),
+        )
+
+    def _same_but_for_names(self) -> Diff:
+        events = self._a.event_count
+        return Diff(
+            a=side(self._a),
+            b=side(self._b),
+            verdict=Verdict.IDENTICAL,
+            sentence=f"the two runs are identical but for names of programs: {events} events",
+            agreeing=events,
+            settings=(*self._job, *self._environment),
+            aligned_to=(events, events),
+            bytes_read=self._a.bytes_read + self._b.bytes_read,
+            notes=tuple(self._notes),
         )
 
     def _with_failure(self, first: Divergence) -> Divergence:

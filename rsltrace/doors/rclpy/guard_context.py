@@ -33,6 +33,11 @@ class GuardContext:
         entry = entry_of(stacks.event)
         return entry.key if entry is not None else ""
 
+    def process(self) -> int:
+        """Return which main's code runs, counted from 1; 0 for that of the job's own nodes."""
+        programs = self._stacks.programs
+        return 0 if programs.is_hosted else programs.all.index(programs.present) + 1
+
     def policy(self) -> Policy | None:
         """Return the policy of that node."""
         return policy_of(self._stacks.event)

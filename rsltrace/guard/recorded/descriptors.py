@@ -21,6 +21,7 @@ from typing import Any
 from rsltrace.guard.callers import user_frame
 from rsltrace.guard.descriptor_table import Descriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
 from rsltrace.model.finding import Mode, Source
@@ -63,6 +64,7 @@ def stand_in(flags: int = 0) -> int:
 
 def _opening(real: Callable[..., int]) -> Any:
     def open_(path: Any, flags: int, *more: Any, **options: Any) -> int:
+        path = meant_path(path)
         frame = sys._getframe(1)
         wanted = not flags & _MAKES_FILES and flags & os.O_ACCMODE != os.O_WRONLY
         guard = recording(Source.FILE, frame) if wanted else None

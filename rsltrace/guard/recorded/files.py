@@ -13,6 +13,7 @@ from typing import Any
 
 from rsltrace.guard.callers import is_nobodys
 from rsltrace.guard.guard import Guard
+from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.recorded.descriptors import (
     RawDescriptor,
     opened,
@@ -50,6 +51,7 @@ def _opening(real: Callable[..., Any]) -> Any:
         closefd: bool = True,
         opener: Any = None,
     ) -> Any:
+        file = meant_path(file)
         frame = sys._getframe(1)
         text = (buffering, encoding, errors, newline)
         if isinstance(file, int):
@@ -110,6 +112,7 @@ _REAL = {"stat": _real_stat, "lstat": copy_of(os.lstat)}  # type: ignore[arg-typ
 
 def _looking(name: str, plain: Callable[..., Any], real: Callable[..., Any]) -> Any:
     def stat(path: Any, *more: Any, **options: Any) -> Any:
+        path = meant_path(path)
         frame = sys._getframe(1)
         if is_nobodys(frame):  # nor does the watch below have to know
             return plain(path, *more, **options)

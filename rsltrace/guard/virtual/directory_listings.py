@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from rsltrace.guard.guard import engaged
+from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.redirect import redirect
 from rsltrace.model.finding import Mode, Source
 
@@ -42,7 +43,7 @@ def _listing(name: str, arrange: Callable[[Any], Any], real: Callable[..., Any])
     call = f"os.{name}()"
 
     def listed(*arguments: Any, **options: Any) -> Any:
-        value = real(*arguments, **options)
+        value = real(*map(meant_path, arguments), **options)
         guard = engaged()
         if guard is None:
             return value

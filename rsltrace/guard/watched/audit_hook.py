@@ -65,7 +65,7 @@ _FOREIGN = {
     "lrand48": Source.RANDOM,
     "times": Source.CLOCK,
     "getrusage": Source.CLOCK,
-    "getpid": Source.ENVIRONMENT,
+    "getpid": Source.PID,
     "getppid": Source.ENVIRONMENT,
     "gettid": Source.ENVIRONMENT,
     "getenv": Source.ENVIRONMENT,

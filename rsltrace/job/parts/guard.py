@@ -126,6 +126,9 @@ class GuardSpec(Part):
     environment: Annotated[SourceSpec | None, _source(Source.ENVIRONMENT)] = _about(
         Source.ENVIRONMENT, "Environment variables."
     )
+    pid: Annotated[SourceSpec | None, _source(Source.PID)] = _about(
+        Source.PID, "The process id (`os.getpid`): by default each main has a number of its own."
+    )
     thread: Annotated[SourceSpec | None, _source(Source.THREAD)] = _about(
         Source.THREAD, "Threads that are started."
     )
@@ -153,6 +156,7 @@ class GuardSpec(Part):
             directory: SourceSpec | dict[str, Any] | ModeName | None = None,
             file: SourceSpec | dict[str, Any] | ModeName | None = None,
             environment: SourceSpec | dict[str, Any] | ModeName | None = None,
+            pid: SourceSpec | dict[str, Any] | ModeName | None = None,
             thread: SourceSpec | dict[str, Any] | ModeName | None = None,
             process: SourceSpec | dict[str, Any] | ModeName | None = None,
             socket: SourceSpec | dict[str, Any] | ModeName | None = None,

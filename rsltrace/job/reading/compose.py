@@ -85,7 +85,8 @@ class Composition(Part):
         description="Values to use elsewhere in the job as `$(var NAME)`; "
         "`--set vars.NAME=...` gives them others. Also understood in every value: "
         "`$(env NAME default)`, `$(find-pkg-share PACKAGE)`, `$(find-pkg-prefix PACKAGE)` and "
-        "`$(dirname)`, the folder of the file. Text without quotes is read again after that, so "
+        "`$(dirname)`, the folder of the file; the share of a package in `search_path` that nobody "
+        "has built is its folder. Text without quotes is read again after that, so "
         "`seed: $(env SEED 7)` is a number. `\\$(` stands for itself.",
         examples=[{"robot": "husky", "rate": 50.0}],
     )
@@ -130,7 +131,8 @@ def compose(
         composed.overrides.append(f"{label} {override}")
     values = dict(composed.root.value)
     variables = values.get("vars")
-    late = Substitution(variables.value if variables is not None and _is_mapping(variables) else {})
+    known = variables.value if variables is not None and _is_mapping(variables) else {}
+    late = Substitution(known, lambda: _search_path(composed.root, Substitution(known)))
     composed.root = late.tree(composed.root)
     composed.substituted = early.used or late.used or bool(variables)
     return composed
@@ -211,6 +213,19 @@ def _other(
         raise item.place.error(f"{role}: {shown}: {message}") from None
     composed.others.append(path)
     return _with_search_path(_with_others(other, shown, read, early, outer, composed))
+
+
+def _search_path(root: Item, substitution: Substitution) -> list[Path]:
+    """Return the folders of a job's ``search_path``, or the folder of its file."""
+    listed = root.value.get("search_path")
+    items = listed.value if listed is not None and isinstance(listed.value, list) else [listed]
+    written = [item if item is not None else Item(".", root.place) for item in items]
+    found = [substitution.tree(item) for item in written]
+    return [
+        Path(item.place.source.folder or os.getcwd(), item.value)
+        for item in found
+        if isinstance(item.value, str)
+    ]
 
 
 def _with_search_path(root: Item) -> Item:

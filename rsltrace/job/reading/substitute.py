@@ -9,12 +9,13 @@ import difflib
 import os
 import shlex
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean, nearest
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, bare_value
+from rsltrace.source_packages import source_packages
 
 SUBSTITUTIONS = {
     "env": "env NAME [default]",
@@ -36,10 +37,15 @@ _NOT_HERE = {
 
 class Substitution:
     """Replaces ``$(...)`` in values. ``variables`` are those of ``vars:``, or None before these
-    are known."""
+    are known; ``folders`` returns where packages are looked for that nobody has built."""
 
-    def __init__(self, variables: Mapping[object, Item] | None) -> None:
+    def __init__(
+        self,
+        variables: Mapping[object, Item] | None,
+        folders: Callable[[], Iterable[Path]] = lambda: (),
+    ) -> None:
         self._variables = variables
+        self._folders = folders
         self._open: list[str] = []
         self.used = False
 
@@ -92,15 +98,31 @@ class Substitution:
             return self._env(written, item, *arguments)
         if name == "var":
             return self._var(written, item, arguments[0])
-        prefix = package_prefix(arguments[0])
-        if prefix is None:
+        return self._of_package(written, item, arguments[0], shared=name == "find-pkg-share")
+
+    def _of_package(self, written: str, item: Item, package: str, *, shared: bool) -> str:
+        """Return the share of a package (of one that is not built: its folder), or its prefix."""
+        prefix = package_prefix(package)
+        if prefix is not None:
+            return str(prefix / "share" / package if shared else prefix)
+        sources = source_packages(self._folders())
+        if package not in sources:
+            hint = did_you_mean(package, sources)
             raise _error(
                 item,
                 written,
-                f"there is no ROS package {arguments[0]!r} in AMENT_PREFIX_PATH or "
-                f"{sys.prefix}: install it, or source the workspace that has it",
+                f"there is no ROS package {package!r} in AMENT_PREFIX_PATH, {sys.prefix} or the "
+                f"search_path{hint}: install it, source the workspace that has it, or add its "
+                "folder to search_path",
             )
-        return str(prefix / "share" / arguments[0] if name == "find-pkg-share" else prefix)
+        if not shared:
+            raise _error(
+                item,
+                written,
+                f"nobody has built {package!r} ({sources[package].folder}), so that it has no "
+                f"prefix: write $(find-pkg-share {package}), or build it",
+            )
+        return str(sources[package].folder)
 
     def _env(self, written: str, item: Item, name: str, default: str | None = None) -> str:
         value = os.environ.get(name, default)

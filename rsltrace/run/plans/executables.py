@@ -21,7 +21,7 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
-from rsltrace.workspace.imports import unbuilt_executables, unbuilt_names
+from rsltrace.workspace.imports import unbuilt_executables, unbuilt_names, unbuilt_programs
 
 
 class Mains:
@@ -152,11 +152,19 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
             where=where,
         )
     available = sorted({*scripts, *files, *sources})
+    compiled = unbuilt_programs(package)
+    if name in compiled:
+        raise JobError(
+            f"{target} is a program that nobody has built (CMakeLists.txt of {package}): build it "
+            "(colcon build) and source its workspace (install/setup.bash)",
+            where=where,
+        )
     has = f"it has {', '.join(available[:10])}" if available else "it has none"
-    raise JobError(
-        f"package {package!r} has no executable {name!r}{_near(name, available)}: {has}",
-        where=where,
-    )
+    if compiled:
+        listed = ", ".join(sorted(compiled)[:10])
+        has += f"; once it is built (colcon build): {listed}"
+    near = _near(name, {*available, *compiled})
+    raise JobError(f"package {package!r} has no executable {name!r}{near}: {has}", where=where)
 
 
 def compiled_file(target: str) -> Path | None:

@@ -24,6 +24,7 @@ from rsltrace.doors.rclpy.stacks.runners import RunEnded
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.errors import UnsupportedError
+from rsltrace.guard.process_ids import meant_id
 from rsltrace.guard.redirect import Redirected
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
@@ -73,6 +74,7 @@ def _abort() -> None:
 
 
 def _kill(pid: int, number: int, /) -> None:
+    pid = meant_id(pid)
     stacks = _calling()
     if stacks is None or pid != getpid() or not _signalled(stacks, number, "os.kill"):
         _real["kill"](pid, number)

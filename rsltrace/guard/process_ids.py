@@ -1,0 +1,44 @@
+"""Process ids of the run: each main has one of its own, the same in every run.
+
+They are none that Linux gives (2**22 at most), so whoever is told one can take nobody else for it.
+Where the code that got one gives it back, the process of the run is meant.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from rsltrace.guard.guard import Guard, engaged
+
+FIRST = 5_000_000
+"""That of the nodes which the job constructs; mains follow in the order of the job."""
+
+_PROC = "/proc/"
+_OF_PROCESS = re.compile(r"/proc/(\d+)(?=/|$)")
+
+
+def virtual_id(guard: Guard) -> int:
+    """Return the process id of whoever runs."""
+    return FIRST + guard.context.process()
+
+
+def meant_id(pid: Any) -> Any:
+    """Return the real process id if ``pid`` is what whoever runs takes for its own."""
+    if isinstance(pid, int) and pid >= FIRST:
+        guard = engaged()
+        if guard is not None and pid == virtual_id(guard):
+            return guard.process
+    return pid
+
+
+def meant_path(path: Any) -> Any:
+    """Return a path below ``/proc`` with the real process id in it."""
+    if isinstance(path, str) and path.startswith(_PROC):
+        match = _OF_PROCESS.match(path)
+        if match is not None:
+            return f"{_PROC}{meant_id(int(match[1]))}{path[match.end() :]}"
+    return path
+
+
+__all__ = ["FIRST", "meant_id", "meant_path", "virtual_id"]
