@@ -106,23 +106,10 @@ bench: $(INSTALLED)
 	$(BIN)/python benchmarks/throughput.py
 	$(BIN)/python benchmarks/usual.py
 
-# The pictures of the documentation, drawn from the sample traces without a screen. That of Rerun
-# needs a graphics driver; one in software will do (Debian: mesa-vulkan-drivers).
-PICTURES := $(abspath docs/pictures)
-VIEW := $(abspath $(BIN))/rsltrace view a.mcap b.mcap
-
+# The pictures of the documentation, drawn without a screen (docs/draw_pictures.py says what they
+# need); a test fails when one is stale.
 pictures: $(INSTALLED)
-	@mkdir -p $(PICTURES) $(OUT)
-	cd $(SAMPLE) && $(VIEW) --export $(PICTURES)/view_two.svg
-	cd sample_traces/delayed_input && $(abspath $(BIN))/rsltrace view a.mcap --at 252 \
-		--export $(PICTURES)/view.svg
-	cd sample_traces/schedule && $(abspath $(BIN))/rsltrace view a.mcap --live --at 20 --keys \
-		"B slash t o r q u e colon space d a t a space greater_than_sign space 1 enter full_stop" \
-		--export $(PICTURES)/view_live.svg
-	cd sample_traces/schedule && $(VIEW) --light --keys p --export $(PICTURES)/view_plot.svg
-	cd $(SAMPLE) && $(abspath $(BIN))/rsltrace rerun a.mcap b.mcap -o $(abspath $(OUT))/pictures.rrd --force
-	$(BIN)/python -m rsltrace_viewer.rerun_export.picture $(OUT)/pictures.rrd \
-		$(PICTURES)/rerun_two.png sim_time 2.1
+	$(BIN)/python docs/draw_pictures.py
 
 clean:
 	rm -rf $(VENV) $(OUT)

@@ -263,7 +263,7 @@ def test_the_distance_between_two_runs_is_that_of_their_last_values(tmp_path: Pa
     found = both.values("/divergence/distance/odom/pose.pose.position", "Scalars:scalars")
     assert [apart for (apart,) in found] == pytest.approx([0.0] * 20 + [0.5] * (STEPS - 20))
     assert "/divergence/distance/voltage" not in both.rows, "it is equal in both"
-    assert both.static["/run_b/topics/odom/track"]["LineStrips3D:labels"] == ["b"]
+    assert both.static["/run_b/topics/odom/track"]["Points3D:labels"] == ["b"]
 
 
 def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:

@@ -30,6 +30,7 @@ from rsltrace.diff.result.traces import Diff
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.phrases import event_title
+from rsltrace_viewer.rerun_export.colours import lane
 from rsltrace_viewer.rerun_export.columns import EVENT, SIM_TIME, Clock, lane_colours, make_chunk
 from rsltrace_viewer.rerun_export.paths import join
 
@@ -126,6 +127,7 @@ def _chain(first: Divergence, clock: Clock) -> Iterator[Chunk]:
     yield from make_chunk(CHAIN, ((EVENT, pa.array(indexes)),), ((state, pa.array(texts)),))
     times = clock.array(np.array(stamps[:-1]))
     yield from make_chunk(CHAIN, ((SIM_TIME, times),), ((state, pa.array(texts[:-1])),))
+    yield from lane_colours(CHAIN, {text: lane(i) for i, text in enumerate(texts[:-1])})
 
 
 def document(diff: Diff) -> str:

@@ -54,7 +54,7 @@ def blueprint(
     if marks is not None:
         above.append(rrb.TextDocumentView(origin=marks.document, name="What differs"))
     above += [part for part in (world, plots) if part is not None]
-    below = rrb.Tabs(*_below(shown, marks, timeline), name="Run")
+    below = rrb.Tabs(*_below(shown, marks), name="Run")
     if not above:
         root: Part = below
     else:
@@ -196,17 +196,21 @@ def _plots(shown: Sequence[Shown], marks: Marks | None, distances: Distances) ->
         views[-1] = rrb.Tabs(views[-1], *more, active_tab=0)
     apart = [distances.paths[key] for key in ranked if key in distances.paths]
     if apart:
-        views.insert(0, _plot(("Distance between the runs", ""), apart[:_PLOTS_SHOWN]))
+        title = ("Distance between the runs", "")
+        views.insert(0, _plot(title, apart[:_PLOTS_SHOWN], "LeftTop"))  # it grows to the right
     return views[0] if len(views) == 1 else rrb.Vertical(*views, name="Plots")
 
 
-def _plot(key: tuple[str, str], paths: list[str]) -> rrb.TimeSeriesView:
+def _plot(key: tuple[str, str], paths: list[str], legend: str = "RightTop") -> rrb.TimeSeriesView:
+    """Return curves over the whole run, on either timeline."""
     name = f"{key[0]} {key[1]}".strip()
+    always = rr.TimeRangeBoundary.infinite()
     return rrb.TimeSeriesView(
         origin="/",
         contents=_only(paths),
         name=name,
-        plot_legend=rrb.PlotLegend(corner="RightTop", visible=True),
+        plot_legend=rrb.PlotLegend(corner=legend, visible=True),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=always, end=always)),
     )
 
 
@@ -224,7 +228,7 @@ def _rank(topic: str, names: str) -> tuple[bool, bool, int]:
     )
 
 
-def _below(shown: Sequence[Shown], marks: Marks | None, timeline: str) -> list[Part]:
+def _below(shown: Sequence[Shown], marks: Marks | None) -> list[Part]:
     lanes = list(marks.lanes) if marks is not None else []
     logs: list[str] = []
     rates: list[str] = []
@@ -233,12 +237,9 @@ def _below(shown: Sequence[Shown], marks: Marks | None, timeline: str) -> list[P
         lanes += [run.paths.node(name) for name in nodes[:_LANES_MAX] if name != NO_NODE]
         rates += [f"{run.paths.node(name)}/rate" for name in nodes]
         logs += [f"{run.paths.node(name)}/log" for name in nodes]
-    parts: list[Part] = [
-        _lanes(lanes, "Callbacks by time", _in_sight_ns(shown)),
-        _lanes(lanes, "Callbacks by event", _EVENTS_IN_SIGHT // 2),
-    ]
-    if timeline == EVENT:
-        parts.reverse()  # the first is in front, and the other one empty
+    by_time = _lanes(lanes, "by time", _in_sight_ns(shown))
+    by_event = _lanes(lanes, "by event", _EVENTS_IN_SIGHT // 2)
+    parts: list[Part] = [rrb.Horizontal(by_time, by_event, name="Callbacks")]
     if any(run.log_records for run in shown):
         parts.append(
             rrb.TextLogView(

@@ -9,9 +9,12 @@ Rerun's headless viewer needs a Vulkan driver; Mesa's software rasterizer (Debia
 from __future__ import annotations
 
 import os
+import re
 import sys
 import time
 from pathlib import Path
+
+import xxhash
 
 from rsltrace_viewer.rerun_export.columns import EVENT
 from rsltrace_viewer.rerun_export.control import LOADED_S_MAX, controlled
@@ -22,6 +25,10 @@ _SETTLE_S = 1.0
 _GREETING_S = 6.0
 """How long the viewer shows that it runs headless."""
 _COLOURS = 256
+_MENU_HEIGHT = 36
+_MADE_FROM = "rsltrace recording"
+_MADE_UP = "rerun.controls."
+_UUID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 def software_driver() -> Path | None:
@@ -54,17 +61,49 @@ def take(
         ]
 
 
-def shrink(picture: Path) -> None:
-    """Make a PNG several times smaller, for a repository: with few colours."""
-    from PIL import Image  # Rerun brings it
+def shrink(picture: Path, source: str) -> None:
+    """Make a PNG several times smaller, for a repository: with few colours, without the viewer's
+    menu. ``source`` is written into it."""
+    from PIL import Image, PngImagePlugin  # Rerun brings it
 
     with Image.open(picture) as image:
-        small = image.convert("RGB").quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
-    small.save(picture, optimize=True)
+        below = image.convert("RGB").crop((0, _MENU_HEIGHT, *image.size))
+        small = below.quantize(_COLOURS, method=Image.Quantize.MEDIANCUT)
+    notes = PngImagePlugin.PngInfo()
+    notes.add_text(_MADE_FROM, source)
+    small.save(picture, optimize=True, pnginfo=notes)
+
+
+def made_from(picture: Path) -> str | None:
+    """Return the fingerprint of what a picture was drawn from, None if it does not say."""
+    from PIL import Image
+
+    with Image.open(picture) as image:
+        found = image.info.get(_MADE_FROM)
+    return found if isinstance(found, str) else None
+
+
+def fingerprint(recording: Path) -> str:
+    """Return a hash of all that a recording and its layout hold.
+
+    Left out is what Rerun makes up for each export: the ids of rows, views and containers.
+    """
+    from rerun.chunk import RrdReader
+
+    reader = RrdReader(str(recording))
+    rows = set()
+    for store in (*reader.recordings(), *reader.blueprints()):
+        for chunk in reader.stream(store=store):
+            batch = chunk.to_record_batch()
+            kept = [name for name in batch.schema.names if not name.startswith(_MADE_UP)]
+            for row in batch.select(kept).to_pylist():
+                rows.add(_UUID.sub("", f"{chunk.entity_path} {row}"))
+    text = "\n".join(sorted(rows))
+    return f"{xxhash.xxh3_64_intdigest(text.encode()):016x}"
 
 
 if __name__ == "__main__":
     source, target, on_timeline, at = sys.argv[1:5]
     for line in take(Path(source), Path(target), on_timeline, float(at), settle_s=_GREETING_S):
         print(line)
-    shrink(Path(target))
+    shrink(Path(target), fingerprint(Path(source)))

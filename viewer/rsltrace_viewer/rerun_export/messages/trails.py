@@ -10,12 +10,20 @@ import pyarrow as pa
 import rerun as rr
 from rerun.chunk import Chunk
 
-from rsltrace_viewer.rerun_export.columns import constant, lists, make_chunk, strip_lists, vectors
+from rsltrace_viewer.rerun_export.columns import (
+    Column,
+    constant,
+    lists,
+    make_chunk,
+    strip_lists,
+    vectors,
+)
 from rsltrace_viewer.rerun_export.messages.shapes import Paint
 from rsltrace_viewer.rerun_export.messages.tracks import Track
 
 _WIDTH = -1.0
 """On the screen."""
+_LABEL_AT = {"a": 0.5, "b": 0.65}
 
 
 class Trails:
@@ -48,8 +56,7 @@ class Trails:
                     (rr.LineStrips3D.descriptor_colors(), paint.faint.column(1)),
                     (rr.LineStrips3D.descriptor_radii(), constant(_WIDTH, 1, pa.float32())),
                     (rr.CoordinateFrame.descriptor_frame(), pa.array([frame])),
-                    (rr.LineStrips3D.descriptor_labels(), pa.array([[label]])),
-                    (rr.LineStrips3D.descriptor_show_labels(), pa.array([bool(label)])),
+                    *(_named(label, points, paint) if label else ()),
                 )
                 yield path, frame, points, make_chunk(path, (), columns)
 
@@ -67,3 +74,16 @@ class Trails:
                     (rr.GeoLineStrings.descriptor_colors(), paint.column(1)),
                 )
                 yield from make_chunk(f"{topic_path}/track", (), columns)
+
+
+def _named(label: str, points: npt.NDArray[np.float64], paint: Paint) -> tuple[Column, ...]:
+    """Return what writes ``label`` on a track: elsewhere for ``b`` than for ``a``, as their tracks
+    may be one."""
+    at = int(len(points) * _LABEL_AT.get(label, 0.5))
+    return (
+        (rr.Points3D.descriptor_positions(), vectors(points[at : at + 1])),
+        (rr.Points3D.descriptor_colors(), paint.column(1)),
+        (rr.Points3D.descriptor_radii(), constant(_WIDTH, 1, pa.float32())),
+        (rr.Points3D.descriptor_labels(), pa.array([[label]])),
+        (rr.Points3D.descriptor_show_labels(), pa.array([True])),
+    )
