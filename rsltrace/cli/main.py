@@ -6,6 +6,7 @@ click costs, however much the others need.
 
 from __future__ import annotations
 
+import gc
 import importlib
 import sys
 from collections.abc import Sequence
@@ -107,7 +108,11 @@ def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> 
     words = sys.argv[1:] if words is None else words
     open_standard_streams()
     pin_recording(words)
-    cli.main(args=list(words), prog_name=prog_name)
+    try:
+        cli.main(args=list(words), prog_name=prog_name)
+    finally:
+        if "rsltrace.run.session" not in sys.modules:  # else there may be users' finalizers to run
+            gc.freeze()  # at its end Python would look at all modules for garbage, several times
     raise AssertionError("click exits")
 
 

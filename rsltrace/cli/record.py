@@ -94,7 +94,9 @@ def record(
     130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
     from rsltrace.run import Observer, run
+    from rsltrace.run.process import end_with_run
 
+    end_with_run()
     changes = _all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:

@@ -7,8 +7,8 @@ import signal
 import sys
 from typing import NoReturn
 
-_ALLOCATIONS = 50_000
-"""How many new objects Python looks at together for garbage: with its own 700, a tenth of what a
+_ALLOCATIONS = 200_000
+"""How many new objects Python looks at together for garbage: with its own 700, a sixth of what a
 short command takes went into looking at modules that were being loaded."""
 
 

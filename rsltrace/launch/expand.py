@@ -4,26 +4,18 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job import Job, NodeSpec, locate, showing_line
 from rsltrace.launch import ros_launch
 from rsltrace.launch.apart import read_apart
+from rsltrace.launch.expanded import Expanded
 from rsltrace.launch.model import Argument, Launched
 from rsltrace.launch.reader import ProgramNeededError, read_launch_file
 from rsltrace.launch.specs import node_specs
 from rsltrace.source_packages import source_packages, workspace_of
 from rsltrace.workspace.imports import unbuilt_packages
-
-
-@dataclass(frozen=True)
-class Expanded:
-    """A job without launch files, and what of them it leaves out or has no use for."""
-
-    job: Job
-    notes: tuple[str, ...] = ()
 
 
 def expand(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rsltrace.job import Job
-from rsltrace.launch import Expanded, expand
+from rsltrace.launch.expanded import Expanded
 from rsltrace.run.plans.executables import why_not
 from rsltrace.run.process import search_path
 
@@ -16,5 +16,7 @@ def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
     """
     if not job.launch:
         return Expanded(job)
+    from rsltrace.launch.expand import expand
+
     with search_path(job):
         return expand(job, why_not=why_not, programs=programs)

@@ -86,6 +86,16 @@ def quiet_gc() -> Iterator[None]:
             gc.enable()
 
 
+_lives_on = True
+
+
+def end_with_run() -> None:
+    """Let what there is before the next run be out of garbage collection up to the end of the
+    process, for a command: Python looks at it several times there, a sixth of a short command."""
+    global _lives_on
+    _lives_on = False
+
+
 @contextmanager
 def frozen_heap() -> Iterator[None]:
     """Keep what there was before the run out of all garbage collection in it: it takes longer to
@@ -94,7 +104,8 @@ def frozen_heap() -> Iterator[None]:
     try:
         yield
     finally:
-        gc.unfreeze()
+        if _lives_on:
+            gc.unfreeze()
 
 
 def keep_heap() -> None:

@@ -1,6 +1,7 @@
 """Lets user code import interfaces and find shares of packages that nobody has built.
 
-Both are looked for only when somebody asks: most jobs never do. What is built comes first.
+Both are looked for only when somebody asks: most jobs never do, and what looks is loaded then.
+What is built comes first.
 """
 
 from __future__ import annotations
@@ -13,13 +14,12 @@ from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.guard.guard import engage
-from rsltrace.source_packages import SourcePackage, source_packages
-from rsltrace.workspace.installs import compiled_executables, executables, modules
-from rsltrace.workspace.interfaces import interface_prefix
-from rsltrace.workspace.share import share_prefix
+
+if TYPE_CHECKING:
+    from rsltrace.source_packages import SourcePackage
 
 _KINDS = ("msg", "srv", "action")
 _SUPPORT = "_s__rosidl_typesupport_c"
@@ -41,6 +41,8 @@ class Workspace:
         """The packages by name; looked for once."""
         if self._packages is None:
             with engage(None):
+                from rsltrace.source_packages import source_packages
+
                 self._packages = source_packages(self._folders)
         return self._packages
 
@@ -54,6 +56,8 @@ class Workspace:
             return None
         if name not in self._prefixes:
             with engage(None):  # what that takes is none of the node's doing
+                from rsltrace.workspace.interfaces import interface_prefix
+
                 self._prefixes[name] = interface_prefix(package, self.packages)
             self.made.add(name)
         return self._prefixes[name] / "site-packages" / name
@@ -70,6 +74,8 @@ class Workspace:
         """Return the file or folder of a module that a package would install, or None."""
         if self._modules is None:
             with engage(None):
+                from rsltrace.workspace.installs import modules
+
                 listed = [modules(package) for package in self.packages.values()]
             self._modules = {name: path for each in reversed(listed) for name, path in each.items()}
         return self._modules.get(name)
@@ -80,6 +86,8 @@ class Workspace:
         if found is None:
             return {}
         with engage(None):
+            from rsltrace.workspace.installs import executables
+
             return executables(found)
 
     def prefix(self, name: str) -> str | None:
@@ -88,6 +96,8 @@ class Workspace:
         if package is None:
             return None
         with engage(None):
+            from rsltrace.workspace.share import share_prefix
+
             return str(share_prefix(package))
 
 
@@ -165,6 +175,8 @@ def unbuilt_executables(package: str) -> dict[str, str | Path]:
 
 def unbuilt_programs(package: str) -> set[str]:
     """Return the names of what a package would have, were it built: its compiled programs."""
+    from rsltrace.workspace.installs import compiled_executables
+
     sources = [one.packages[package] for one in _open if package in one.packages]
     return {name for source in sources for name in compiled_executables(source)}
 

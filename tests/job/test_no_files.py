@@ -13,7 +13,7 @@ import pytest
 from rsltrace.audit.audit import audit_path
 from rsltrace.errors import JobError
 from rsltrace.job import job_from_text, load_job
-from rsltrace.launch import expand
+from rsltrace.launch.expand import expand
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.run.plans.entries import node_entries
 

@@ -7,6 +7,8 @@ name (``duration_ns=``). The pydantic context tells the two apart.
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
@@ -21,10 +23,15 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+_PLUGINS = "pydantic.plugin._loader"
+"""What pydantic asks for plugins when it builds a model: it reads the metadata of all packages that
+are installed, which takes longer than to read a job."""
+
+
 class Part(BaseModel):
     """Base of a job and its parts. Built wrongly, it raises ``JobError``, not pydantic's error."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
     TIMES: ClassVar[dict[str, str]] = {}
     """YAML key of each time → name of its field, which ends in ``_ns``."""
@@ -57,6 +64,19 @@ class Part(BaseModel):
                 data = {k: v for k, v in data.items() if k != name}
                 data[key] = value if value is None else Nanoseconds(value)
         return data
+
+    @classmethod
+    def model_rebuild(cls, **options: Any) -> bool | None:
+        """Build what checks a part, when it is first used; plugins have no say in it."""
+        if _PLUGINS in sys.modules:
+            return super().model_rebuild(**options)
+        without: Any = ModuleType(_PLUGINS)
+        without.get_plugins = tuple
+        sys.modules[_PLUGINS] = without
+        try:
+            return super().model_rebuild(**options)
+        finally:
+            del sys.modules[_PLUGINS]
 
     def replace(self, **changes: object) -> Self:
         """Return a copy with ``changes`` (keys as in the constructor), validated again."""

@@ -15,7 +15,6 @@ from pathlib import Path
 
 from rsltrace.errors import JobError, did_you_mean, nearest
 from rsltrace.job.reading.yaml_source import Item, Mark, Place, bare_value
-from rsltrace.source_packages import source_packages
 
 SUBSTITUTIONS = {
     "env": "env NAME [default]",
@@ -105,6 +104,8 @@ class Substitution:
         prefix = package_prefix(package)
         if prefix is not None:
             return str(prefix / "share" / package if shared else prefix)
+        from rsltrace.source_packages import source_packages  # which loads a parser of XML
+
         sources = source_packages(self._folders())
         if package not in sources:
             hint = did_you_mean(package, sources)

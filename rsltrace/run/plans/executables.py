@@ -12,7 +12,6 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from importlib import metadata
 from pathlib import Path
 from types import ModuleType
 
@@ -197,6 +196,8 @@ def _same(name: str) -> str:
 def _console_scripts(package: str) -> dict[str, str]:
     """Return ``module:function`` by name of a distribution's console scripts."""
     found: dict[str, str] = {}
+    from importlib import metadata
+
     for entry in metadata.entry_points(group="console_scripts"):
         if entry.dist is not None and _same(entry.dist.name) == _same(package):
             found.setdefault(entry.name, f"{entry.module}:{entry.attr}")
@@ -224,6 +225,8 @@ def _installed_files(package: str) -> dict[str, Path]:
 
 def _packages() -> set[str]:
     """Return the names of the packages there are."""
+    from importlib import metadata
+
     names = {dist.name for dist in metadata.distributions() if dist.name}
     names |= {name.replace("-", "_") for name in names}
     for prefix in _prefixes():

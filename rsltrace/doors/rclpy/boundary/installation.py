@@ -6,11 +6,9 @@ The reference ``_rclpy`` is exchanged in every loaded rclpy module and in
 
 from __future__ import annotations
 
-import importlib
 import sys
-import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from rsltrace.doors.rclpy.boundary.boundary import Boundary
 from rsltrace.doors.rclpy.boundary.log_callers import quick_log_callers
 from rsltrace.doors.rclpy.boundary.quick_id_texts import quick_id_texts
 from rsltrace.doors.rclpy.boundary.release import check_release
+from rsltrace.doors.rclpy.boundary.type_support import load_type_support
 from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.doors.rclpy.handles.context import ContextHandle
 from rsltrace.doors.rclpy.handles.guard_condition import GuardConditionHandle
@@ -76,25 +75,12 @@ def boundary() -> Boundary:
                 "`pip install 'rsltrace[ros]'`, or source a ROS 2 installation "
                 f"({error})"
             ) from error
-        _load_type_support()
+        load_type_support()
         real = singleton.rclpy_implementation
         ours = Boundary(real)
         check_release(real, ours, _HANDLES, Path(singleton.__file__).parents[1])
         _installed = ours
     return _installed
-
-
-def _load_type_support() -> None:
-    """Load what messages load when their type is first used.
-
-    It drags a template engine in, which in a run would be compiled as if it were a node's library;
-    and a parser with warnings of old modules, which ``pytest -W error`` makes a node's failure.
-    """
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for name in ("rosidl_parser", "rosidl_generator_py"):
-            with suppress(ImportError):
-                importlib.import_module(name)
 
 
 def check_free() -> None:

@@ -13,9 +13,7 @@ from typing import Any
 from rsltrace.errors import SetupError
 
 KNOWN = "Jazzy (rclpy 7.1) and Kilted (rclpy 9.1)"
-_NAME = re.compile(r"\b_rclpy\.([A-Za-z]\w*)")
 _UNUSED = {"add_to_waitset"}  # executors get no wait set here
-_CALL = re.compile(r"\.([a-z]\w*)\(")
 
 
 def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> None:
@@ -38,15 +36,17 @@ def check_release(real: Any, stand_ins: Any, handles: dict[str, type], package: 
 
 def missing_parts(real: Any, stand_ins: Any, handles: dict[str, type], package: Path) -> list[str]:
     """Return what rclpy's sources use of the extension and has no stand-in, sorted."""
-    names: set[str] = set()
-    calls: set[str] = set()
-    for path in sorted(package.rglob("*.py")):
-        text = path.read_text("utf-8", "replace")
-        names.update(_NAME.findall(text))
-        calls.update(_CALL.findall(text))
     # Sources also mention names that only a type checker sees; the extension has none of those.
-    missing = [n for n in names if hasattr(real, n) and not hasattr(stand_ins, n)]
+    lacking = [
+        (rf"\b_rclpy\.{name}\b", name)
+        for name in dir(real)
+        if name[0].isalpha() and not hasattr(stand_ins, name)
+    ]
     for name, handle in handles.items():
-        methods = calls.intersection(vars(getattr(real, name, object))) - _UNUSED
-        missing += [f"{name}.{method}" for method in methods if not hasattr(handle, method)]
-    return sorted(missing)
+        for method in vars(getattr(real, name, object)):
+            if method[0].isalpha() and method not in _UNUSED and not hasattr(handle, method):
+                lacking.append((rf"\.{method}\(", f"{name}.{method}"))
+    if not lacking:
+        return []
+    sources = "\n".join(path.read_text("utf-8", "replace") for path in package.rglob("*.py"))
+    return sorted(name for use, name in lacking if re.search(use, sources))

@@ -1,0 +1,75 @@
+"""What a command does not load, and that it is there all the same for who asks."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rsltrace.run.provenance import _PACKAGES, _versions
+
+_RECORDED = """
+import json, sys
+from pathlib import Path
+import rsltrace
+
+text = "nodes: [{node: rclpy.node:Node, arguments: {node_name: n}}]\\nstop: {duration: 1s}\\n"
+Path("job.yaml").write_text(text)
+assert rsltrace.record(rsltrace.load_job("job.yaml"), Path("run.mcap")).exit_code == 0
+print(json.dumps(sorted(sys.modules)))
+import rosidl_generator_py
+assert "lark" not in sys.modules
+assert callable(rosidl_generator_py.generate_py) and "lark" in sys.modules
+from pydantic.plugin._loader import get_plugins
+assert get_plugins.__module__ == "pydantic.plugin._loader"
+"""
+_NOT_NEEDED = (
+    *("lark", "em", "rosidl_pycommon", "importlib.metadata", "xml.etree.ElementTree"),
+    *("rosbags", "rich", "rsltrace.launch.expand", "rsltrace.workspace.interfaces"),
+)
+
+
+@pytest.mark.ros
+def test_a_small_run_loads_no_generators_no_plugins_and_no_metadata(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _RECORDED], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    loaded = done.stdout.splitlines()[-1]
+    assert '"rsltrace.run.session"' in loaded
+    assert [name for name in _NOT_NEEDED if f'"{name}"' in loaded] == []
+
+
+def test_versions_are_those_of_the_packages_metadata() -> None:
+    known = {}
+    for package in _PACKAGES:
+        try:
+            known[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            continue
+    assert dict(_versions()) == known
+    assert "numpy" in known
+
+
+def test_versions_are_found_in_either_kind_of_metadata(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    egg = tmp_path / "rclpy-7.1.6-py3.12.egg-info"
+    egg.mkdir()
+    (egg / "PKG-INFO").write_text("Metadata-Version: 2.1\nName: rclpy\nVersion: 7.1.6\n\ntext\n")
+    (tmp_path / "mcap-1.2.egg-info").write_text("Name: mcap\nVersion: 1.2.post1\n")
+    wheel = tmp_path / "numpy-2.0.dist-info"
+    wheel.mkdir()
+    (wheel / "METADATA").write_text("Name: numpy\nversion: 2.0\n\nVersion: 9\n")
+    (tmp_path / "scipy-1.0.dist-info").mkdir()  # left over, with nothing in it
+    monkeypatch.setattr(sys, "path", [str(tmp_path / "missing"), str(tmp_path)])
+    _versions.cache_clear()
+    try:
+        found = {dist.metadata["Name"]: dist.version for dist in importlib.metadata.distributions()}
+        assert dict(_versions()) == {"rclpy": "7.1.6", "mcap": "1.2.post1", "numpy": "2.0"}
+        assert {k: v for k, v in found.items() if k} == dict(_versions())
+    finally:
+        _versions.cache_clear()
