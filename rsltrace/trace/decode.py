@@ -27,6 +27,7 @@ from rsltrace.errors import TraceError
 from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.wide_texts import with_wide_texts, without_wide_texts
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
 _CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
@@ -44,7 +45,10 @@ _MISFITS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, Me
 
 
 class Decoder:
-    """Decodes the messages of one channel's schema: type ``name``, defined in ``types``."""
+    """Decodes the messages of one channel's schema: type ``name``, defined in ``types``.
+
+    With ``wide_texts`` it has some, in whose place ``types`` have messages.
+    """
 
     def __init__(self, channel: ChannelInfo) -> None:
         """Check the schema and make the decoder. Raises TraceError if the schema is unusable."""
@@ -58,8 +62,10 @@ class Decoder:
         # Types named without a package are looked up beside the type: those a service names are in
         # the package's msg folder, as if the request or response stood there itself.
         self.name = normalize_msgtype(channel.type.replace("/srv/", "/msg/", 1))
+        schema = without_wide_texts(channel.schema_text)
+        self.wide_texts = schema is not channel.schema_text
         try:
-            types = get_types_from_msg(channel.schema_text, self.name)
+            types = get_types_from_msg(schema, self.name)
             self.types: dict[str, Any] = {
                 name: ([], _checked_fields(name, types)) for name in types
             }
@@ -86,7 +92,8 @@ class Decoder:
         (with an underscore behind those that Python reserves).
         """
         try:
-            return self._store.deserialize_cdr(data, self.name)
+            message = self._store.deserialize_cdr(data, self.name)
+            return with_wide_texts(message) if self.wide_texts else message
         except _MISFITS as error:
             raise TraceError(
                 f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "

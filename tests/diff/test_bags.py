@@ -296,6 +296,54 @@ def test_tolerances_and_a_missing_message(compare: Any) -> None:
     assert (diff.first.presence, diff.first.a.index) == (Presence.ONLY_A, 25)
 
 
+@pytest.mark.parametrize("at", range(1, 9))
+def test_one_missing_here_and_another_there_among_noise(compare: Any, at: int) -> None:
+    """Both recordings are of one length, and no two messages of them are equal."""
+    noisy = {f"x{i}": i + 0.001 for i in range(12)}
+    a = points(12, skip=[at])
+    b = points(12, skip=[10 if at < 5 else 0], **noisy)
+    for sample in (a, b):  # without stamps that would tell them apart
+        sample[:] = [(stamp, topic, point(0, _x(data))) for stamp, topic, data in sample]
+    diff = compare(a, b, DiffOptions(absolute=(("point.x", 0.01),)))
+    assert counts(diff) == (0, 10, 0, 1, 1)
+    mirrored = compare(b, a, DiffOptions(absolute=(("point.x", 0.01),)))
+    assert counts(mirrored) == (0, 10, 0, 1, 1)
+
+
+def _x(data: bytes) -> float:
+    return float(struct.unpack_from("<d", data, len(data) - 24)[0])
+
+
+def test_changed_messages_among_noise_are_not_missing(compare: Any) -> None:
+    noisy = {f"x{i}": i + 0.001 for i in range(30)}
+    changed = {f"x{i}": i + 500.0 for i in (3, 4, 9, 29)}
+    a, b = points(30), points(30, **{**noisy, **changed})
+    for sample in (a, b):
+        sample[:] = [(stamp, topic, point(0, _x(data))) for stamp, topic, data in sample]
+    diff = compare(a, b, DiffOptions(absolute=(("point.x", 0.01),)))
+    assert counts(diff) == (0, 26, 4, 0, 0)
+
+
+def test_of_several_messages_of_one_log_time_that_which_is_missing_is_named(compare: Any) -> None:
+    a = [(SECOND * (n // 3), "/p", point(n, float(n))) for n in range(3, 12)]
+    for missing in range(len(a)):
+        diff = compare(a, a[:missing] + a[missing + 1 :], DiffOptions(by="stamp"))
+        assert counts(diff) == (8, 0, 0, 1, 0)
+        assert diff.first is not None
+        assert diff.first.a is not None
+        assert diff.first.a.index == missing
+
+
+def test_of_two_topics_that_diverge_at_once_the_same_leads_in_both_orders(compare: Any) -> None:
+    one, other = points(3, "/p"), points(3, "/q")
+    changed = points(3, "/q", x1=5.0), points(3, "/p", x1=5.0)
+    a = sorted([*one, *other], key=lambda sample: sample[0])
+    b = sorted([*changed[0], *changed[1]], key=lambda sample: sample[0])
+    assert [sample[1] for sample in a] != [sample[1] for sample in b]
+    firsts = [compare(*sides).first for sides in ((a, b), (b, a))]
+    assert [first and (first.topic, first.after_ns) for first in firsts] == [("/p", SECOND)] * 2
+
+
 def test_by_stamp(compare: Any) -> None:
     a, b = points(20), points(20, skip=[4], x9=0.0)
     diff = compare(a, b, DiffOptions(by="stamp"))

@@ -141,9 +141,43 @@ def test_two_channels_may_define_a_type_in_two_ways() -> None:
     assert to_plain(two.decode(CDR + b"\1\0")) == {"i": {"b": 1}}
 
 
+def wide(*texts: str) -> bytes:
+    """The CDR of a sequence of wide texts, as ROS 2 writes it."""
+    units = [
+        [*struct.unpack(f"<{len(d) // 2}H", d)] for d in (t.encode("utf-16-le") for t in texts)
+    ]
+    return struct.pack("<I", len(texts)) + b"".join(
+        struct.pack(f"<I{len(some)}I", len(some), *some) for some in units
+    )
+
+
+def test_wide_texts_are_texts() -> None:
+    text = (
+        'wstring W="a"\nwstring<=7 one "x # y"\nuint8 a\np/I i\nwstring[] more # wstring[]\n'
+        f"wstring[2] two\n{SEPARATOR}\nMSG: p/I\nwstring s\nuint8 b\n"
+    )
+    made = decoder(text)
+    data = CDR + wide("Größe")[4:] + b"\1\0\0\0" + wide("")[4:] + b"\2\0\0\0"
+    data += wide("日本", "\U0001f916") + wide("p", "q")[4:]
+    plain = to_plain(made.decode(data))
+    more = ["日本", "\U0001f916"]
+    assert plain == {
+        "one": "Größe", "a": 1, "i": {"s": "", "b": 2}, "more": more, "two": ["p", "q"]
+    }  # fmt: skip
+    other = made.decode(data.replace(struct.pack("<I", ord("本")), struct.pack("<I", ord("p"))))
+    (found,), _ = diff_messages(made.decode(data), other, DiffOptions())
+    assert (found.path, found.a, found.b) == ("more[0]", '"日本"', '"日p"')
+
+
+@pytest.mark.parametrize("unit", [0xD800, 0x10000, 2**32 - 1])
+def test_a_wide_text_that_is_no_utf_16_is_refused(unit: int) -> None:
+    with pytest.raises(TraceError, match="does not fit its type"):
+        decoder("wstring a\n").decode(CDR + struct.pack("<2I", 1, unit))
+
+
 HOSTILE_TEXTS = {
     "a type it does not define": "p/Missing a\n",
-    "wide strings": "wstring a\n",
+    "a wide string of nothing": "wstring<=\n",
     "a type that contains itself": "T a\n",
     "types that contain each other": f"p/A a\n{SEPARATOR}\nMSG: p/A\nx/T t\n",
     "a huge array of strings": "string[100000000] a\n",

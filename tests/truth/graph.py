@@ -61,6 +61,9 @@ class Callback:
     arguments: str = ""
     """What it is called with, where its kind does not say so: ``future``."""
 
+    waits: bool = False
+    """Whether it is a coroutine."""
+
 
 @dataclass
 class NodePlan:
@@ -106,7 +109,8 @@ class NodePlan:
             arguments = {"timer": "self", "service": "self, request, response"}
             head = arguments.get(callback.kind, "self, message")
             head = f"self, {callback.arguments}" if callback.arguments else head
-            text += f"\n    def {callback.method}({head}):\n"
+            define = "async def" if callback.waits else "def"
+            text += f"\n    {define} {callback.method}({head}):\n"
             text += "".join(f"        {line}\n" for line in ["self.n += 1", *callback.lines])
         return text + "".join(f"{line}\n" for line in ["", "", *self.bottom] if self.bottom)
 

@@ -11,12 +11,7 @@ from fnmatch import fnmatchcase
 ALWAYS = "always"
 SOMETIMES = "sometimes"
 
-KNOWN: dict[str, str] = {
-    # The status of a goal that ends at once overwrites the one before it in a queue of 1: with the
-    # runs in one order that is told as a divergence of its own.
-    "goal cancelled by nobody, *: symmetric": SOMETIMES,
-    "goal whose work raises, *: symmetric": SOMETIMES,
-}
+KNOWN: dict[str, str] = {}
 
 
 def item_of(key: str) -> str:

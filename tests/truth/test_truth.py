@@ -60,6 +60,12 @@ def test_what_is_said_of_a_quarter_of_the_classes_is_true(part: int) -> None:
     assert not wrong(outcomes), wrong(outcomes)
 
 
+def test_what_takes_the_place_of_a_message_in_a_queue_is_no_divergence_of_its_own() -> None:
+    """The status of a goal that ends at once overwrites the one before it."""
+    outcomes = list(try_cases([("goal cancelled by nobody, in code", SEED)]))
+    assert not wrong(outcomes), wrong(outcomes)
+
+
 def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report with another index, another sentence and another cause is not let through."""
     from dataclasses import replace

@@ -72,3 +72,31 @@ def _paired(
                     yield begin_a + nth, a[begin_a + nth], None
                 for nth in range(j, j_end):
                     yield begin_b + nth, None, b[begin_b + nth]
+
+
+def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:
+    """Return the outputs that only one side has; where one changed into another of the same
+    sender, that of ``a``. The order does not matter."""
+    if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
+        return []
+    if len(a) == 1 == len(b):  # as most events: counting would take ten times as long
+        return [*a] if a[0][:2] == b[0][:2] else [*a, *b]
+    theirs = Counter(output[:3] for output in b)
+    mine = Counter(output[:3] for output in a)
+    result = list(beyond(a, theirs))
+    changed = Counter(output[:2] for output in result)
+    for output in beyond(b, mine):
+        if changed[output[:2]] > 0:
+            changed[output[:2]] -= 1
+        else:
+            result.append(output)
+    return result
+
+
+def beyond(outputs: list[OutputRow], others: Counter[tuple[int, int, int]]) -> Iterator[OutputRow]:
+    """Yield the outputs of which the others have fewer."""
+    left = Counter(others)
+    for output in outputs:
+        left[output[:3]] -= 1
+        if left[output[:3]] < 0:
+            yield output

@@ -169,7 +169,7 @@ class _Comparison:
         lone_b: tuple[LoneTopic, ...],
     ) -> BagDiff:
         firsts = [topic.first for topic in topics if topic.first is not None]
-        first = min(firsts, key=lambda found: found.after_ns, default=None)
+        first = min(firsts, key=lambda found: (found.after_ns, found.topic), default=None)
         tolerated = sum(topic.tolerated + topic.ignored for topic in topics)
         if first is not None or lone_a or lone_b:
             verdict = BagVerdict.DIFFERENT

@@ -47,7 +47,9 @@ class ContentKeys:
         elif kind is list:
             parts.append(_LENGTH(len(value)))
             for place, item in enumerate(value):
-                self._add(parts, f"{path}[{place}]", item)
+                inner = f"{path}[{place}]"
+                if type(item) is not str or not self._is_ignored(inner):
+                    self._add(parts, inner, item)
         else:
             prefix = f"{path}." if path else ""
             for name, attribute, _ in fields_of(value):

@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
+from rsltrace.diff.bags.pairing import LOOKAHEAD, MessagePair, Pairing
 from rsltrace.diff.bags.sequences import Gap, Keys, moved_messages
 from rsltrace.diff.bags.source import Source, SourceTopic
 from rsltrace.diff.options import BY_STAMP, DiffOptions
@@ -25,8 +25,6 @@ from rsltrace.diff.values.fields import diff_messages, field_differences, previe
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.errors import TraceError
 
-_LOOKAHEAD = 16
-"""How many surplus messages in a row are looked past for the counterpart of one."""
 _PREVIEW = 160
 
 
@@ -48,13 +46,6 @@ class TopicPair:
     gaps: list[Gap]
     full_a: Keys
     full_b: Keys
-
-
-class _Pair(NamedTuple):
-    """Messages that belong together; -1 where there is none."""
-
-    a: int
-    b: int
 
 
 class Fetched:
@@ -79,7 +70,7 @@ class Fetched:
                 gap = pair.gaps[0]
                 start, end = (gap[2:], gap[:2])[side == 0]
                 number = (pair.number_a, pair.number_b)[side]
-                ranges[number] = (start - self._context, min(end, start + 4 * _LOOKAHEAD))
+                ranges[number] = (start - self._context, min(end, start + 4 * LOOKAHEAD))
         if not ranges:
             return
         found = self._collected[side]
@@ -123,7 +114,7 @@ class _Side:
         self._known = known if known is not None else {}
         self._stream = stream
         self._order: deque[int] = deque()
-        self._keep = keep + 2 * _LOOKAHEAD
+        self._keep = keep + 2 * LOOKAHEAD
         self._next = 0
 
     def get(self, index: int) -> object | None:
@@ -166,8 +157,10 @@ def compare_topic(
         if own.tolerant:
             counts = _Counts(equal=len(pair.keys_a))
         gaps = pair.gaps if own.tolerant else pair.gaps[:1]
-        for one in _pairs(pair, gaps, side_a, side_b, rules, options):
-            whole = _Pair(
+        by_stamp, tolerant = options.by == BY_STAMP, own.tolerant
+        pairing = Pairing(side_a.get, side_b.get, rules, by_stamp=by_stamp, tolerant=tolerant)
+        for one in pairing.of(gaps, pair.keys_a, pair.keys_b):
+            whole = MessagePair(
                 one.a if one.a >= 0 else came_from.get(one.b, -1),
                 one.b if one.b >= 0 else moved.get(one.a, -1),
             )
@@ -204,7 +197,7 @@ class _Counts:
     only_b: int = 0
     moved: int = 0
 
-    def add(self, one: _Pair, *, covered: bool, moved: bool) -> None:
+    def add(self, one: MessagePair, *, covered: bool, moved: bool) -> None:
         """Count what is not the same; ``equal`` begins as all of a."""
         self.equal -= one.a >= 0
         if moved:
@@ -255,69 +248,7 @@ def _ignored(pair: TopicPair) -> int:
     return count
 
 
-def _pairs(
-    pair: TopicPair,
-    gaps: list[Gap],
-    a: _Side,
-    b: _Side,
-    rules: FieldRules,
-    options: DiffOptions,
-) -> Iterator[_Pair]:
-    """Yield what is not the same, in order: messages that belong together, and single ones."""
-    for gap in gaps:
-        i, j, surplus = gap.a_start, gap.b_start, gap.surplus
-        while i < gap.a_end or j < gap.b_end:
-            if surplus > 0 and (j >= gap.b_end or _is_surplus(a, i, surplus, b, j, rules, options)):
-                yield _Pair(i, -1)
-                i, surplus = i + 1, surplus - 1
-            elif surplus < 0 and (
-                i >= gap.a_end or _is_surplus(b, j, -surplus, a, i, rules, options)
-            ):
-                yield _Pair(-1, j)
-                j, surplus = j + 1, surplus + 1
-            else:
-                if pair.keys_a[i] != pair.keys_b[j]:
-                    yield _Pair(i, j)
-                i, j = i + 1, j + 1
-
-
-def _is_surplus(
-    longer: _Side,
-    at: int,
-    surplus: int,
-    shorter: _Side,
-    other: int,
-    rules: FieldRules,
-    options: DiffOptions,
-) -> bool:
-    """Whether a message of the longer side has no counterpart: a later one fits better."""
-    if options.by == BY_STAMP:
-        return False
-    try:
-        wanted = shorter.get(other)
-        if wanted is None or _alike(longer.get(at), wanted, rules):
-            return False
-        later = range(at + 1, at + 1 + min(surplus, _LOOKAHEAD))
-        return any(_alike(longer.get(place), wanted, rules) for place in later)
-    except TraceError:
-        return False
-
-
-def _alike(one: object | None, other: object, rules: FieldRules) -> bool:
-    """Whether two messages are of one moment: equal within tolerance, or of one header stamp."""
-    if one is None:
-        return False
-    stamps = []
-    for message in (one, other):
-        stamp = getattr(getattr(message, "header", None), "stamp", None)
-        if stamp is not None:
-            stamps.append((stamp.sec, stamp.nanosec))
-    if len(stamps) == 2 and stamps[0] == stamps[1] and any(stamps[0]):
-        return True
-    return all(found.within_tolerance for found in field_differences(one, other, rules))
-
-
-def _covered(a: _Side, b: _Side, one: _Pair, rules: FieldRules) -> bool:
+def _covered(a: _Side, b: _Side, one: MessagePair, rules: FieldRules) -> bool:
     if one.a < 0 or one.b < 0:
         return False
     try:
@@ -329,7 +260,7 @@ def _covered(a: _Side, b: _Side, one: _Pair, rules: FieldRules) -> bool:
 
 def _divergence(
     pair: TopicPair,
-    one: _Pair,
+    one: MessagePair,
     a: _Side,
     b: _Side,
     starts: tuple[int, int],
@@ -338,8 +269,6 @@ def _divergence(
     in_a, in_b = one.a >= 0, one.b >= 0
     view_a = a.view(one.a, pair.stamps_a) if in_a else None
     view_b = b.view(one.b, pair.stamps_b) if in_b else None
-    shown = view_a or view_b
-    assert shown is not None
     fields: tuple[FieldDifference, ...] = ()
     more, reason = 0, ""
     if in_a and in_b:
@@ -357,7 +286,11 @@ def _divergence(
         presence=(Presence.BOTH if in_a and in_b else Presence.ONLY_A if in_a else Presence.ONLY_B),
         a=view_a,
         b=view_b,
-        after_ns=shown.stamp_ns - starts[0 if in_a else 1],
+        after_ns=min(
+            view.stamp_ns - start
+            for view, start in zip((view_a, view_b), starts, strict=True)
+            if view is not None
+        ),
         fields=fields,
         more_fields=more,
         reason=reason,
@@ -367,8 +300,8 @@ def _divergence(
 
 def _moved(
     pair: TopicPair,
-    one: _Pair,
-    whole: _Pair,
+    one: MessagePair,
+    whole: MessagePair,
     a: _Side,
     b: _Side,
     starts: tuple[int, int],

@@ -48,9 +48,10 @@ def gaps_by_order(a: Keys, b: Keys, within: list[Gap] | None = None) -> list[Gap
 def gaps_by_stamp(a: Keys, b: Keys, stamps_a: Keys, stamps_b: Keys) -> list[Gap]:
     """Return the gaps when messages belong together that have the same stamp (sorted, both).
 
-    Of several messages with one stamp, the first belongs to the first, and so on.
+    Of several messages with one stamp, the first belongs to the first, and so on; if one recording
+    has more of them, they belong together by what they say.
     """
-    gaps = []
+    gaps: list[Gap] = []
     i = j = 0
     keys_a, keys_b = a.tolist(), b.tolist()
     times_a, times_b = stamps_a.tolist(), stamps_b.tolist()
@@ -58,15 +59,28 @@ def gaps_by_stamp(a: Keys, b: Keys, stamps_a: Keys, stamps_b: Keys) -> list[Gap]
         if j == len(keys_b) or (i < len(keys_a) and times_a[i] < times_b[j]):
             gaps.append(Gap(i, i + 1, j, j))
             i += 1
-        elif i == len(keys_a) or times_b[j] < times_a[i]:
+            continue
+        if i == len(keys_a) or times_b[j] < times_a[i]:
             gaps.append(Gap(i, i, j, j + 1))
             j += 1
+            continue
+        end_a, end_b = (_same_until(times, at) for times, at in ((times_a, i), (times_b, j)))
+        if end_a - i == end_b - j:
+            for at, other in zip(range(i, end_a), range(j, end_b), strict=True):
+                if keys_a[at] != keys_b[other]:
+                    gaps.append(Gap(at, at + 1, other, other + 1))
         else:
-            if keys_a[i] != keys_b[j]:
-                gaps.append(Gap(i, i + 1, j, j + 1))
-            i += 1
-            j += 1
+            gaps += _gaps(a, b, Gap(i, end_a, j, end_b))
+        i, j = end_a, end_b
     return gaps
+
+
+def _same_until(stamps: list[int], at: int) -> int:
+    """Return the place behind the last of equal stamps."""
+    end = at + 1
+    while end < len(stamps) and stamps[end] == stamps[at]:
+        end += 1
+    return end
 
 
 def moved_messages(a: Keys, b: Keys, gaps: list[Gap]) -> dict[int, int]:

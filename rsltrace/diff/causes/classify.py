@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import CLOCK_OF, drawn_for, node_of, phrase, raised
-from rsltrace.diff.causes.lost_messages import GONE
+from rsltrace.diff.causes.lost_messages import GONE, OTHER_QOS
 from rsltrace.diff.causes.output_notes import durations
 from rsltrace.diff.causes.propagation import NODE
 from rsltrace.diff.causes.relevance import Place, Relevance
@@ -267,7 +267,7 @@ def _one_sided(case: Case) -> Judgement:
         because = case.because()
         if because:
             root_sentence += f"; {because}"
-        elif case.lost.startswith(GONE):
+        elif case.lost.startswith((GONE, OTHER_QOS)):
             root_sentence += f"; {one.entity.node} is not deterministic"
     elif one.kind is EventKind.BAG:
         root_sentence = case.because() or f"only the bag of {has} has this message"

@@ -5,13 +5,16 @@ from __future__ import annotations
 from rsltrace.diff.alignment.rows import Run, load_rows
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.model.printable import printable
 
 GONE = "nothing more reaches it"
+OTHER_QOS = "its QoS is another one"
 _LOOKED_AT_MAX = 1000
 
 
 def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> str:
-    """Say that a queue overflowed, or that a subscription is gone; "" where that is not so.
+    """Say that a queue overflowed, that a subscription is gone or has another QoS; "" where that
+    is not so.
 
     ``a`` or ``b`` is the event of the run that received the message, the other is None.
     """
@@ -23,6 +26,8 @@ def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | Non
     has_not, name = (run_b, "b") if a is not None else (run_a, "a")
     has = run_a if a is not None else run_b
     number = has_not.matching.by_key[view.entity]
+    if changed := _changed_qos(run_a, run_b, number):
+        return f"{OTHER_QOS}: {changed}"
     later = _received_after(has_not, number, view.cause_event, view.cause_output)
     if later is None:
         more = _received_after(has, number, view.cause_event, view.cause_output)
@@ -64,9 +69,24 @@ def _sent_between(run: Run, view: EventView, later: tuple[int, int, int]) -> int
     return count
 
 
+def _changed_qos(run_a: Run, run_b: Run, number: int) -> str:
+    """Say which policies of a subscription differ but for its depth, which shows in another way."""
+    a, b = _qos(run_a, number), _qos(run_b, number)
+    differing = [name for name in a if name != "depth" and name in b and a[name] != b[name]]
+    return ", ".join(f"{printable(n)} {_word(a[n])} in a, {_word(b[n])} in b" for n in differing)
+
+
+def _word(value: object) -> str:
+    return printable(str(value))
+
+
 def _depth(run: Run, number: int) -> int | None:
+    depth = _qos(run, number).get("depth")
+    return depth if isinstance(depth, int) else None
+
+
+def _qos(run: Run, number: int) -> dict[str, object]:
     table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
     ids = (table == number).nonzero()[0]
     qos = run.trace.entities[int(ids[0])].detail.get("qos") if len(ids) else None
-    depth = qos.get("depth") if isinstance(qos, dict) else None
-    return depth if isinstance(depth, int) else None
+    return qos if isinstance(qos, dict) else {}

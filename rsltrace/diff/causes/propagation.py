@@ -9,11 +9,14 @@ from, so that the way back to the root can be told.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
+from rsltrace.diff.alignment.outputs import beyond, different_outputs
 from rsltrace.diff.alignment.rows import (
+    ACTION,
     BAG,
     CONSTRUCT,
     OF_THEIR_OWN,
@@ -23,7 +26,8 @@ from rsltrace.diff.alignment.rows import (
     Rows,
     counts,
 )
-from rsltrace.model.event import NO_EVENT, OutputKind
+from rsltrace.diff.causes.relevance import resolved_job
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.reader import Trace
 
 CAUSE = "cause"
@@ -35,6 +39,7 @@ REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONS
 
 UNDECIDED = -1
 _DRAW = int(OutputKind.DRAW)
+_RESUME = int(EventKind.RESUME)
 
 _REMEMBERED_MAX = 50_000
 _DEPTH_MAX = 100
@@ -94,6 +99,7 @@ class Propagation:
         self._moment: list[Origin] = []
         self._moment_stamp = -1
         self._inverted_in: dict[int, int] = {}
+        self._sent: dict[str, Origin] = {}
         self._drawn: Origin | None = None
         self._busy: Origin | None = None
 
@@ -168,10 +174,29 @@ class Propagation:
             origin = Origin(item, UNDECIDED, why, previous)
             self._moment.append(origin)
             self._remember(item, origin)
+        else:
+            self._take_alone(item)
+
+    def _take_alone(self, item: EventPair) -> None:
+        """Take an item that differs and follows from nothing by its cause or its node."""
+        rows, index = self._rows(item)
+        previous: Origin | None = None
+        if self._busy is None and self._moved_by(item):
+            self._take_others_at(self._first_stamp(item))
+            why, previous = self._explanation(item)
+        if previous is not None:
+            self._consequence(item, why, previous)
         elif (shared := self._shared_root(item)) is not None:
             self._consequence(item, *shared)
-        elif rows.kind[place] != SHUTDOWN and not self._is_unwinding(item):
+        elif rows.kind[index - rows.first] != SHUTDOWN and not self._is_unwinding(item):
             self._spread(item, self._root(item).origin)  # when the run ends is said elsewhere
+
+    def _take_others_at(self, stamp: int) -> None:
+        """Take what only one run has at a time: it may have kept others waiting."""
+        for item in self._block.items:
+            alone = (item.a < 0 or item.b < 0) and not item.beyond
+            if alone and self._block.stamp(item) == stamp and self.origin_of(item) is None:
+                self._take_item(item)
 
     def _shared_root(self, item: EventPair) -> tuple[str, Origin] | None:
         """Return what an item follows from that neither its cause nor its node tells: what is drawn
@@ -183,8 +208,13 @@ class Propagation:
             stuck = (b if item.b < 0 else a).run.trace
             if _failed(stuck) and not _failed(rows.run.trace) and self.found:
                 return STUCK, self.found[0].origin
-            waits = rows.kind[index - rows.first] == SUBSCRIPTION
-            return (BUSY, self._busy) if self._busy is not None and waits else None
+            if rows.kind[index - rows.first] not in (SUBSCRIPTION, ACTION):
+                return None
+            if self._busy is not None:
+                return BUSY, self._busy
+            # A message that both sent: what else was sent on its topic took its place in the queue.
+            topic = rows.run.matching.keys[rows.number[index - rows.first]].name
+            return (CAUSE, self._sent[topic]) if topic in self._sent else None
         i, j = item.a - a.first, item.b - b.first
         if a.stamp[i] != b.stamp[j]:
             waits = self._busy is not None and a.kind[i] != BAG
@@ -357,7 +387,8 @@ class Propagation:
             self._taint(owner, origin)
         if any(o[0] == _DRAW for o in outputs):
             self._drawn = self._drawn or origin
-        if any(o[:2] == (_DRAW, number) for o in outputs):  # it takes longer, or shorter
+        takes_longer = any(o[:2] == (_DRAW, number) for o in outputs)
+        if takes_longer or (self._workers_are_shared and self._waits_otherwise(item)):
             self._busy = self._busy or origin
         found = self.found[origin.root]
         for kind, number, _, _ in outputs:
@@ -365,6 +396,7 @@ class Propagation:
                 self._taint(rows.run.matching.nodes[number], origin)
             elif kind in REACHING:
                 self._reach(found, number, self._first_stamp(item), 0)
+                self._sent.setdefault(rows.run.matching.keys[number].name, origin)
         if rows.kind[place] == CONSTRUCT:  # a program and the node that it makes are one
             keys = rows.run.matching.keys
             for kind, number, _, _ in rows.outputs(index):
@@ -373,6 +405,23 @@ class Propagation:
         for kind, number, _, _ in self._moved_outputs(item, outputs):
             if kind in REACHING:
                 self._reach(found, number, self._first_stamp(item), self._moved_by(item))
+
+    @cached_property
+    def _workers_are_shared(self) -> bool:
+        """Whether a callback that waits keeps those of other nodes waiting."""
+        runs = self._block.rows_a.run, self._block.rows_b.run
+        return any(resolved_job(run.trace).get("executors") for run in runs)
+
+    def _waits_otherwise(self, item: EventPair) -> bool:
+        """Whether a callback waits in one run only, or for another time."""
+        waits = []
+        for rows, index in ((self._block.rows_a, item.a), (self._block.rows_b, item.b)):
+            if index >= 0:
+                place = index - rows.first
+                if rows.kind[place] == _RESUME and (self._moved_by(item) or -1 in (item.a, item.b)):
+                    return True
+                waits.append(bool(rows.flags[place] & EventFlag.SUSPENDED))
+        return any(waits) and not (len(waits) == 2 and all(waits))
 
     def _reach(self, found: FoundDivergence, number: int, stamp: int, moved_ns: int) -> None:
         first, count, moved = found.reached.get(number, (stamp, 0, moved_ns))
@@ -395,7 +444,7 @@ class Propagation:
         if not self._moved_by(item):
             return []
         a = self._block.rows_a
-        return list(_beyond(a.outputs(item.a), Counter(output[:3] for output in differing)))
+        return list(beyond(a.outputs(item.a), Counter(output[:3] for output in differing)))
 
     def _taint(self, owner: int, origin: Origin) -> None:
         if owner:
@@ -418,31 +467,3 @@ def outputs_of_one(block: AlignedBlock, item: EventPair) -> list[OutputRow]:
         mine = [output for output in mine if counts(a.run, output)]
         theirs = [output for output in theirs if counts(b.run, output)]
     return different_outputs(mine, theirs)
-
-
-def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:
-    """Return the outputs that only one side has; where one changed into another of the same
-    sender, that of ``a``. The order does not matter."""
-    if len(a) == len(b) and all(x[:3] == y[:3] for x, y in zip(a, b, strict=True)):
-        return []
-    if len(a) == 1 == len(b):  # as most events: counting would take ten times as long
-        return [*a] if a[0][:2] == b[0][:2] else [*a, *b]
-    theirs = Counter(output[:3] for output in b)
-    mine = Counter(output[:3] for output in a)
-    result = list(_beyond(a, theirs))
-    changed = Counter(output[:2] for output in result)
-    for output in _beyond(b, mine):
-        if changed[output[:2]] > 0:
-            changed[output[:2]] -= 1
-        else:
-            result.append(output)
-    return result
-
-
-def _beyond(outputs: list[OutputRow], others: Counter[tuple[int, int, int]]) -> Iterator[OutputRow]:
-    """Yield the outputs of which the others have fewer."""
-    left = Counter(others)
-    for output in outputs:
-        left[output[:3]] -= 1
-        if left[output[:3]] < 0:
-            yield output

@@ -14,6 +14,7 @@ from rsltrace.diff.alignment.blocks import (
     EventPair,
 )
 from rsltrace.diff.alignment.entity_matching import EntityMatching, match_entities
+from rsltrace.diff.alignment.outputs import different_outputs
 from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.effects import EffectSearch
 from rsltrace.diff.causes.explain import Explainer
@@ -22,7 +23,6 @@ from rsltrace.diff.causes.job_settings import job_settings
 from rsltrace.diff.causes.propagation import (
     FoundDivergence,
     Propagation,
-    different_outputs,
 )
 from rsltrace.diff.causes.settings import entity_settings, environment_settings
 from rsltrace.diff.options import DiffOptions

@@ -34,6 +34,8 @@ _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 _ABSENT = "absent"
 _NO_FIELD = "only one of the types has this field"
+_SECONDS_MAX = 2.0**33
+"""More than any two times are apart."""
 _TEXT_MAX = 60
 _TEXT_BEFORE = 20
 _SORTED_MAX = 1000
@@ -183,14 +185,25 @@ def _list_differences(
             note=f"length {len(a)} and {len(b)}",
             first=extra,
         )
-    elif 1 < len(a) <= _SORTED_MAX and rules.empty:
-        texts_a, texts_b = ([preview(item, _ITEM_MAX) for item in side] for side in (a, b))
-        if texts_a != texts_b and sorted(texts_a) == sorted(texts_b):
-            text_a, text_b = (preview(side, _LIST_MAX) for side in (a, b))
-            yield FieldDifference(path, text_a, text_b, note=SAME_ELEMENTS)
-            return
+    elif 1 < len(a) <= _SORTED_MAX and rules.empty and _changed_places(a, b, base, rules):
+        text_a, text_b = (preview(side, _LIST_MAX) for side in (a, b))
+        yield FieldDifference(path, text_a, text_b, note=SAME_ELEMENTS)
+        return
     for place, (one, other) in enumerate(zip(a, b, strict=False)):
         yield from _differences(f"{path}[{place}]", one, other, base, rules)
+
+
+def _changed_places(a: list[Any], b: list[Any], base: str, rules: FieldRules) -> bool:
+    """Whether two lists of one length have the same elements in another order."""
+    texts_a, texts_b = ([preview(item, _ITEM_MAX) for item in side] for side in (a, b))
+    if texts_a == texts_b or sorted(texts_a) != sorted(texts_b):
+        return False
+    order_a, order_b = (sorted(range(len(t)), key=t.__getitem__) for t in (texts_a, texts_b))
+    # A text is not the whole of a long element.
+    return all(
+        next(_differences("", a[i], b[j], base, rules), None) is None
+        for i, j in zip(order_a, order_b, strict=True)
+    )
 
 
 def _item(items: list[Any], place: int) -> str:
@@ -242,7 +255,7 @@ def _time_difference(
     distance_ns = abs(ns_a - ns_b)
     tolerance = rules.tolerance(path) if path else None
     covered = tolerance is not None and (
-        distance_ns <= round(tolerance[0] * NS_PER_S)
+        distance_ns <= round(min(tolerance[0], _SECONDS_MAX) * NS_PER_S)
         or distance_ns <= tolerance[1] * max(abs(ns_a), abs(ns_b))
     )
     yield FieldDifference(

@@ -21,13 +21,16 @@ def load() -> None:
         lifecycle,
         mains,
         messages,
+        mixed,
         origins,
         outside,
         pairs,
+        programs,
         recordings,
         rules,
         sensors,
         settings,
+        systems,
         timing,
         unrelated,
         waiting,
@@ -36,6 +39,6 @@ def load() -> None:
     families = (
         *(bags, behaviour, delivery, endings, equal, graphs, messages, origins, outside, pairs),
         *(recordings, rules, settings, waiting, actions, lifecycle, mains, timing),
-        *(answers, sensors, unrelated),
+        *(answers, sensors, unrelated, systems, mixed, programs),
     )
     assert all(families)

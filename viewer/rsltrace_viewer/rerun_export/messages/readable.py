@@ -32,7 +32,9 @@ def left_out(trace: Trace) -> dict[str, str]:
         except _EmptyItems as error:
             found[channel.topic] = f"{channel.type} has a sequence of {error}, which has no fields"
             continue
-        if values > _VALUES_MAX:
+        if decoder.wide_texts:
+            found[channel.topic] = f"{channel.type} has wide texts (wstring)"
+        elif values > _VALUES_MAX:
             found[channel.topic] = f"a {channel.type} has {values} values, more than {_VALUES_MAX}"
     return found
 
