@@ -602,3 +602,28 @@ def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(
         timers = {e.entity for e in recorded.events() if e.kind.label == "timer"}
         assert [trace.entities[number].kind.label for number in timers] == ["timer"]
         assert [trace.entities[trace.entities[n].node].name for n in timers] == ["/late"]
+
+
+def test_a_pool_that_is_used_in_the_pool_of_an_executor(simulate: Any) -> None:
+    """All pools of a process share a lock, which is taken while a worker is started."""
+    log: list[Any] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Node("pools")
+        pool = ThreadPoolExecutor(1)
+
+        def work() -> float:
+            time.sleep(0.7)
+            return seconds(node)
+
+        def tick() -> None:
+            pool.submit(work).add_done_callback(lambda done: log.append(done.result()))
+
+        node.create_timer(1.0, tick)
+        executor = MultiThreadedExecutor()
+        executor.add_node(node)
+        executor.spin()
+
+    simulate(main_spec(program), duration=3)
+    assert log[:2] == [1.7, 2.7]

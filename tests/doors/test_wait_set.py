@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from rclpy.action import ActionClient, ActionServer
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import SingleThreadedExecutor
@@ -18,6 +19,7 @@ from rclpy.wait_for_message import wait_for_message
 from rclpy.waitable import NumberOfEntities, Waitable
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
+from test_msgs.action import Fibonacci
 
 pytestmark = pytest.mark.ros
 
@@ -238,3 +240,50 @@ def test_a_waitable_that_an_executor_of_ones_own_runs(simulate: Callable[..., An
 
     simulate(Counter, main_spec(program), duration=4)
     assert log == EXPECTED
+
+
+def test_an_executor_of_ones_own_runs_actions(simulate: Callable[..., Any]) -> None:
+    """One that has nothing of rclpy's executors: it waits for an action as for a waitable."""
+    seen: list[Any] = []
+
+    def serve() -> None:
+        rclpy.init()
+        node = Node("server")
+
+        def execute(goal: Any) -> Any:
+            goal.publish_feedback(Fibonacci.Feedback(sequence=[goal.request.order]))
+            goal.succeed()
+            return Fibonacci.Result(sequence=[1, 2])
+
+        ActionServer(node, Fibonacci, "fib", execute)
+        rclpy.spin(node)
+
+    def ask() -> None:
+        rclpy.init()
+        node = Node("asker")
+        client = ActionClient(node, Fibonacci, "fib")
+        goal = client.send_goal_async(
+            Fibonacci.Goal(order=7), lambda said: seen.append(list(said.feedback.sequence))
+        )
+        _turn(node, client, goal.done)
+        result = goal.result().get_result_async()
+        _turn(node, client, result.done)
+        seen.append((goal.result().accepted, list(result.result().result.sequence)))
+
+    simulate(main_spec(serve), main_spec(ask), duration=10)
+    assert seen == [[7], (True, [1, 2])]
+
+
+def _turn(node: Node, waitable: Any, until: Callable[[], bool]) -> None:
+    while not until():
+        count = waitable.get_num_entities()
+        wait_set = rclpy_implementation.WaitSet(
+            count.num_subscriptions, 0, 0, count.num_clients, 0, 0, node.context.handle
+        )
+        wait_set.clear_entities()
+        waitable.add_to_wait_set(wait_set)
+        wait_set.wait(100_000_000)
+        if waitable.is_ready(wait_set):
+            run = waitable.execute(waitable.take_data())
+            with pytest.raises(StopIteration):
+                run.send(None)

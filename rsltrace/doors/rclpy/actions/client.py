@@ -43,15 +43,13 @@ class ActionClientHandle(ActionHandle):
         )
 
     def is_ready(self, wait_set: Any) -> tuple[bool, bool, bool, bool, bool]:
-        """Say which of feedback, status and the three responses is being executed."""
-        ready = self._ready
-        return (
-            ready is self._feedback,
-            ready is self._status,
-            ready is self._goal,
-            ready is self._cancel,
-            ready is self._result,
+        """Say which of feedback, status and the three responses is being executed, or is ready in a
+        wait set."""
+        parts = (self._feedback, self._status, self._goal, self._cancel, self._result)
+        feedback, status, goal, cancel, result = (
+            self.is_part_ready(wait_set, part) for part in parts
         )
+        return feedback, status, goal, cancel, result
 
     def send_goal_request(self, request: Any) -> int:
         """Send a goal; return the sequence number of the request."""

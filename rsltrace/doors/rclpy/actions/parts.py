@@ -28,6 +28,8 @@ class Part(ReceiverHandle):
     """One of an action's endpoints: its arrivals are handed to the action's waitable."""
 
     owner: ActionHandle
+    in_wait_sets: str
+    """What it is to a wait set: ``service``, ``client`` or ``subscription``."""
     purpose: str
     """``goal``, ``cancel``, or what else it is for."""
 
@@ -60,13 +62,19 @@ class Part(ReceiverHandle):
 class GoalService(Part, ServiceHandle):
     """A server's end of one of the three services."""
 
+    in_wait_sets = "service"
+
 
 class GoalClient(Part, ClientHandle):
     """A client's end of one of the three services."""
 
+    in_wait_sets = "client"
+
 
 class GoalSubscription(Part, SubscriptionHandle):
     """A client's feedback or status subscription."""
+
+    in_wait_sets = "subscription"
 
 
 class ActionHandle(Handle):
@@ -86,6 +94,7 @@ class ActionHandle(Handle):
         self.action_type = action_type
         node.actions.append(self)
         self._ready: Part | None = None
+        self._places: dict[Part, int] = {}
 
     @property
     def type_name(self) -> str:
@@ -100,6 +109,17 @@ class ActionHandle(Handle):
         part.__init__(self.node, interface, self.path(name), qos)  # type: ignore[misc]
         self.parts.append(part)
         return part
+
+    def add_to_waitset(self, wait_set: Any) -> None:
+        """Let an executor that has wait sets of its own wait for the parts."""
+        for part in self.parts:
+            self._places[part] = getattr(wait_set, f"add_{part.in_wait_sets}")(part)
+
+    def is_part_ready(self, wait_set: Any, part: Part) -> bool:
+        """Return whether a part is the one that is executed, or was found ready by a wait set."""
+        if wait_set is None:
+            return part is self._ready
+        return bool(wait_set.is_ready(part.in_wait_sets, self._places[part]))
 
     def path(self, name: str) -> str:
         """Return the full name of a part."""

@@ -69,14 +69,11 @@ class ActionServerHandle(ActionHandle):
     # -- requests and responses ----------------------------------------------------------------
 
     def is_ready(self, wait_set: Any) -> tuple[bool, bool, bool, bool]:
-        """Say which of goal, cancel, result request and expiry is being executed."""
-        ready = self._ready
-        return (
-            ready is self._goal,
-            ready is self._cancel,
-            ready is self._result,
-            self._expired,
-        )
+        """Say which of goal, cancel, result request and expiry is being executed, or is ready in a
+        wait set."""
+        parts = (self._goal, self._cancel, self._result)
+        goal, cancel, result = (self.is_part_ready(wait_set, part) for part in parts)
+        return goal, cancel, result, self._expired
 
     def get_num_entities(self) -> tuple[int, int, int, int, int]:
         """Count its subscriptions, guard conditions, timers, clients and services, as rcl does."""

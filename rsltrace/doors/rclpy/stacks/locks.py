@@ -103,6 +103,10 @@ class SimLock:
         """Return whether somebody has the lock."""
         return self._taken
 
+    def is_mine(self) -> bool:
+        """Return whether the calling stack has the lock."""
+        return self._taken and self._owner is getcurrent()
+
     def __enter__(self) -> bool:
         return self.acquire()
 
@@ -111,6 +115,25 @@ class SimLock:
 
     def _at_fork_reinit(self) -> None:
         self.__init__()  # type: ignore[misc]
+
+
+class LockOfPools:
+    """Stands in for the lock that all thread pools of a process share (``concurrent.futures``).
+
+    A pool starts a worker while it has it, and the worker runs first: it may well want it, too.
+    Real threads keep ``real``.
+    """
+
+    def __init__(self, real: Any) -> None:
+        self._real = real
+        self._own: SimLock = object.__new__(SimLock)
+        self._own.__init__()  # type: ignore[misc]
+
+    def __enter__(self) -> bool:
+        return bool((self._real if simulated_stacks() is None else self._own).acquire())
+
+    def __exit__(self, *exc: object) -> None:
+        (self._own if self._own.is_mine() else self._real).release()
 
 
 class SimRLock:
@@ -260,4 +283,4 @@ class _Holder:
         return "a lock that nobody will release"
 
 
-__all__ = ["SimLock", "SimRLock"]
+__all__ = ["LockOfPools", "SimLock", "SimRLock"]

@@ -30,7 +30,7 @@ from greenlet import getcurrent, greenlet
 
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
 from rsltrace.doors.rclpy.stacks.construction import Construction
-from rsltrace.doors.rclpy.stacks.locks import SimLock, SimRLock
+from rsltrace.doors.rclpy.stacks.locks import LockOfPools, SimLock, SimRLock
 from rsltrace.doors.rclpy.stacks.runners import RunEnded, Wait
 from rsltrace.doors.rclpy.stacks.simulated_sleep import simulated_stacks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
@@ -363,6 +363,11 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (queue, "time", now),
         (futures_base, "time", SimpleNamespace(monotonic=now)),
         (concurrent.futures.ThreadPoolExecutor, "_counter", staticmethod(_numbers(0))),
+        (
+            futures_thread,
+            "_global_shutdown_lock",
+            LockOfPools(futures_thread._global_shutdown_lock),  # type: ignore[attr-defined]
+        ),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
     with ExitStack() as stack:
