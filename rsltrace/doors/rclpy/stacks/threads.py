@@ -366,7 +366,7 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
         (
             futures_thread,
             "_global_shutdown_lock",
-            LockOfPools(futures_thread._global_shutdown_lock),  # type: ignore[attr-defined]
+            LockOfPools(futures_thread._global_shutdown_lock),
         ),
         (futures_thread, "os", SimpleNamespace(cpu_count=_count, process_cpu_count=_count)),
     ]
