@@ -44,7 +44,7 @@ def audit_job(job: Job, executable: Executables) -> Audit:
     targets: list[str | Path] = []
     for index, spec in enumerate(job.nodes):
         where = locate(job, ("nodes", index, spec.kind))
-        if spec.program is not None:
+        if spec.program is not None or spec.component is not None:
             targets.append("")  # whatever it does is no Python's doing
             continue
         target: str | Path = spec.target

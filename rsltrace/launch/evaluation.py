@@ -68,6 +68,14 @@ class Evaluation:
         """Return the environment that the launch file found."""
         return dict(self._environment)
 
+    def changed_environment(self) -> dict[str, str]:
+        """Return what the launch file has set in the environment that it found."""
+        return {
+            name: value
+            for name, value in self.scope.environment.items()
+            if self._environment.get(name) != value
+        }
+
     def replaced_text(self, written: str) -> str:
         """Return a text with its substitutions replaced. Raises ``ValueError``."""
         return self._substitutions.text(written)

@@ -19,25 +19,30 @@ from rsltrace.workspace.imports import unbuilt_packages
 
 
 def expand(
-    job: Job, *, why_not: Callable[[str, str], str | None], programs: bool = True
+    job: Job,
+    *,
+    why_not: Callable[[str, str], str | None],
+    is_process: Callable[[str, str], bool],
+    programs: bool = True,
 ) -> Expanded:
     """Return a job whose launch files have become nodes.
 
     A Python launch file is a program, and so is the ``setup.py`` of a package that nobody has
     built: they are run to do so, or not used if ``programs`` is False.
-    ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot.
+    ``why_not(package, executable)`` says why an executable cannot be simulated, if it cannot, and
+    ``is_process`` whether it runs as a process of its own.
 
     :raises JobError: if a launch file is wrong, or starts what cannot be simulated.
     """
     if not job.launch:
         return Expanded(job)
     if not programs:
-        return _expand(job, None, why_not)
+        return _expand(job, None, why_not, is_process)
     folders = [job.resolve(folder) for folder in job.search_path]
     around = [workspace_of(job.resolve(spec.file)) for spec in job.launch]
     new = [f for f in dict.fromkeys(around) if f is not None and f not in folders]
     with unbuilt_packages([*folders, *new]):
-        expanded = _expand(job, [*folders, *new], why_not)
+        expanded = _expand(job, [*folders, *new], why_not, is_process)
     job = expanded.job
     named = {spec.executable.partition("/")[0] for spec in job.nodes if spec.executable}
     if new and not named.isdisjoint(source_packages(new)):
@@ -47,7 +52,10 @@ def expand(
 
 
 def _expand(
-    job: Job, folders: Sequence[Path] | None, why_not: Callable[[str, str], str | None]
+    job: Job,
+    folders: Sequence[Path] | None,
+    why_not: Callable[[str, str], str | None],
+    is_process: Callable[[str, str], bool],
 ) -> Expanded:
     """Do so; ``folders`` are those of packages and modules, None if no programs are to run."""
     nodes: list[NodeSpec] = list(job.nodes)
@@ -58,7 +66,8 @@ def _expand(
             launched,
             skip_unsupported=spec.skip_unsupported,
             why_not=why_not,
-            first=len(nodes),
+            is_process=is_process,
+            before=nodes,
         )
         notes += [f"left out: {item}" for item in launched.unsupported]
         notes += launched.ignored

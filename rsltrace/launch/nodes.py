@@ -8,16 +8,13 @@ from typing import Any
 
 from rsltrace.launch.element import Element
 from rsltrace.launch.evaluation import Evaluation
-from rsltrace.launch.model import LaunchedNode
+from rsltrace.launch.model import LaunchedNode, Surroundings, respawning
 from rsltrace.launch.parameter_files import substituted_parameters
-from rsltrace.launch.scope import ParameterFile, Parameters, absolute_namespace
+from rsltrace.launch.scope import ParameterFile, Parameters, absolute_namespace, full_name
 
 _WITHOUT_MEANING = (
     "output",
     "output_format",
-    "respawn",
-    "respawn_delay",
-    "respawn_max_retries",
     "emulate_tty",
     "exec_name",
     "log_cmd",
@@ -27,8 +24,8 @@ _WITHOUT_MEANING = (
 )
 """How a process is run: nothing that a node could tell in a simulation."""
 
-_LOST = ("launch-prefix", "cwd", "on_exit", "required")
-"""What makes a difference for a process of its own, and has none here: said, then left out."""
+_OF_PROCESSES = ("launch-prefix", "cwd", "respawn", "respawn_delay", "respawn_max_retries")
+_ENDS = ("on_exit", "required")
 
 _NODE = ("pkg", "exec", "name", "node-name", "namespace", "args", "ros_args", "autostart")
 _COMPONENT = ("pkg", "plugin", "name", "namespace")
@@ -43,6 +40,9 @@ class Nodes:
     def node(self, element: Element) -> None:
         """Do ``<node>`` and ``<lifecycle_node>``."""
         self._check_process(element, ["param", "remap"])
+        self._process(element)
+
+    def _process(self, element: Element, *, is_container: bool = False) -> None:
         evaluation = self._evaluation
         executable = evaluation.needed(element, "exec")
         package = evaluation.optional(element, "pkg")
@@ -57,6 +57,11 @@ class Nodes:
                 f"autostart of {package}/{executable}",
                 "nobody changes the states of lifecycle nodes here: let a node of the job do it",
             )
+        number = 0
+        if self._ends_everything(element):
+            evaluation.kept.append(element)  # so that no other gets its id
+            number = id(element)
+            evaluation.launched.required.add(number)
         evaluation.launched.nodes.append(
             LaunchedNode(
                 where=_where(element),
@@ -64,21 +69,26 @@ class Nodes:
                 executable=executable,
                 arguments=self._words(element, "args"),
                 ros_arguments=self._words(element, "ros_args"),
+                number=number,
+                surroundings=self._surroundings(element),
+                is_container=is_container,
                 **self._common(element),
             )
         )
 
     def container(self, element: Element) -> None:
-        """Do ``<node_container>``: its components are nodes, it is nothing itself."""
+        """Do ``<node_container>`` and its components."""
         self._check_process(element, ["composable_node", "param", "remap"])
-        self._components(element)
+        self._process(element, is_container=True)
+        namespace, name = self._names(element)
+        self._components(element, full_name(namespace, name or ""))
 
     def load(self, element: Element) -> None:
         """Do ``<load_composable_node>``."""
         element.check(["target"], ["composable_node"])
-        self._components(element)
+        self._components(element, full_name(None, self._evaluation.needed(element, "target")))
 
-    def _components(self, element: Element) -> None:
+    def _components(self, element: Element, container: str) -> None:
         evaluation = self._evaluation
         for child in element.named("composable_node"):
             child.check(_COMPONENT, ["param", "remap", "extra_arg"])
@@ -89,33 +99,72 @@ class Nodes:
                     where=_where(child),
                     package=evaluation.needed(child, "pkg"),
                     plugin=evaluation.needed(child, "plugin"),
+                    container=container,
+                    extra_arguments=(self._mapping(child.named("extra_arg")),),
                     **self._common(child),
                 )
             )
 
     def _check_process(self, element: Element, children: list[str]) -> None:
-        element.check([*_NODE, *_WITHOUT_MEANING, *_LOST], [*children, "env"])
-        lost = [name for name in _LOST if element.get(name) is not None]
-        lost += [f"env {self._evaluation.needed(e, 'name')}" for e in element.named("env")]
-        if lost:
-            self._evaluation.launched.ignored.append(
-                f"{_where(element)}: {', '.join(lost)}: all nodes run in one process"
-            )
+        element.check([*_NODE, *_WITHOUT_MEANING, *_OF_PROCESSES, *_ENDS], [*children, "env"])
+
+    def _surroundings(self, element: Element) -> Surroundings:
+        """Return what is said of the process of a node."""
+        evaluation = self._evaluation
+        own = {
+            evaluation.needed(e, "name"): evaluation.needed(e, "value")
+            for e in element.named("env")
+        }
+        respawn: tuple[int, int | None] | None = None
+        if evaluation.flag(element.get("respawn"), False):
+            times = int(self._number(element, "respawn_max_retries", -1))
+            delay_s = self._number(element, "respawn_delay", 0.0)
+            respawn = respawning(delay_s, times)
+        return Surroundings(
+            tuple({**evaluation.changed_environment(), **own}.items()),
+            folder=evaluation.optional(element, "cwd") or "",
+            respawn=respawn,
+            own=(*(f"env {name}" for name in own), *_given(element, "cwd")),
+            without=_given(element, "launch-prefix"),
+        )
+
+    def _number(self, element: Element, name: str, default: float) -> float:
+        attribute = element.get(name)
+        if attribute is None:
+            return default
+        written = self._evaluation.text(attribute)
+        try:
+            return float(written)
+        except ValueError:
+            raise attribute.place.error(f"{name} is a number, not {written!r}") from None
+
+    def _ends_everything(self, element: Element) -> bool:
+        """Return whether everything ends when the process of an element does."""
+        evaluation, on_exit = self._evaluation, element.get("on_exit")
+        if on_exit is not None and evaluation.text(on_exit) != "shutdown":
+            raise on_exit.place.error("what a process can do at its end is 'shutdown'")
+        return on_exit is not None or evaluation.flag(element.get("required"), False)
+
+    def _names(self, element: Element) -> tuple[str | None, str | None]:
+        """Return namespace and name of a node, as far as they are said."""
+        evaluation = self._evaluation
+        own = evaluation.optional(element, "namespace")
+        name = evaluation.optional(element, "name") or evaluation.optional(element, "node-name")
+        return absolute_namespace(evaluation.scope.namespace, own), name
 
     def _common(self, element: Element) -> dict[str, Any]:
         evaluation = self._evaluation
         scope = evaluation.scope
-        namespace = absolute_namespace(scope.namespace, evaluation.optional(element, "namespace"))
-        name = evaluation.optional(element, "name") or evaluation.optional(element, "node-name")
+        namespace, name = self._names(element)
         remappings = []
         for remap in element.named("remap"):
             remap.check(["from", "to"])
             remappings.append((evaluation.needed(remap, "from"), evaluation.needed(remap, "to")))
-        full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
+        whole = None if name is None else full_name(namespace, name)
         return {
             "name": name,
             "namespace": namespace,
-            "parameters": scope.parameters + self._parameters(element, full_name),
+            "parameters": scope.parameters + self._parameters(element, whole),
             "remappings": scope.remappings + tuple(remappings),
             "delay_ns": evaluation.delay_ns,
             "after": evaluation.after,
@@ -162,6 +211,10 @@ class Nodes:
             else:
                 values[name] = self._mapping(nested)
         return values
+
+
+def _given(element: Element, *names: str) -> tuple[str, ...]:
+    return tuple(name for name in names if element.get(name) is not None)
 
 
 def _where(element: Element) -> str:

@@ -18,9 +18,17 @@ from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job.values.times import parse_time
-from rsltrace.launch.model import ENVIRONMENT, Argument, Launched, LaunchedNode, Unsupported
+from rsltrace.launch.model import (
+    ENVIRONMENT,
+    Argument,
+    Launched,
+    LaunchedNode,
+    Surroundings,
+    Unsupported,
+    respawning,
+)
 from rsltrace.launch.parameter_files import parameters_for
-from rsltrace.launch.scope import ParameterFile, Parameters
+from rsltrace.launch.scope import ParameterFile, Parameters, full_name
 from rsltrace.launch.values import yaml_value
 
 _NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
@@ -76,6 +84,7 @@ class _Visitor:
     def __init__(self, context: Any, path: Path) -> None:
         self.launched = Launched()
         self._context = context
+        self._environment = dict(os.environ)
         self._path = path
         self._delay_ns = 0
         self._after: tuple[str, int] | None = None
@@ -131,9 +140,16 @@ class _Visitor:
         from launch_ros.actions import ComposableNodeContainer, LoadComposableNodes, Node, RosTimer
 
         if isinstance(action, ComposableNodeContainer):
-            self._components(getattr(action, f"_ComposableNodeContainer{_DESCRIPTIONS}") or ())
+            self._node(action, is_container=True)
+            container = full_name(None, action.node_name)
+            descriptions = getattr(action, f"_ComposableNodeContainer{_DESCRIPTIONS}")
+            self._components(descriptions or (), container)
         elif isinstance(action, LoadComposableNodes):
-            self._components(getattr(action, f"_LoadComposableNodes{_DESCRIPTIONS}") or ())
+            target = action._LoadComposableNodes__target_container
+            is_action = isinstance(target, ComposableNodeContainer)
+            container = full_name(None, target.node_name if is_action else self._text(target))
+            descriptions = getattr(action, f"_LoadComposableNodes{_DESCRIPTIONS}")
+            self._components(descriptions or (), container)
         elif isinstance(action, Node):
             self._node(action)
         elif isinstance(action, actions.ExecuteLocal):
@@ -145,7 +161,10 @@ class _Visitor:
         elif isinstance(action, actions.RegisterEventHandler):
             self._handler(action.event_handler)
         elif isinstance(action, actions.EmitEvent):
-            if isinstance(action, actions.Shutdown) and self._after is not None:
+            is_end = isinstance(action, actions.Shutdown) and self._after is not None
+            if is_end and self._after[0] == "ended" and not self._delay_ns:  # type: ignore[index]
+                self.launched.required.add(self._after[1])  # type: ignore[index]
+            elif is_end:
                 self.launched.ignored.append(f"{self.where()}: shutdown: {_NOT_IN_A_RUN}")
             else:
                 self._refuse(type(action).__name__, _NOT_IN_A_RUN)
@@ -199,7 +218,7 @@ class _Visitor:
 
     # -- nodes -------------------------------------------------------------------------------------
 
-    def _node(self, node: Any) -> None:
+    def _node(self, node: Any, *, is_container: bool = False) -> None:
         package = self._optional(node.node_package)
         executable = self._text(node.node_executable)
         if package is None:
@@ -221,8 +240,14 @@ class _Visitor:
                 "nobody changes the states of lifecycle nodes here: let a node of the job do it",
             )
         self._kept.append(node)
+        on_exit = getattr(node, "_ExecuteLocal__on_exit", None)
+        if on_exit and not callable(on_exit):
+            listed = on_exit if isinstance(on_exit, (list, tuple)) else [on_exit]
+            self._later.append((("ended", id(node)), list(listed)))
         self.launched.nodes.append(
             LaunchedNode(
+                surroundings=self._surroundings(node),
+                is_container=is_container,
                 where=self.where(),
                 delay_ns=self._delay_ns,
                 after=self._after,
@@ -237,6 +262,32 @@ class _Visitor:
                 ros_arguments=self._words(node._Node__ros_arguments),
             )
         )
+
+    def _surroundings(self, node: Any) -> Surroundings:
+        process = node.process_description
+        own: dict[str, str] = {}
+        for pairs in (process.env, process.additional_env):
+            own |= {self._text(name): self._text(value) for name, value in pairs or ()}
+        now, found = self._context.environment, self._environment
+        changed = {name: value for name, value in now.items() if found.get(name) != value}
+        respawn = None
+        if self._typed(getattr(node, "_ExecuteLocal__respawn", False), bool):
+            delay_s = float(getattr(node, "_ExecuteLocal__respawn_delay", None) or 0.0)
+            times = getattr(node, "_ExecuteLocal__respawn_max_retries", -1)
+            respawn = respawning(delay_s, int(times))
+        prefix = self._text(process.prefix) if process.prefix is not None else ""
+        return Surroundings(
+            tuple({**changed, **own}.items()),
+            folder=self._optional(process.cwd) or "",
+            respawn=respawn,
+            own=(*(f"env {name}" for name in own), *(("cwd",) if process.cwd else ())),
+            without=("launch-prefix",) if prefix else (),
+        )
+
+    def _typed(self, value: Any, kind: type) -> Any:
+        from launch.utilities.type_utils import perform_typed_substitution
+
+        return perform_typed_substitution(self._context, value, kind)
 
     def _words(self, words: Any) -> tuple[str, ...]:
         return tuple(self._text(word) for word in words or ())
@@ -258,13 +309,13 @@ class _Visitor:
                 found.append(ParameterFile(text))
         return tuple(found)
 
-    def _components(self, descriptions: Any) -> None:
+    def _components(self, descriptions: Any, container: str) -> None:
         for description in descriptions:
             condition = description.condition()
             if condition is None or condition.evaluate(self._context):
-                self._component(description)
+                self._component(description, container)
 
-    def _component(self, description: Any) -> None:
+    def _component(self, description: Any, container: str) -> None:
         from launch_ros.utilities import make_namespace_absolute, prefix_namespace
 
         configurations = self._context.launch_configurations
@@ -284,21 +335,27 @@ class _Visitor:
                 plugin=self._text(description.node_plugin),
                 name=self._optional(description.node_name),
                 namespace=namespace or None,
+                container=container,
                 parameters=self._component_parameters(description),
+                extra_arguments=self._evaluated(description.extra_arguments),
                 remappings=tuple(remappings),
             )
         )
 
     def _component_parameters(self, description: Any) -> Parameters:
-        from launch_ros.utilities import evaluate_parameters
-
         found: list[ParameterFile | dict[str, Any]] = []
         for item in self._context.launch_configurations.get("global_params") or ():
             if isinstance(item, tuple):
                 found.append({item[0]: item[1]})
             else:
                 found.append(ParameterFile(os.path.abspath(item)))
-        for given in evaluate_parameters(self._context, description.parameters or ()):
+        return (*found, *self._evaluated(description.parameters))
+
+    def _evaluated(self, parameters: Any) -> Parameters:
+        from launch_ros.utilities import evaluate_parameters
+
+        found: list[ParameterFile | dict[str, Any]] = []
+        for given in evaluate_parameters(self._context, parameters or ()):
             if isinstance(given, dict):
                 found.append({str(name): _plain(value) for name, value in given.items()})
             elif isinstance(given, Path):

@@ -44,6 +44,11 @@ def absolute_namespace(base: str, own: str | None) -> str | None:
     return namespace or (None if own is None else "/")
 
 
+def full_name(namespace: str | None, name: str) -> str:
+    """Return the name of a node with its namespace; a name that is a path already stands alone."""
+    return name if name.startswith("/") else f"{(namespace or '').rstrip('/')}/{name}"
+
+
 def joined_namespace(base: str, own: str | None) -> str:
     """Return a namespace below another one, as launch joins them; absolute ones stand alone."""
     if own is None or own == "":

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 from rsltrace.errors import JobError
 from rsltrace.job import NodeSpec
+from rsltrace.job.parts.process import RespawnSpec
 from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.job.values.ros_arguments import split_ros_arguments
-from rsltrace.launch.model import Launched, LaunchedNode, Unsupported
+from rsltrace.launch.model import Launched, LaunchedNode, Surroundings, Unsupported
 from rsltrace.launch.parameter_files import flat, parameters_for
-from rsltrace.launch.scope import ParameterFile
+from rsltrace.launch.scope import ParameterFile, full_name
 from rsltrace.launch.values import inferred
 from rsltrace.workspace.cache import lasting
 
@@ -24,27 +25,36 @@ def node_specs(
     *,
     skip_unsupported: bool,
     why_not: Callable[[str, str], str | None],
-    first: int = 0,
+    is_process: Callable[[str, str], bool] = lambda package, executable: False,
+    before: Sequence[NodeSpec] = (),
 ) -> list[NodeSpec]:
     """Return the nodes as entries of a job; ``launched.unsupported`` grows by what is left out.
 
-    ``why_not(package, executable)`` says why an executable cannot be simulated. ``first`` is the
-    number that the first of them will have in the job.
+    ``why_not(package, executable)`` says why an executable cannot be simulated, ``is_process``
+    whether it runs as a process of its own. ``before`` are the entries that the job has already.
 
     :raises JobError: with everything that cannot be simulated, unless that is to be skipped.
     """
+    first = len(before)
+    containers = {full_name(spec.namespace, spec.name) for spec in before if spec.name}
     runs: list[LaunchedNode] = []
-    for node in launched.nodes:
-        why = _why_not(node, why_not)
+    for node in _without_idle_containers(launched.nodes, why_not):
+        why = _why_not(node, why_not, containers)
         if why is not None:
             launched.unsupported.append(Unsupported(node.where, node.title, why))
         else:
             runs.append(node)
+            containers |= {node.full_name} if node.is_container else set()
     runs = _without_orphans(runs, launched)
+    _note_what_is_lost(runs, launched, is_process)
     numbers: dict[int, int] = {}
     for position, node in enumerate(runs, first):
         numbers.setdefault(node.number, position)
-    specs = [_spec(node, numbers) for node in runs]
+    required = launched.required
+    specs = [
+        _spec(node, numbers, is_process(node.package, node.executable), node.number in required)
+        for node in runs
+    ]
     launched.unsupported.sort(key=_position)
     if launched.unsupported and not skip_unsupported:
         listed = launched.unsupported[:_LISTED_MAX]
@@ -76,25 +86,63 @@ def _without_orphans(nodes: list[LaunchedNode], launched: Launched) -> list[Laun
         nodes = kept
 
 
-def _why_not(node: LaunchedNode, of_executable: Callable[[str, str], str | None]) -> str | None:
+def _without_idle_containers(
+    nodes: Sequence[LaunchedNode], why_not: Callable[[str, str], str | None]
+) -> list[LaunchedNode]:
+    """Return the nodes but those containers of which nothing would come: Python components are
+    nodes of the run without one."""
+    busy = {node.container for node in nodes if "::" in node.plugin}
+    idle = {node.container for node in nodes if node.plugin} - busy
+    return [
+        node
+        for node in nodes
+        if not node.is_container
+        or node.full_name in busy
+        or (node.full_name not in idle and why_not(node.package, node.executable) is None)
+    ]
+
+
+def _note_what_is_lost(
+    nodes: Sequence[LaunchedNode], launched: Launched, is_process: Callable[[str, str], bool]
+) -> None:
+    for node in nodes:
+        said = node.surroundings
+        if is_process(node.package, node.executable):
+            if said.without:
+                why = "processes are started as they are"
+                launched.ignored.append(f"{node.where}: {', '.join(said.without)}: {why}")
+        elif lost := (*said.without, *said.own):
+            why = "it runs in the process of rsltrace"
+            launched.ignored.append(f"{node.where}: {', '.join(lost)}: {why}")
+
+
+def _why_not(
+    node: LaunchedNode,
+    of_executable: Callable[[str, str], str | None],
+    containers: Collection[str],
+) -> str | None:
     if not node.plugin:
         return of_executable(node.package, node.executable)
     if "::" in node.plugin:
-        return "it is a C++ component: only Python nodes can be simulated"
+        if node.container in containers:
+            return None
+        return f"it is a C++ component, and its container {node.container} is not there"
     if "." not in node.plugin and ":" not in node.plugin:
         return "a Python component is written module.Class, or module:Class"
     return None
 
 
-def _spec(node: LaunchedNode, numbers: Mapping[int, int]) -> NodeSpec:
+def _spec(
+    node: LaunchedNode, numbers: Mapping[int, int], is_process: bool, is_required: bool
+) -> NodeSpec:
     if node.fault:
         raise JobError(node.fault)
     words, ros_words = split_ros_arguments(node.arguments)
     given = _RosWords([*node.ros_arguments, *ros_words], node.where)
     name = given.name or node.name
     namespace = given.namespace or node.namespace
-    full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
-    files, parameters = _in_order([*node.parameters, *given.parameters], full_name)
+    whole = None if name is None else full_name(namespace, name)
+    files, parameters = _in_order([*node.parameters, *given.parameters], whole)
     remappings = dict(reversed([*node.remappings, *given.remappings]))  # the first one counts
     values: dict[str, Any] = {
         "name": name,
@@ -111,13 +159,34 @@ def _spec(node: LaunchedNode, numbers: Mapping[int, int]) -> NodeSpec:
     elif node.delay_ns:
         values["start_after"] = StartAfterSpec.after(node.delay_ns)
     try:
+        if "::" in node.plugin:
+            extra = [item for item in node.extra_arguments if isinstance(item, dict)]
+            return NodeSpec(
+                component=f"{node.package}/{node.plugin}",
+                container=node.container,
+                extra_arguments={name: v for item in extra for name, v in flat(item)},
+                **values,
+            )
         if node.plugin:
             module, _, attribute = node.plugin.replace(":", ".").rpartition(".")
             return NodeSpec(node=f"{module}:{attribute}", **values)
         target = f"{node.package}/{node.executable}"
+        if is_process:
+            values |= _surroundings(node.surroundings)
+        values["required"] = is_required
         return NodeSpec(executable=target, arguments=words, **values)
     except JobError as error:
         raise JobError(str(error).removeprefix("NodeSpec: "), where=node.where) from None
+
+
+def _surroundings(said: Surroundings) -> dict[str, Any]:
+    values: dict[str, Any] = {"environment": dict(said.environment)}
+    if said.folder:
+        values["working_directory"] = said.folder
+    if said.respawn is not None:
+        delay_ns, times = said.respawn
+        values["respawn"] = RespawnSpec.after(delay_ns, times)
+    return values
 
 
 def _in_order(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rsltrace.job import Job
 from rsltrace.launch.expanded import Expanded
-from rsltrace.run.plans.executables import why_not
+from rsltrace.run.plans.executables import compiled_file, why_not
 from rsltrace.run.process import search_path
 
 
@@ -19,4 +19,8 @@ def without_launch_files(job: Job, *, programs: bool = True) -> Expanded:
     from rsltrace.launch.expand import expand
 
     with search_path(job):
-        return expand(job, why_not=why_not, programs=programs)
+        return expand(job, why_not=why_not, is_process=_is_process, programs=programs)
+
+
+def _is_process(package: str, executable: str) -> bool:
+    return compiled_file(f"{package}/{executable}") is not None

@@ -46,7 +46,7 @@ from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
 from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
 from rsltrace.run.plans.starts import missed_starts
-from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions
+from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions, stop_with
 from rsltrace.run.process import (
     Observer,
     frozen_heap,
@@ -370,12 +370,15 @@ class Session:
             self.world.domain.watch(self.job.stop.topic.name, watch)
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
+            stop_with(self.world, self._entries)
             self.world.stacks.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
             for entry in later:
                 self.world.starts.add(entry)
             for entry in self._entries:
-                if entry not in later and not self.world.construct(entry):
+                if entry in later or (entry.is_component and self.whole_graph):
+                    continue
+                if not self.world.construct(entry):
                     say_where(self.job, entry, self.world.error)
                     break
             if not self.ended:
@@ -478,7 +481,7 @@ class Session:
 
     def _order_of_starts(self) -> dict[str, str]:
         """Return what a trace keeps of the order of its constructions where it is not the job's."""
-        if all(entry.start_after is None for entry in self._entries):
+        if all(entry.start_after is None and entry.respawn is None for entry in self._entries):
             return {}
         places = [str(self._entries.index(entry)) for entry in self.world.constructed]
         if self._bags:

@@ -38,7 +38,7 @@ def unused_remappings(job: Job, census: Census) -> Iterator[str]:
     for asker in census.asked:
         asked_by.setdefault(asker.entry_key, []).append(asker)
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
-        own = asked_by.get(key, [])
+        own = [] if spec.component is not None else asked_by.get(key, [])
         everybody += own  # nodes of hooks, of callbacks and the bag player get no arguments
         for old, new in spec.remappings.items() if own else ():
             loc: Loc = ("nodes", index, "remappings", old)

@@ -409,7 +409,7 @@ GOLDEN = {
           - name: talker
         """,
         """
-        job.yaml:2:5: nodes[0]: missing key: give one of 'node', 'main', 'executable', 'script', 'module' and 'program'
+        job.yaml:2:5: nodes[0]: missing key: give one of 'node', 'main', 'executable', 'script', 'module', 'program' and 'component'
             2 |   - name: talker
               |     ^
         """,  # noqa: E501
@@ -426,7 +426,7 @@ GOLDEN = {
           - executable: talker
         """,
         """
-        job.yaml:3:5: nodes[0]: 'node' says what to run already: give only one of 'node', 'main', 'executable', 'script', 'module' and 'program'
+        job.yaml:3:5: nodes[0]: 'node' says what to run already: give only one of 'node', 'main', 'executable', 'script', 'module', 'program' and 'component'
             3 |     main: m:main
               |     ^
         job.yaml:5:16: nodes[1].arguments: 'main' takes a list of command-line words: arguments: [--rate, 10]
@@ -470,7 +470,7 @@ GOLDEN = {
     "a node as text": (
         "nodes: [my_nodes:Talker]\n",
         """
-        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, script, module, program, isolated, environment, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard, start_after, stdin; write {node: my_nodes:Talker}
+        job.yaml:1:9: nodes[0]: expected a mapping, got text 'my_nodes:Talker'; its keys are node, main, executable, script, module, program, component, container, extra_arguments, isolated, environment, working_directory, respawn, required, name, namespace, parameters, parameter_files, remappings, arguments, on_exception, guard, start_after, stdin; write {node: my_nodes:Talker}
             1 | nodes: [my_nodes:Talker]
               |         ^
         """,  # noqa: E501

@@ -62,7 +62,7 @@ def test_what_a_launch_file_names(name: str, none: Path, tmp_path: Path) -> None
     )
     job = job_from_text(f"launch: [{name}]\n", "job.yaml", tmp_path)
     with pytest.raises(JobError, match="not a regular file"):
-        expand(job, why_not=lambda package, executable: None)
+        expand(job, why_not=lambda *_: None, is_process=lambda *_: False)
     with pytest.raises(JobError, match="not a regular file"):
         parameters_for(str(none), "/node")
 

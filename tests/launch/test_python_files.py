@@ -77,7 +77,10 @@ def write_body(write: Callable[..., Path], body: str) -> Path:
 
 
 def specs_of(launched: Launched) -> list[Any]:
-    return node_specs(launched, skip_unsupported=True, why_not=lambda package, name: None)
+    def why_not(package: str, name: str) -> str | None:
+        return "it is not installed" if package == "rclcpp_components" else None
+
+    return node_specs(launched, skip_unsupported=True, why_not=why_not)
 
 
 def parameters(launched: Launched) -> dict[str, Any]:
@@ -119,11 +122,14 @@ def test_everything(write: Callable[..., Path], prefix: Path) -> None:
     assert specs[6].start_after == StartAfterSpec.after(1_000_000_000)
     assert specs[7].start_after == StartAfterSpec(ended=0)
     lines = path.read_text().splitlines()
+    container_line = next(n for n, text in enumerate(lines, 1) if "NodeContainer(" in text)
     component_line = next(n for n, text in enumerate(lines, 1) if "demo::Fast" in text)
     process_line = next(n for n, text in enumerate(lines, 1) if "ExecuteProcess(cmd" in text)
     assert [str(item) for item in launched.unsupported] == [
-        f"a.launch.py:{component_line}: demo/demo::Fast: it is a C++ component: only Python nodes "
-        "can be simulated",
+        f"a.launch.py:{container_line}: rclcpp_components/component_container (c): it is not "
+        "installed",
+        f"a.launch.py:{component_line}: demo/demo::Fast: it is a C++ component, and its container "
+        "/c is not there",
         f"a.launch.py:{process_line}: process 'echo jackal': other programs do not run in a "
         "simulation",
     ]
@@ -215,6 +221,7 @@ return LaunchDescription([
 """
     )
     a, root, b, c = specs_of(launched)
+    assert [one.required for one in (a, root, b, c)] == [True, False, False, False]
     assert (a.name, a.start_after, a.namespace, root.namespace) == ("a", None, None, "/")
     assert (b.name, b.start_after) == ("b", StartAfterSpec(started=0, delay="500ms"))  # type: ignore[arg-type]
     assert (c.name, c.start_after) == ("c", StartAfterSpec(ended=2))
@@ -225,7 +232,6 @@ return LaunchDescription([
     assert [text.partition(": ")[2].partition(":")[0] for text in launched.ignored] == [
         "OnShutdown",
         "what follows when the Node of a.launch.py",
-        "shutdown",
     ]
 
 

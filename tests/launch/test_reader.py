@@ -222,7 +222,7 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
         "  a.launch.xml:6:3: process './program': it belongs to no package (pkg=)",
         "  a.launch.xml:7:3: process 'rviz2 -d x': other programs do not run in a simulation",
         "  a.launch.xml:9:3: shutdown: a run ends by the job's stop: conditions",
-        "  a.launch.xml:10:36: d/d::T: it is a C++ component: only Python nodes can be simulated",
+        "  a.launch.xml:10:36: d/d::T: it is a C++ component, and its container /c is not there",
     ]
     launched = read(UNSUPPORTED)
     timed, fine = node_specs(launched, skip_unsupported=True)
@@ -230,7 +230,7 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
     assert (fine.name, fine.start_after) == ("fine", None)
     assert len(launched.unsupported) == 8
     assert launched.ignored == [
-        "a.launch.xml:11:3: launch-prefix, env A: all nodes run in one process"
+        "a.launch.xml:11:3: launch-prefix, env A: it runs in the process of rsltrace"
     ]
 
 

@@ -29,6 +29,10 @@ PYTHON = (FILES / "everything.launch.py").read_text(encoding="utf-8")
 SUB = "<launch><arg name='who'/><node pkg='demo' exec='talker' name='sub_$(var who)'/></launch>"
 
 
+def _why_not(package: str, name: str) -> str | None:
+    return "it is not installed" if package == "rclcpp_components" else None
+
+
 @pytest.fixture
 def evaluate(write: Callable[..., Path], prefix: Path) -> Callable[..., Launched]:
     def go(text: str, name: str, **arguments: str) -> Launched:
@@ -44,7 +48,7 @@ def test_a_python_launch_file(evaluate: Any) -> None:
     launched = evaluate(PYTHON, "a.launch.py", robot="jackal")
     assert "RSLTRACE_T" not in os.environ
     assert "environment variable RSLTRACE_T" in launched.ignored[0]
-    specs = node_specs(launched, skip_unsupported=True, why_not=lambda package, name: None)
+    specs = node_specs(launched, skip_unsupported=True, why_not=_why_not)
     names = [(spec.target, spec.namespace, spec.name) for spec in specs]
     assert names == [
         ("demo/talker", "/jackal", "talk"),
@@ -73,6 +77,7 @@ def test_a_python_launch_file(evaluate: Any) -> None:
     assert {item.what for item in launched.unsupported} == {
         "process 'echo jackal'",
         "demo/demo::Fast",
+        "rclcpp_components/component_container (c)",
     }
     assert list(launched.arguments) == ["robot", "camera", "who"]
 
@@ -91,9 +96,7 @@ def test_both_readers_agree(
 
     def specs(launched: Launched) -> list[Any]:
         nodes = [replace(node, where="") for node in launched.nodes]
-        return node_specs(
-            replace(launched, nodes=nodes), skip_unsupported=True, why_not=lambda p, e: None
-        )
+        return node_specs(replace(launched, nodes=nodes), skip_unsupported=True, why_not=_why_not)
 
     assert specs(ros) == specs(own)
     assert set(ros.arguments) == set(own.arguments)

@@ -19,6 +19,7 @@ _LIBRARIES = (
     "rcl",
     "rcutils",
     "rcl_yaml_param_parser",
+    "tracetools",
     "rosidl_runtime_c",
     "std_msgs__rosidl_typesupport_c",
     "std_msgs__rosidl_generator_c",

@@ -1,6 +1,8 @@
 // A node on rcl alone: a timer counts, and what comes in on /echo goes out on /heard.
 //
 // Usage: counter [period in ms] [when to leave, or what to do at the fifth count: crash, exit, …]
+// It counts from the number in COUNT_FROM, and from that in the file "more" in its folder. With
+// NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
 #include <signal.h>
@@ -8,6 +10,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <tracetools/tracetools.h>
 #include <unistd.h>
 
 #define CHECK(call)                                                            \
@@ -49,7 +52,30 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
   }
 }
 
+static uint64_t first(void) {
+  const char *from = getenv("COUNT_FROM");
+  uint64_t count = from == NULL ? 0 : strtoull(from, NULL, 10);
+  FILE *more = fopen("more", "r");
+  char text[16] = "";
+  if (more != NULL && fgets(text, sizeof text, more) != NULL) count += strtoull(text, NULL, 10);
+  if (more != NULL) fclose(more);
+  return count;
+}
+
+static void tell_names(const rcl_node_t *node, const rcl_timer_t *timer,
+                       const rcl_subscription_t *echo) {
+  static const char callbacks[2], subscription;
+  ros_trace_rclcpp_timer_callback_added(timer, &callbacks[0]);
+  if (ros_trace_enabled_rclcpp_callback_register())
+    ros_trace_do_rclcpp_callback_register(&callbacks[0], "Counter::tick()");
+  ros_trace_rclcpp_timer_link_node(timer, node);
+  ros_trace_rclcpp_subscription_init(echo, &subscription);
+  ros_trace_rclcpp_subscription_callback_added(&subscription, &callbacks[1]);
+  ros_trace_rclcpp_callback_register(&callbacks[1], "Counter::echo(UInt64)");
+}
+
 int main(int argc, const char **argv) {
+  counted = first();
   const int64_t period_ms = argc > 1 && argv[1][0] != '-' ? atoi(argv[1]) : 100;
   if (argc > 2 && argv[2][0] != '-') action = argv[2];
   rcl_allocator_t allocator = rcl_get_default_allocator();
@@ -70,11 +96,14 @@ int main(int argc, const char **argv) {
   rcl_subscription_options_t subscription_options = rcl_subscription_get_default_options();
   rcl_subscription_t echo = rcl_get_zero_initialized_subscription();
   CHECK(rcl_subscription_init(&echo, &node, type, "echo", &subscription_options));
+  rcl_node_t other = rcl_get_zero_initialized_node();
+  if (getenv("NAMED") != NULL) CHECK(rcl_node_init(&other, "other", "", &context, &node_options));
   rcl_clock_t clock;
   CHECK(rcl_clock_init(RCL_STEADY_TIME, &clock, &allocator));
   rcl_timer_t timer = rcl_get_zero_initialized_timer();
   CHECK(rcl_timer_init2(&timer, &clock, &context, RCL_MS_TO_NS(period_ms), on_timer, allocator,
                         true));
+  if (getenv("NAMED") != NULL) tell_names(&node, &timer, &echo);
   rcl_wait_set_t set = rcl_get_zero_initialized_wait_set();
   CHECK(rcl_wait_set_init(&set, 1, 0, 1, 0, 0, 0, &context, allocator));
   std_msgs__msg__UInt64 message;

@@ -81,6 +81,14 @@ class ProcessSubscription(Subscription):
         self.process = process
         self.number = number
         self._received = 0
+        self._callback_name = ""
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self._callback_name = name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**super().trace_detail(), "callback": self._callback_name}
 
     def dispatch(self) -> None:
         if not self.may_run():
@@ -128,6 +136,14 @@ class ProcessService(Service):
         self.process = process
         self.number = number
         self._asked: dict[tuple[bytes, int], RequestId] = {}
+        self._callback_name = ""
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self._callback_name = name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**super().trace_detail(), "callback": self._callback_name}
 
     def dispatch(self) -> None:
         if not self.may_run():
@@ -226,6 +242,10 @@ class ProcessTimer(Timer):
         self.number = number
         self.name = ""
         self.is_callback = True
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self.name = name
 
     def due_at(self, deadline_ns: int) -> None:
         """Take note of when it is due, by what rcl says."""

@@ -53,6 +53,8 @@ class Things(dict[int, Any]):
             Say.CLIENT: self._client,
             Say.TIMER: self._timer,
             Say.QOS_EVENT: self._qos_event,
+            Say.TIMER_OF: self._timer_of,
+            Say.CALLBACK: self._callback,
         }
 
     def _node(self, fields: Fields) -> None:
@@ -119,13 +121,28 @@ class Things(dict[int, Any]):
             return
         self._timers_named += 1
         timer.name = f"timer {self._timers_named}"
-        timer.node = self._nodes[-1]
-        timer.node.timers.append(timer)
+        self._give(timer, self._nodes[-1])
+
+    def _give(self, timer: ProcessTimer, node: Participant) -> None:
+        timer.node = node
+        node.timers.append(timer)
         dispatcher = self._process.dispatcher
-        dispatcher.entities.look_again(timer.node)
+        dispatcher.entities.look_again(node)
         event = dispatcher.event
         if event.entity == timer.entity_id:
             event.node = timer.node
+
+    def _timer_of(self, fields: Fields) -> None:
+        """Take note of whose a timer is, which rclcpp says."""
+        timer, node = self[fields.number()], self[fields.number()]
+        if timer.node is not node:
+            if timer.node is not None:
+                timer.node.timers.remove(timer)
+            self._give(timer, node)
+
+    def _callback(self, fields: Fields) -> None:
+        """Take note of the name of a callback, which rclcpp says."""
+        self[fields.number()].named_callback(fields.text())
 
     @property
     def last_node(self) -> str:

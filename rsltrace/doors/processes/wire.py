@@ -56,6 +56,8 @@ class Say(IntEnum):
     ALIVE = 23
     QOS_EVENT = 24
     FOLLOWS = 25
+    CALLBACK = 26
+    TIMER_OF = 27
 
 
 class Told(IntEnum):

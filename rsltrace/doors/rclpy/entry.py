@@ -57,6 +57,12 @@ class Entry:
     """What is typed at its terminal, None if it has none."""
     program: object | None = None
     """What runs as a process of its own, if it does: ``World.start_process`` knows how."""
+    is_component: bool = False
+    """Whether ``make`` asks a container to load it."""
+    respawn: tuple[int, int | None] | None = None
+    """How much later (ns) a process starts again that has ended, and how often (None: always)."""
+    required: bool = False
+    """Whether the run ends when it has ended."""
 
 
 _PART = "[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*"

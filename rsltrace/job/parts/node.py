@@ -11,10 +11,13 @@ from pydantic import Field, model_validator
 
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.part import Part
+from rsltrace.job.parts.process import RespawnSpec, check_environment
 from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.job.parts.stdin import InputSpec, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
 from rsltrace.job.values.names import (
+    check_component,
+    check_container,
     check_executable,
     check_module,
     check_namespace,
@@ -94,6 +97,11 @@ def _check_module(value: object) -> str:
     return text(check_module)(value)
 
 
+def _check_component(value: object) -> str:
+    return text(check_component)(value)
+
+
+attach(_check_component, schema={"type": "string", "pattern": check_component.pattern})  # type: ignore[attr-defined]
 attach(_check_module, schema={"type": "string", "pattern": check_module.pattern})  # type: ignore[attr-defined]
 attach(_check_executable, schema={"type": "string", "pattern": check_executable.pattern})  # type: ignore[attr-defined]
 
@@ -111,31 +119,22 @@ def _plain_floats(value: object) -> object:
     return value
 
 
-_KINDS = ("node", "main", "executable", "script", "module", "program")
+_KINDS = ("node", "main", "executable", "script", "module", "program", "component")
 """What an entry may be."""
 _ONE_OF = f"{', '.join(map(repr, _KINDS[:-1]))} and {_KINDS[-1]!r}"
-_WITH_WORDS = ", ".join(f"'{kind}'" for kind in _KINDS[1:])
+_WITH_WORDS = ", ".join(f"'{kind}'" for kind in _KINDS[1:-1])
 
 
-def _check_environment(value: object) -> dict[str, str]:
-    if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to texts, got {describe(value)}")
-    problems = Collected()
-    for name, content in value.items():
-        with problems.at(str(name), at_key=True):
-            if not isinstance(name, str) or not name or "=" in name or "\0" in name:
-                raise Problem(f"{name!r} cannot be the name of an environment variable")
-        with problems.at(str(name)):
-            if isinstance(content, bool) or not isinstance(content, (str, int, float)):
-                raise Problem(f"expected a text, got {describe(content)}")
-    problems.check()
-    return {name: str(getattr(content, "text", content)) for name, content in value.items()}
-
-
-attach(
-    _check_environment,
-    schema={"type": "object", "additionalProperties": {"type": ["string", "number"]}},
+_ONLY_A_PROCESS = {
+    "environment": "only a process has an environment of its own: 'program', or 'isolated: true'",
+    "working_directory": "only a process has a folder of its own: 'program', or 'isolated: true'",
+    "respawn": "only a process is started again: 'program', or 'isolated: true'",
+}
+_RARE = (
+    *("start_after", "stdin", "isolated", "environment", "working_directory", "respawn"),
+    *("required", "container", "extra_arguments"),
 )
+"""Keys that are written down only where they say something."""
 
 _NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
 attach(
@@ -158,14 +157,15 @@ attach(
 
 class NodeSpec(Part):
     """One entry of ``nodes:``: one of ``node``, ``main``, ``executable``, ``script``, ``module``,
-    ``program``.
+    ``program``, ``component``.
 
     ``node`` is a Node subclass or a function returning a node or a list of nodes, ``main`` a
     function that initializes rclpy, makes nodes and spins, ``executable`` (``package/name``) an
     installed one, ``script`` a file to run as ``python script.py`` does, ``module`` one to run as
-    ``python -m module`` does, ``program`` a file to run as a process. ``arguments`` are keyword
-    arguments of a ``node``, and command-line words (a list) of the others. ``parameters`` are flat
-    (dotted names); paths are relative to the job's folder.
+    ``python -m module`` does, ``program`` a file to run as a process, ``component`` what a
+    ``container`` among the nodes is asked to load. ``arguments`` are keyword arguments of a
+    ``node``, and command-line words (a list) of the others. ``parameters`` are flat (dotted names);
+    paths are relative to the job's folder.
     """
 
     ONE_OF: ClassVar[tuple[str, ...]] = _KINDS
@@ -212,16 +212,48 @@ class NodeSpec(Part):
         "a process of its own.",
         examples=["build/talker"],
     )
+    component: Annotated[str | None, check(_check_component, optional=True)] = Field(
+        default=None,
+        description="Instead of `node`: a component, as `package/plugin`, that a `container` is "
+        "asked to load once it is there.",
+        examples=["image_proc/image_proc::RectifyNode"],
+    )
+    container: Annotated[str | None, check(text(check_container), optional=True)] = Field(
+        default=None,
+        description="Which node loads a `component`, by its name in full: an executable of "
+        "`rclcpp_components`, or whatever serves `<name>/_container/load_node`.",
+        examples=["/camera/container"],
+    )
+    extra_arguments: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
+        default_factory=dict,
+        description="What the container is told besides the parameters of a `component`.",
+        examples=[{"use_intra_process_comms": True}],
+    )
     isolated: Annotated[bool, check(flag)] = Field(
         default=False,
         description="Whether Python code runs as a process of its own, like a `program`, and not "
         "in the process of the run. For `executable`, `script` and `module`.",
         examples=[True],
     )
-    environment: Annotated[dict[str, str], check(_check_environment)] = Field(
+    environment: Annotated[dict[str, str], check(check_environment)] = Field(
         default_factory=dict,
         description="Environment variables of a process, beside those that rsltrace has itself.",
         examples=[{"RCUTILS_LOGGING_USE_STDOUT": "1"}],
+    )
+    working_directory: Annotated[str | None, check(check_path, optional=True)] = Field(
+        default=None,
+        description="The folder in which a process runs, if not that of rsltrace.",
+        examples=["data"],
+    )
+    respawn: Annotated[RespawnSpec | None, part("delay")] = Field(
+        default=None,
+        description="That a process is started again when it has ended: how much later.",
+        examples=["1s", {"delay": "500ms", "times": 3}],
+    )
+    required: Annotated[bool, check(flag)] = Field(
+        default=False,
+        description="Whether the run ends when this entry has ended. Not for a `node`.",
+        examples=[True],
     )
     name: Annotated[str | None, check(text(check_node_name), optional=True)] = Field(
         default=None,
@@ -295,7 +327,13 @@ class NodeSpec(Part):
             module: str | None = None,
             program: str | os.PathLike[str] | None = None,
             isolated: bool = False,
+            component: str | None = None,
+            container: str | None = None,
+            extra_arguments: dict[str, Any] = ...,
             environment: dict[str, str] = ...,
+            working_directory: str | os.PathLike[str] | None = None,
+            respawn: RespawnSpec | dict[str, Any] | TimeLike | None = None,
+            required: bool = False,
             name: str | None = None,
             namespace: str | None = None,
             parameters: dict[str, Any] = ...,
@@ -339,6 +377,7 @@ class NodeSpec(Part):
                 at_key=True,
             )
         self._check_process(kinds[0])
+        self._check_loading(kinds[0])
         if self.node is None and isinstance(self.arguments, dict) and self.arguments:
             raise Problem(
                 f"'{kinds[0]}' takes a list of command-line words: arguments: [--rate, 10]",
@@ -347,7 +386,7 @@ class NodeSpec(Part):
         return self
 
     def _check_process(self, kind: str) -> None:
-        if self.isolated and kind in ("node", "main"):
+        if self.isolated and kind in ("node", "main", "component"):
             raise Problem(
                 f"a '{kind}' is a part of a program: name what runs it as 'script', 'module' or "
                 "'executable' to have it in a process of its own",
@@ -359,12 +398,29 @@ class NodeSpec(Part):
             raise Problem(
                 "the guard is for Python code in the process of the run", ("guard",), at_key=True
             )
-        if self.environment and not (self.is_process or kind == "executable"):
+        for key in ("environment", "working_directory", "respawn"):
+            if getattr(self, key) and not (self.is_process or kind == "executable"):
+                raise Problem(_ONLY_A_PROCESS[key], (key,), at_key=True)
+        if self.required and kind in ("node", "component"):
             raise Problem(
-                "only a process has an environment of its own: 'program', or 'isolated: true'",
-                ("environment",),
-                at_key=True,
+                f"a '{kind}' lasts as long as the run: only a program ends", ("required",)
             )
+
+    def _check_loading(self, kind: str) -> None:
+        if kind != "component":
+            for key in ("container", "extra_arguments"):
+                if getattr(self, key):
+                    raise Problem(f"only a 'component' has '{key}:'", (key,), at_key=True)
+            return
+        if self.container is None:
+            raise Problem("say which 'container:' loads the component, by its name: /container")
+        for key, instead in (
+            ("arguments", "a component takes 'parameters:' and 'extra_arguments:'"),
+            ("stdin", "a component has no terminal in a run"),
+            ("guard", "the guard is for Python code in the process of the run"),
+        ):
+            if getattr(self, key):
+                raise Problem(instead, (key,), at_key=True)
 
     @property
     def is_process(self) -> bool:
@@ -379,9 +435,8 @@ class NodeSpec(Part):
     @property
     def absent(self) -> tuple[str, ...]:
         """The keys that stand for other kinds of entries, and those that only some entries have."""
-        not_given = [name for name in ("start_after", "stdin") if getattr(self, name) is None]
-        unused = [name for name in ("isolated", "environment") if not getattr(self, name)]
-        return (*(name for name in _KINDS if name != self.kind), *not_given, *unused)
+        rare = (name for name in _RARE if getattr(self, name) in (None, False, {}))
+        return (*(name for name in _KINDS if name != self.kind), *rare)
 
     @property
     def target(self) -> str:
@@ -390,5 +445,6 @@ class NodeSpec(Part):
 
     @property
     def package(self) -> str:
-        """The package that the entry names (or the module that is in none), "" for a file."""
-        return "" if self.script or self.program else re.split("[:./]", self.target)[0]
+        """The package that the entry names (or the module that is in none), "" for others."""
+        other = self.script or self.program or self.component
+        return "" if other else re.split("[:./]", self.target)[0]

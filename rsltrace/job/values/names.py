@@ -29,6 +29,7 @@ _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
 _MODULE_NAME = re.compile(_MODULE)
 _EXECUTABLE = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", re.ASCII)
+_COMPONENT = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z_]\w*(?:(?:::|[.:])[A-Za-z_]\w*)*", re.ASCII)
 
 
 def check_node_name(name: str) -> None:
@@ -70,6 +71,14 @@ def check_topic(name: str) -> None:
         )
 
 
+def check_container(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` is a node's name in full."""
+    if not name.startswith("/") and _TOPIC.fullmatch(f"/{name}"):
+        raise ValueError(f"a node is named in full here, from '/': write '/{name}'")
+    if not _TOPIC.fullmatch(name):
+        raise ValueError(f"{name!r} is not the name of a node in full, as in /camera/container")
+
+
 def check_field_path(path: str) -> None:
     """Raise ``ValueError`` unless ``path`` is a field of a message: ``data``, ``header.seq``."""
     if not _FIELD_PATH.fullmatch(path):
@@ -98,6 +107,15 @@ def check_executable(name: str) -> None:
     """Raise ``ValueError`` unless ``name`` looks like ``package/executable``."""
     if not _EXECUTABLE.fullmatch(name):
         raise ValueError(f"expected package/executable (as ros2 run has them), got {name!r}")
+
+
+def check_component(name: str) -> None:
+    """Raise ``ValueError`` unless ``name`` looks like ``package/name::Class``."""
+    if not _COMPONENT.fullmatch(name):
+        raise ValueError(
+            "expected package/plugin (as ros2 component types has them, package/name::Class), got "
+            f"{name!r}"
+        )
 
 
 def check_module(name: str) -> None:
@@ -170,6 +188,8 @@ _PATTERNS: tuple[tuple[Any, str], ...] = (
     (check_field_path, r"^[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*$"),
     (check_target, r"^[^\s:]+:[^\s:]+$"),
     (check_executable, r"^[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+$"),
+    (check_component, r"^[A-Za-z0-9_.-]+/[A-Za-z_][A-Za-z0-9_:.]*$"),
+    (check_container, rf"^(/{_PART})+$"),
     (check_module, r"^[^\s:./]+(\.[^\s:./]+)*$"),
     (check_remap_from, r"^[A-Za-z0-9_~/:]+$"),
     (check_remap_to, r"^[A-Za-z0-9_~/]+$"),

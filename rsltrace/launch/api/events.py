@@ -171,14 +171,18 @@ class EmitEvent(Action):
         self.event = event
 
     def execute(self, context: LaunchContext) -> None:
-        """Note that it cannot be simulated; an end that follows on another is only told."""
+        """Note that it cannot be simulated, but for the end of everything where a node ends."""
         if not isinstance(self.event, Shutdown):
             what = f"EmitEvent({type(self.event).__name__})"
             context.refuse(self.where, what, "there are no processes and no launch service here")
-        elif context.evaluation.after is None:
+            return
+        evaluation = context.evaluation
+        if evaluation.after is None:
             context.refuse(self.where, "shutdown", _NO_END)
+        elif evaluation.after[0] == "ended" and not evaluation.delay_ns:
+            evaluation.launched.required.add(evaluation.after[1])
         else:
-            context.evaluation.launched.ignored.append(f"{self.where}: shutdown: {_NO_END}")
+            evaluation.launched.ignored.append(f"{self.where}: shutdown: {_NO_END}")
 
 
 class ShutdownAction(EmitEvent):

@@ -16,17 +16,19 @@ from rsltrace.launch.api.basics import (
 from rsltrace.launch.api.events import later
 from rsltrace.launch.api.packages import names_missing_package
 from rsltrace.launch.api.parameters import evaluated_parameters
-from rsltrace.launch.model import LaunchedNode
-from rsltrace.launch.scope import absolute_namespace
+from rsltrace.launch.model import LaunchedNode, Surroundings, respawning
+from rsltrace.launch.scope import absolute_namespace, full_name
+from rsltrace.launch.substitution import truth
 
 _WITHOUT_MEANING = frozenset(
-    "output output_format respawn respawn_delay respawn_max_retries emulate_tty exec_name log_cmd "
-    "sigterm_timeout sigkill_timeout cached_output additional_env".split()
+    "output output_format emulate_tty exec_name log_cmd sigterm_timeout sigkill_timeout "
+    "cached_output".split()
 )
 """How a process is run: nothing that a node could tell in a simulation."""
 
-_LOST = ("prefix", "cwd", "env", "additional_env", "shell")
-"""What makes a difference for a process of its own, and has none here: said, then left out."""
+_OF_PROCESSES = ("cwd", "env", "additional_env", "respawn", "respawn_delay", "respawn_max_retries")
+_WITHOUT = ("prefix", "shell")
+"""What processes are not given here: said, then left out."""
 
 _RENAMED = {"node_executable": "executable", "node_name": "name", "node_namespace": "namespace"}
 
@@ -39,18 +41,34 @@ class ExecuteLocal(Action):
     ) -> None:
         super().__init__(condition=condition)
         for name in options:
-            if name not in _WITHOUT_MEANING and name not in _LOST:
+            if name not in _WITHOUT_MEANING and name not in (*_OF_PROCESSES, *_WITHOUT):
                 now = f"; it is {_RENAMED[name]!r} since Galactic" if name in _RENAMED else ""
                 raise TypeError(f"{type(self).__name__} has no argument {name!r}{now}")
         self._on_exit = on_exit
-        self._lost = [name for name in _LOST if options.get(name)]
+        self._options = {name: value for name, value in options.items() if value}
+
+    def _surroundings(self, context: LaunchContext) -> Surroundings:
+        """Return what is said of the process."""
+        options = self._options
+        own = {
+            context.text(name): context.text(value)
+            for key in ("env", "additional_env")
+            for name, value in dict(options.get(key, {})).items()
+        }
+        respawn = None
+        if _flag(context, options.get("respawn", False)):
+            times = int(_number(context, options.get("respawn_max_retries", -1)))
+            respawn = respawning(_number(context, options.get("respawn_delay", 0.0)), times)
+        return Surroundings(
+            tuple({**context.evaluation.changed_environment(), **own}.items()),
+            folder=context.optional(options.get("cwd")) or "",
+            respawn=respawn,
+            own=tuple(name for name in ("cwd", "env", "additional_env") if name in options),
+            without=tuple(name for name in _WITHOUT if name in options),
+        )
 
     def _started(self, context: LaunchContext) -> None:
-        """Note what is lost, and what follows when it ends."""
-        if self._lost:
-            context.evaluation.launched.ignored.append(
-                f"{self.where}: {', '.join(self._lost)}: all nodes run in one process"
-            )
+        """Note what follows when it ends."""
         if self._on_exit is not None:
             later(context, self.where, "ended", self, self._on_exit)
 
@@ -101,6 +119,9 @@ class Node(ExecuteLocal):
 
     def execute(self, context: LaunchContext) -> None:
         """Note the node."""
+        self._note(context)
+
+    def _note(self, context: LaunchContext, *, is_container: bool = False) -> None:
         executable = context.text(self._executable)
         package = context.optional(self._package)
         if package is None:
@@ -111,11 +132,19 @@ class Node(ExecuteLocal):
             try:
                 values["arguments"] = tuple(context.text(word) for word in self._arguments)
                 values["ros_arguments"] = tuple(context.text(w) for w in self._ros_arguments)
+                values["surroundings"] = self._surroundings(context)
                 _check_paths([*values["arguments"], *values["ros_arguments"]])
             except Exception as error:
                 values["fault"] = str(as_job_error(error, self.where))
         self._values = values  # should it be started again
-        note(context, self, package=package, executable=executable, **values)
+        note(
+            context,
+            self,
+            package=package,
+            executable=executable,
+            is_container=is_container,
+            **values,
+        )
         self._started(context)
 
 
@@ -161,10 +190,10 @@ class _Description:
         scope = context.evaluation.scope
         name = context.optional(self.name) or None
         namespace = absolute_namespace(scope.namespace, context.optional(self.namespace))
-        full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
+        whole = None if name is None else full_name(namespace, name)
         values: dict[str, Any] = {"name": name, "namespace": namespace}
         try:
-            given = tuple(evaluated_parameters(context, self.parameters, full_name))
+            given = tuple(evaluated_parameters(context, self.parameters, whole))
             values["parameters"] = scope.parameters + given
             for item in given:
                 _check_paths(item.values() if isinstance(item, dict) else ())
@@ -214,17 +243,31 @@ class ComposableNode:
         self._package, self._plugin = as_substitutions(package), as_substitutions(plugin)
         self._condition = condition
         self._description = _Description(name, namespace, parameters, remappings)
+        self._extra_arguments = list(extra_arguments or ())
 
-    def note(self, context: LaunchContext) -> None:
-        """Note it, if its condition holds."""
-        if self._condition is None or self._condition.evaluate(context):
-            package, plugin = context.text(self._package), context.text(self._plugin)
-            values = self._description.values(context, self.where)
-            note(context, self, package=package, plugin=plugin, **values)
+    def note(self, context: LaunchContext, container: str) -> None:
+        """Note it, if its condition holds; ``container`` is the full name of the one it is for."""
+        if self._condition is not None and not self._condition.evaluate(context):
+            return
+        values = self._description.values(context, self.where)
+        try:
+            extra = tuple(evaluated_parameters(context, self._extra_arguments, None))
+        except Exception as error:
+            extra = ()
+            values["fault"] = str(as_job_error(error, self.where))
+        note(
+            context,
+            self,
+            package=context.text(self._package),
+            plugin=context.text(self._plugin),
+            container=container,
+            extra_arguments=extra,
+            **values,
+        )
 
 
 class ComposableNodeContainer(Node):
-    """Its components are nodes; it is nothing itself."""
+    """Starts a container, and has it load components."""
 
     def __init__(
         self,
@@ -238,13 +281,19 @@ class ComposableNodeContainer(Node):
         self._components = list(composable_node_descriptions or ())
 
     def execute(self, context: LaunchContext) -> None:
-        """Note the components."""
+        """Note it and its components."""
+        self._note(context, is_container=True)
         for component in self._components:
-            component.note(context)
+            component.note(context, self.full_name(context))
+
+    def full_name(self, context: LaunchContext) -> str:
+        """Return its name with its namespace."""
+        values = self._values or self._description.values(context, self.where)
+        return full_name(values["namespace"], values["name"] or "")
 
 
 class LoadComposableNodes(Action):
-    """Loads components into a container."""
+    """Has a container load components."""
 
     def __init__(
         self,
@@ -255,11 +304,25 @@ class LoadComposableNodes(Action):
     ) -> None:
         super().__init__(**options)
         self._components = list(composable_node_descriptions)
+        self._target = target_container
 
     def execute(self, context: LaunchContext) -> None:
         """Note the components."""
+        target = self._target
+        if isinstance(target, ComposableNodeContainer):
+            container = target.full_name(context)
+        else:
+            container = full_name(None, context.text(target))
         for component in self._components:
-            component.note(context)
+            component.note(context, container)
+
+
+def _flag(context: LaunchContext, value: Any) -> bool:
+    return value if isinstance(value, bool) else truth(context.text(value))
+
+
+def _number(context: LaunchContext, value: Any) -> float:
+    return float(value if isinstance(value, (int, float)) else context.text(value))
 
 
 __all__ = [

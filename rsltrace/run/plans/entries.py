@@ -5,11 +5,13 @@ from __future__ import annotations
 import inspect
 from collections import Counter
 from collections.abc import Callable, Container, Sequence
+from dataclasses import replace
 from functools import partial
 from inspect import Parameter
 from typing import Any
 
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
+from rsltrace.doors.rclpy.components import Component, check_loadable, load_service
 from rsltrace.doors.rclpy.entry import Entry, StartRule, ros_arguments
 from rsltrace.doors.rclpy.hints import parameter_in
 from rsltrace.errors import JobError, RunError, did_you_mean
@@ -59,9 +61,11 @@ def node_entries(
                 where=where,
                 for_all=for_all,
             )
-            if spec.node is None:
+            if spec.node is None and spec.component is None:
                 program = processes.find(spec, arguments, where=where)
-            if program is not None:
+            if spec.component is not None:
+                make = _component(spec, arguments, where).load
+            elif program is not None:
                 argv, make = list(program.argv), _never
             elif isinstance(spec.arguments, tuple) or spec.node is None:
                 name, make = mains.find(spec, where=where)
@@ -75,14 +79,19 @@ def node_entries(
             Entry(
                 spec.target,
                 make,
-                arguments,
+                arguments if spec.component is None else [],
                 argv=argv,
                 log_exceptions=spec.on_exception == "log",
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
-                start_after=_start_rule(job, spec, keys),
+                start_after=_start_rule(job, index, keys),
                 stdin=typed_at(job, index),
                 program=program,
+                is_component=spec.component is not None,
+                respawn=None
+                if spec.respawn is None
+                else (spec.respawn.delay_ns, spec.respawn.times),
+                required=spec.required,
             )
         )
     return entries
@@ -92,17 +101,59 @@ def _never() -> object:
     raise AssertionError("a process is started, not called")
 
 
-def _start_rule(job: Job, spec: NodeSpec, keys: Sequence[str]) -> StartRule | None:
+def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) -> Component:
+    """Return what a container is asked to load.
+
+    :raises JobError: if the service by which that is done is not known here.
+    """
+    check_loadable(where)
+    assert spec.component is not None
+    assert spec.container is not None
+    package, _, plugin = spec.component.partition("/")
+    return Component(
+        package,
+        plugin,
+        spec.container,
+        spec.name or "",
+        spec.namespace or "",
+        arguments,
+        spec.extra_arguments,
+        spec.on_exception == "log",
+    )
+
+
+def _start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
+    spec = job.nodes[index]
     after = spec.start_after
-    if after is None:
-        return None
 
     def key(reference: str | int | None) -> str | None:
         return None if reference is None else keys[entry_meant(job.nodes, reference)]
 
-    return StartRule(
-        after.delay_ns, after.topic, after.service, after.node, key(after.started), key(after.ended)
+    rule = None
+    if after is not None:
+        started, ended = key(after.started), key(after.ended)
+        rule = StartRule(after.delay_ns, after.topic, after.service, after.node, started, ended)
+    if spec.container is None:
+        return rule
+    # A component waits for its container, which loads one after the other.
+    rule = rule or StartRule()
+    before = previous_component(job.nodes, index)
+    return replace(
+        rule,
+        service=rule.service or load_service(spec.container),
+        started=rule.started or (None if before is None else keys[before]),
     )
+
+
+def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
+    """Return the place of the component that the same container loads before, None if there is
+    none that is to start when this one is."""
+    spec = nodes[index]
+    for place in range(index - 1, -1, -1):
+        other = nodes[place]
+        if (other.container, other.start_after) == (spec.container, spec.start_after):
+            return place
+    return None
 
 
 def _check_parameter_files(job: Job, index: int) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -63,9 +64,17 @@ class Processes:
             [*command, *spec.arguments, *words],
             self._library,
             environment=spec.environment,
-            folder=None,
+            folder=self._folder(spec, where),
             search_path=[str(self._job.resolve(path)) for path in self._job.search_path],
         )
+
+    def _folder(self, spec: NodeSpec, where: str) -> Path | None:
+        if spec.working_directory is None:
+            return None
+        folder = self._job.resolve(spec.working_directory)
+        if not folder.is_dir():
+            raise JobError(f"there is no folder {spec.working_directory} to run in", where=where)
+        return folder
 
     def _command(self, spec: NodeSpec, where: str) -> list[str] | None:
         if spec.program is not None:
@@ -140,7 +149,19 @@ def process_door(job: Job, world: World) -> ProcessDoor:
     interfaces = Interfaces(_message_type, _service_type)
     door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
     programs = world.stacks.programs
-    door.on_end = lambda key: programs.tell("ended", key)
+    restarts: Counter[str] = Counter()
+
+    def ended(key: str) -> None:
+        programs.tell("ended", key)
+        entry = next(one for one in world.constructed if one.key == key)
+        if entry.respawn is None or world.domain.loop.stopped is not None:
+            return
+        delay_ns, times = entry.respawn
+        if times is None or restarts[key] < times:
+            restarts[key] += 1
+            world.starts.add_at(entry, world.domain.loop.now_ns + delay_ns)
+
+    door.on_end = ended
     door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
 
     def start(entry: Entry, cause: tuple[int, int]) -> None:
@@ -149,7 +170,7 @@ def process_door(job: Job, world: World) -> ProcessDoor:
             entry.program,
             name=entry.name,
             key=entry.key,
-            log_failure=entry.log_exceptions,
+            log_failure=entry.log_exceptions or entry.respawn is not None,
             cause=cause,
             on_start=lambda: programs.tell("started", entry.key),
         )

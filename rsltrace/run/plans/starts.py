@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 
+from rsltrace.doors.rclpy.components import load_service
 from rsltrace.errors import did_you_mean
-from rsltrace.job import Job, locate
+from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.job.values.problem import Loc
 from rsltrace.middleware.graph import Graph
 from rsltrace.model.stamp import format_duration
@@ -21,6 +22,12 @@ def impossible_starts(job: Job, graph: Graph, start_ns: int, end_ns: int | None)
     services = [name for name, _ in graph.service_names_and_types() if graph.services(name)]
     nodes = [node.fully_qualified_name for node in graph.nodes]
     for index, spec in enumerate(job.nodes):
+        if spec.container is not None and load_service(spec.container) not in services:
+            near = did_you_mean(spec.container, nodes)
+            yield (
+                f"{_where(job, index, 'container')}: {spec.target} is never loaded: there is no "
+                f"container {spec.container}{near}"
+            )
         after = spec.start_after
         if after is None:
             continue
@@ -48,17 +55,26 @@ def missed_starts(job: Job, missed: Iterable[tuple[str, list[str]]]) -> Iterator
         index = keys.index(key)
         spec = job.nodes[index]
         after = spec.start_after
-        waited = [f"{name} {getattr(after, name)}" for name in unmet]
-        assert after is not None
+        waited = [
+            f"{name} {getattr(after, name, None) or _of_container(spec, name)}" for name in unmet
+        ]
         if not waited:
-            waited = [f"{format_duration(after.delay_ns)} to pass"]
+            waited = [f"{format_duration(0 if after is None else after.delay_ns)} to pass"]
         place = _where(job, index, unmet[0] if unmet else "delay")
         yield f"{place}: {spec.target} has not started: it waited for {' and '.join(waited)}"
+
+
+def _of_container(spec: NodeSpec, name: str) -> str:
+    """Return what a component waits for without saying so."""
+    assert spec.container is not None
+    return load_service(spec.container) if name == "service" else "the component before it"
 
 
 def _where(job: Job, index: int, key: str) -> str:
     spec = job.nodes[index]
     place: Loc = ("nodes", index, "start_after", key)
+    if spec.container is not None and spec.start_after is None:
+        place = ("nodes", index, "container")
     return spec.origin or locate(job, place)
 
 

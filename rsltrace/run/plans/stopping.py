@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rsltrace.job import Job, locate, showing_line
 from rsltrace.job.values.sizes import format_size
@@ -20,6 +20,10 @@ from rsltrace.loop.stop import (
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.plans.target import load_target
 
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.entry import Entry
+    from rsltrace.doors.rclpy.world import World
+
 _Context = Callable[[], AbstractContextManager[None]]
 
 
@@ -33,6 +37,19 @@ def end_ns_of(job: Job, start_ns: int) -> int | None:
     if job.stop.time_ns is not None:
         ends.append(job.stop.time_ns)
     return min(ends, default=None)
+
+
+def stop_with(world: World, entries: Sequence[Entry]) -> None:
+    """Let the run end when an entry has ended that is required."""
+    required = {entry.key for entry in entries if entry.required}
+    loop = world.domain.loop
+
+    def told(what: str, key: str) -> None:
+        if what == "ended" and key in required and loop.stopped is None:
+            loop.stop(Stop(f"{key} has ended, which the run requires"))
+
+    if required:
+        world.stacks.programs.listeners.append(told)
 
 
 def stop_conditions(

@@ -38,6 +38,8 @@ enum class Say : std::uint32_t {
   ALIVE,
   QOS_EVENT,
   FOLLOWS,
+  CALLBACK,
+  TIMER_OF,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from

@@ -1,0 +1,110 @@
+"""Where processes run, that they start again, that a run may end with one, and what their callbacks
+are called."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from rsltrace.errors import JobError
+from rsltrace.job import load_job
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind
+from rsltrace.run.recording import RunResult, run
+from rsltrace.trace.reader import Trace
+
+pytestmark = pytest.mark.ros
+
+Compiled = Callable[[str], Path]
+
+
+def _run(folder: Path, program: Path, entry: str, name: str = "t.mcap") -> RunResult:
+    text = f"nodes:\n  - program: {program}\n{entry}\nstop: {{duration: 2s}}\n"
+    (folder / "job.yaml").write_text(text)
+    return run(load_job(folder / "job.yaml"), folder / name)
+
+
+def _counts(path: Path) -> list[tuple[int, int]]:
+    """Return when (ms) which number was published."""
+    with Trace.open(path) as trace:
+        said = trace.messages("/count")
+        return [(stamp // 1_000_000, struct.unpack("<Q", data[-8:])[0]) for stamp, _, data in said]
+
+
+def test_a_process_has_an_environment_and_a_folder_of_its_own(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    (tmp_path / "place").mkdir()
+    (tmp_path / "place" / "more").write_text("7")
+    entry = "    arguments: ['1000']\n    environment: {COUNT_FROM: 30}\n"
+    entry += "    working_directory: place"
+    assert _run(tmp_path, compiled("counter.c"), entry).error is None
+    assert _counts(tmp_path / "t.mcap") == [(1000, 38), (2000, 39)]
+    with pytest.raises(JobError, match="there is no folder nowhere to run in"):
+        _run(tmp_path, compiled("counter.c"), "    working_directory: nowhere")
+
+
+@pytest.mark.parametrize(("action", "failed"), [("leave", False), ("crash", True)])
+def test_a_process_starts_again_as_often_as_it_may(
+    compiled: Compiled, tmp_path: Path, action: str, failed: bool
+) -> None:
+    """It has ended at 0.5 s, and begins again 0.25 s later; the second time nothing follows."""
+    entry = f"    arguments: ['100', {action}]\n    respawn: {{delay: 250ms, times: 1}}"
+    results = [_run(tmp_path, compiled("counter.c"), entry, f"{n}.mcap") for n in range(2)]
+    assert results[0].digest == results[1].digest
+    assert (results[0].error, results[0].exit_code) == (None, int(failed))
+    counted = [100, 200, 300, 400, 500, 850, 950, 1050, 1150, 1250]
+    numbers = [1, 2, 3, 4, 5] * 2
+    assert _counts(tmp_path / "0.mcap") == list(zip(counted, numbers, strict=True))
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        events = [trace.event(index) for index in range(trace.event_count)]
+        starts = [event for event in events if event.kind is EventKind.CONSTRUCT]
+        assert [event.stamp_ns for event in starts] == [0, 750_000_000]
+        assert len({event.entity for event in starts}) == 2
+
+
+def test_a_run_ends_with_a_process_that_it_requires(compiled: Compiled, tmp_path: Path) -> None:
+    entry = "    arguments: ['100', leave]\n    name: driver\n    required: true"
+    result = _run(tmp_path, compiled("counter.c"), entry)
+    assert (result.error, result.exit_code, result.end_ns) == (None, 0, 500_000_000)
+    assert result.stop_reason.endswith("driver has ended, which the run requires")
+    entry = entry.replace("leave", "exit") + "\n    on_exception: log"
+    assert _run(tmp_path, compiled("counter.c"), entry, "u.mcap").exit_code == 1
+
+
+def test_callbacks_have_the_names_that_rclcpp_tells_its_tracepoints(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    entry = "    arguments: ['1000']\n    environment: {NAMED: 1}"
+    assert _run(tmp_path, compiled("counter.c"), entry).error is None
+    with Trace.open(tmp_path / "t.mcap") as trace:
+        found = list(trace.entities.values())
+    nodes = {entity.name: entity.id for entity in found if entity.kind is EntityKind.NODE}
+    (timer,) = [entity for entity in found if entity.kind is EntityKind.TIMER]
+    assert (timer.name, timer.node) == ("Counter::tick()", nodes["/counter"])  # not the last one
+    (echo,) = [e for e in found if e.kind is EntityKind.SUBSCRIPTION]
+    assert echo.detail["callback"] == "Counter::echo(UInt64)"
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ("node: a:B\n    respawn: 1s", "only a process is started again"),
+        ("main: a:b\n    working_directory: x", "only a process has a folder of its own"),
+        ("node: a:B\n    required: true", "a 'node' lasts as long as the run"),
+        ("program: x\n    container: /c", "only a 'component' has 'container:'"),
+        ("component: p/n::C", "say which 'container:' loads the component"),
+        ("component: p/n::C\n    container: c", "from '/': write '/c'"),
+        ("component: p\n    container: /c", "expected package/plugin"),
+        ("component: p/n::C\n    container: /c\n    arguments: [x]", "a component takes 'param"),
+        ("program: x\n    respawn: {times: 0}", "must be at least 1"),
+    ],
+)
+def test_entries_that_make_no_sense_are_refused(tmp_path: Path, entry: str, expected: str) -> None:
+    (tmp_path / "x").write_text("")
+    (tmp_path / "job.yaml").write_text(f"nodes:\n  - {entry}\n")
+    with pytest.raises(JobError, match=expected):
+        load_job(tmp_path / "job.yaml")

@@ -1,0 +1,143 @@
+"""Nodes of rclcpp, compiled here, where rclcpp is: executors, threads, services, containers.
+
+It is in no wheel. With a ROS 2 that is sourced (``AMENT_PREFIX_PATH``) these tests run.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
+
+from rsltrace.doors.processes.build import find_compiler, find_ros
+from rsltrace.job import load_job
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind
+from rsltrace.run.recording import RunResult, run
+from rsltrace.trace.reader import Trace
+
+SOURCES = Path(__file__).parent / "rclcpp_nodes"
+PREFIXES = [Path(one) for one in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if one]
+_HAS_RCLCPP = any((prefix / "include/rclcpp/rclcpp/rclcpp.hpp").exists() for prefix in PREFIXES)
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long,
+    pytest.mark.skipif(not _HAS_RCLCPP, reason="needs rclcpp: source a ROS 2 that has it"),
+]
+_INTERFACES = ("std_msgs", "std_srvs", "rcl_interfaces", "builtin_interfaces")
+
+
+def _compile(name: str, target: Path, extra: Sequence[str] = ()) -> Path:
+    prefixes = [*PREFIXES, find_ros().prefix]
+    words = [f"-I{one}" for p in prefixes for one in (p / "include").iterdir() if one.is_dir()]
+    words += [f"-I{p / 'include'}" for p in prefixes] + [f"-L{p / 'lib'}" for p in prefixes]
+    words += [f"-Wl,-rpath,{p / 'lib'}" for p in prefixes]
+    words += ["-lrclcpp", "-lrcl", "-lrcutils", "-lrcpputils", "-ltracetools", "-lrosidl_runtime_c"]
+    words += [f"-l{package}__rosidl_typesupport_cpp" for package in _INTERFACES]
+    words += ["-Wl,--unresolved-symbols=ignore-in-shared-libs", "-pthread", *extra]
+    command = [*find_compiler(), "-std=c++17", "-O1", str(SOURCES / name), "-o", str(target)]
+    subprocess.run([*command, *words], check=True)
+    return target
+
+
+@pytest.fixture(scope="module")
+def nodes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The program of ``nodes.cpp``."""
+    return _compile("nodes.cpp", tmp_path_factory.mktemp("rclcpp") / "nodes")
+
+
+def _run(folder: Path, text: str, name: str = "t.mcap") -> RunResult:
+    (folder / "job.yaml").write_text(text)
+    return run(load_job(folder / "job.yaml"), folder / name)
+
+
+def _logs(path: Path) -> list[tuple[int, str, str]]:
+    """Return (ms, logger, text) of all log records."""
+    with Trace.open(path) as trace:
+        records = [(s, trace.decode("/rosout", d)) for s, _, d in trace.messages("/rosout")]
+    return [(stamp // 1_000_000, record.name, record.msg) for stamp, record in records]
+
+
+@pytest.mark.parametrize("executor", ["single", "multi", "static"])
+def test_executors_do_what_rclcpp_does_and_each_run_is_the_same(
+    nodes: Path, tmp_path: Path, executor: str
+) -> None:
+    job = f"nodes: [{{program: {nodes}, arguments: [{executor}]}}]\nstop: {{duration: 3s}}\n"
+    results = [_run(tmp_path, job, f"{number}.mcap") for number in range(3)]
+    assert [result.error for result in results] == [None] * 3
+    assert len({result.digest for result in results}) == 1
+    logs = _logs(tmp_path / "0.mcap")
+    heard = [text.split()[1] for _, _, text in logs if text.startswith("heard")]
+    assert heard[:6] == ["1", "1002", "1003", "1004", "2005", "2006"] or heard[:3] == [
+        "1",
+        "2",
+        "1002",
+    ]
+    assert [text for _, _, text in logs if text.startswith("it is")][:2] == [
+        "it is off",
+        "it is on",
+    ]
+    assert sum(text == "latched 42" for _, _, text in logs) == 1
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        timers = [e.name for e in trace.entities.values() if e.kind is EntityKind.TIMER]
+    assert timers == ["Talker::Talker()::{lambda()#1}", "Talker::Talker()::{lambda()#2}",
+                      "Listener::Listener()::{lambda()#2}"]  # fmt: skip
+
+
+def test_a_container_loads_components(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    prefix = tmp_path / "install"
+    index = prefix / "share/ament_index/resource_index"
+    for kind, content in (
+        ("packages", ""),
+        ("rclcpp_components", "tried::Counter;lib/libtried.so"),
+    ):
+        (index / kind).mkdir(parents=True)
+        (index / kind / "tried").write_text(content)
+    (prefix / "lib").mkdir()
+    extra = ["-shared", "-fPIC", "-lclass_loader", "-lconsole_bridge", "-lcomponent_manager"]
+    _compile("component.cpp", prefix / "lib" / "libtried.so", extra)
+    listed = os.environ["AMENT_PREFIX_PATH"]
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"{prefix}:{listed}")
+    launch = """<launch>
+      <node_container pkg="rclcpp_components" exec="component_container" name="c" namespace="cam">
+        <composable_node pkg="tried" plugin="tried::Counter" name="one">
+          <param name="first" value="10"/>
+          <remap from="count" to="here"/>
+        </composable_node>
+        <composable_node pkg="tried" plugin="tried::Counter" name="two" namespace="n">
+          <remap from="other" to="/here"/>
+        </composable_node>
+      </node_container>
+    </launch>"""
+    (tmp_path / "a.launch.xml").write_text(launch)
+    results = []
+    for number in range(3):
+        job = "launch: [a.launch.xml]\nstop: {duration: 2s}\n"
+        results.append(_run(tmp_path, job, f"{number}.mcap"))
+    assert [result.error for result in results] == [None] * 3
+    assert len({result.digest for result in results}) == 1
+    heard = [(name, text) for _, name, text in _logs(tmp_path / "0.mcap") if "heard" in text]
+    assert heard[:2] == [("n.two", "heard 10"), ("n.two", "heard 11")]
+    with Trace.open(tmp_path / "0.mcap") as trace:
+        nodes = [e.name for e in trace.entities.values() if e.kind is EntityKind.NODE]
+        assert {"/cam/c", "/one", "/n/two"} <= set(nodes)
+        owners = {e.node for e in trace.entities.values() if e.kind is EntityKind.TIMER}
+        assert len(owners) == 2
+        kinds = [trace.event(index).kind for index in range(trace.event_count)]
+    assert EventKind.SERVICE in kinds
+
+
+def test_a_component_that_is_not_there_is_named(tmp_path: Path) -> None:
+    job = """
+nodes:
+  - {executable: rclcpp_components/component_container, name: c}
+  - {component: "nowhere/nowhere::Class", container: /c}
+stop: {duration: 1s}
+"""
+    error = str(_run(tmp_path, job).error)
+    assert "/c cannot load nowhere/nowhere::Class: " in error
