@@ -64,17 +64,19 @@ def run_pytest(request: dict[str, Any], reporter: Reporter) -> None:
 
 
 def simulate(request: dict[str, Any], reporter: Reporter) -> None:
-    """Run the module's tests as a job."""
+    """Run the module's tests as a job, in this process or in one of the run's."""
     from rsltrace import Job, NodeSpec
     from rsltrace.run import run
 
     folder = Path(request["folder"])
-    job = Job(
-        nodes=[NodeSpec(main=partial(run_pytest, request, reporter))],
-        base_dir=folder,
-        start=1000.0,
-        clocks={"source": "topic", "advances": True},
-    )
+    clocks: dict[str, object] = {"source": "topic"}
+    if request["where"] == "process":
+        words = [json.dumps({**request, "where": "here"})]
+        node = NodeSpec(script=Path(__file__), isolated=True, arguments=words)
+    else:
+        node = NodeSpec(main=partial(run_pytest, request, reporter))
+        clocks["advances"] = True
+    job = Job(nodes=[node], base_dir=folder, start=1000.0, clocks=clocks)
     result = run(job, folder / f"{request['module']}.mcap", force=True)
     # Of interest if a test is under way: it waits for what never comes.
     reason = str(result.error) if result.error is not None else result.stop_reason
