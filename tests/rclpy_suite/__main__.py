@@ -21,7 +21,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from document import Counts, document
+from document import Counts, document, read
 from excluded import EXCLUDED
 from suite import Outcome, copy_tests, module_names, run_module
 
@@ -83,7 +83,6 @@ def _report(outcomes: list[Outcome], options: argparse.Namespace) -> int:
         options.list.write_text("".join(f"{test}\n" for test in sorted(passed)))
     if options.document:
         counts = Counts(
-            version=options.document,
             suite=len(outcomes),
             native=len(baseline),
             passed=len(passed),
@@ -91,7 +90,9 @@ def _report(outcomes: list[Outcome], options: argparse.Namespace) -> int:
             excluded=len(excluded),
             failed=len(failed),
         )
-        DOCUMENT.write_text(document(counts, EXCLUDED["simulation"]))
+        way = "process" if options.processes else "simulation"
+        of_both = {**read(DOCUMENT.read_text())[1], way: counts}
+        DOCUMENT.write_text(document(options.document, of_both, EXCLUDED))
     return 1 if failed else 0
 
 

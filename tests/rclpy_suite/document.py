@@ -8,37 +8,46 @@ from dataclasses import asdict, dataclass
 
 _TEXT = """# rclpy's own tests on rsltrace
 
-Made by `python tests/rclpy_suite --rclpy PATH --baseline LIST --document VERSION`, which runs
-rclpy's test suite on rsltrace's middleware, from a checkout of rclpy (none of its code is kept
-here). Each test module is the `main:` of a job with
-`clocks: {{source: topic, advances: true}}`; wherever a test spins, sleeps, waits or starts a
-thread, simulated time passes. `make rclpy-tests RCLPY=PATH` does it without the document.
+Made by `python tests/rclpy_suite --rclpy PATH --baseline LIST --document VERSION`, once with
+`--processes` and once without, which runs rclpy's test suite on rsltrace's middleware, from a
+checkout of rclpy (none of its code is kept here):
 
-| rclpy {version} | tests |
-|---|---|
-| in the suite | {suite} |
-| of these, pass natively over DDS three times in a row | {native} |
-| pass in the simulation | {passed} |
-| of those that pass natively, pass in the simulation | {both} |
-| excluded, with the reasons below | {excluded} |
-| fail | {failed} |
+- **here**: each test module is the `main:` of a job with `clocks: {{source: topic, advances:
+  true}}`, in rsltrace's process;
+- **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
+  rclpy and its compiled parts, unmodified, on [the library of processes](processes.md).
+
+Wherever a test spins, sleeps, waits or starts a thread, simulated time passes. `make rclpy-tests
+RCLPY=PATH` does it without the document.
+
+| rclpy {version} | here | process |
+|---|---|---|
+{counts}
 
 (Some tests are too sensitive to load to pass natively three times in a row; in simulated time they
 pass.)
 
 ## What is excluded, and why
 
-| test | reason |
-|---|---|
+| test | where | reason |
+|---|---|---|
 {rows}
 """
+_WAYS = {"simulation": "here", "process": "process"}
+_LINES = {
+    "suite": "in the suite",
+    "native": "of these, pass natively over DDS three times in a row",
+    "passed": "pass in the simulation",
+    "both": "of those that pass natively, pass in the simulation",
+    "excluded": "excluded, with the reasons below",
+    "failed": "fail",
+}
 
 
 @dataclass(frozen=True)
 class Counts:
     """What a run of the suite came to."""
 
-    version: str
     suite: int
     native: int
     passed: int
@@ -47,18 +56,26 @@ class Counts:
     failed: int
 
 
-def document(counts: Counts, excluded: Mapping[str, str]) -> str:
-    """Return the document."""
-    rows = "\n".join(
-        f"| `{test.removeprefix('test/')}` | {reason} |" for test, reason in excluded.items()
-    )
-    return _TEXT.format(rows=rows, **asdict(counts))
+def document(
+    version: str, counts: Mapping[str, Counts], excluded: Mapping[str, Mapping[str, str]]
+) -> str:
+    """Return the document, of counts and excluded tests by where the tests have run."""
+    lines = [
+        f"| {text} | " + " | ".join(str(asdict(counts[way])[name]) for way in _WAYS) + " |"
+        for name, text in _LINES.items()
+    ]
+    rows = [
+        f"| `{test.removeprefix('test/')}` | {where} | {reason} |"
+        for way, where in _WAYS.items()
+        for test, reason in excluded[way].items()
+    ]
+    return _TEXT.format(version=version, counts="\n".join(lines), rows="\n".join(rows))
 
 
-def counts_in(text: str) -> Counts:
-    """Read the counts back from a document."""
-    version = re.search(r"^\| rclpy (.*) \| tests \|$", text, re.MULTILINE)
+def read(text: str) -> tuple[str, dict[str, Counts]]:
+    """Read the version and the counts back from a document."""
+    version = re.search(r"^\| rclpy (.*) \| here \| process \|$", text, re.MULTILINE)
     assert version is not None
-    head = text.partition("## ")[0]
-    numbers = [int(number) for number in re.findall(r"^\|.*\| (\d+) \|$", head, re.MULTILINE)]
-    return Counts(version[1], *numbers)
+    found = re.findall(r"^\|.*\| (\d+) \| (\d+) \|$", text, re.MULTILINE)
+    columns = zip(*([int(cell) for cell in line] for line in found), strict=True)
+    return version[1], dict(zip(_WAYS, (Counts(*column) for column in columns), strict=True))

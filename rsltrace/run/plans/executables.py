@@ -15,7 +15,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 
-from rsltrace.doors.processes.programs import is_compiled, why_not_run
+from rsltrace.doors.processes.programs import is_compiled, is_python, why_not_run
 from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
@@ -173,19 +173,26 @@ def compiled_file(target: str) -> Path | None:
     return path if path is not None and is_compiled(path) else None
 
 
-def installed_file(target: str, *, where: str) -> Path:
-    """Return the file that starts ``package/name``: a ROS package's, or that of a console script.
+def process_command(target: str, *, where: str) -> list[str]:
+    """Return what starts ``package/name`` as a process: a ROS package's file, or that of a console
+    script; where none is installed, the code that it would run.
 
-    :raises JobError: if there is none.
+    :raises JobError: if there is no such executable.
     """
     package, _, name = target.partition("/")
-    found = _installed_files(package).get(name)
+    found: str | Path | None = _installed_files(package).get(name)
     if found is None and name in _console_scripts(package):
         found = Path(sys.executable).parent / name
-    if found is None or not found.is_file():
-        find_executable(target, where=where)  # says what is wrong, if it is not the file
-        raise JobError(f"{target} has no file that could be started as a process", where=where)
-    return found
+    if found is None or not Path(found).is_file():
+        found = source_of(target, where=where)
+    if isinstance(found, str):
+        module, _, function = found.partition(":")
+        code = (
+            f"import sys, importlib; sys.argv[0] = {name!r}; "
+            f"sys.exit(importlib.import_module({module!r}).{function}())"
+        )
+        return [sys.executable, "-c", code]
+    return [sys.executable, str(found)] if is_python(found) else [str(found)]
 
 
 def _same(name: str) -> str:
@@ -260,4 +267,4 @@ def _python_script(path: Path, target: str, where: str) -> MainProgram:
     )
 
 
-__all__ = ["Mains", "compiled_file", "find_executable", "installed_file", "source_of"]
+__all__ = ["Mains", "compiled_file", "find_executable", "process_command", "source_of"]

@@ -32,7 +32,7 @@ from rsltrace.job import Job, NodeSpec
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.model.printable import printable
 from rsltrace.model.regular_file import not_regular
-from rsltrace.run.plans.executables import compiled_file, installed_file
+from rsltrace.run.plans.executables import compiled_file, process_command
 
 
 class Processes:
@@ -92,8 +92,7 @@ class Processes:
             _check_file(path, spec.script, where)
             return [sys.executable, str(path)]
         assert spec.executable is not None
-        found = installed_file(spec.executable, where=where)
-        return [sys.executable, str(found)] if is_python(found) else [str(found)]
+        return process_command(spec.executable, where=where)
 
 
 def _check_file(path: Path, given: str, where: str) -> None:

@@ -1,4 +1,5 @@
 // Wait sets of rcl, with their timers: rmw_wait would only be told the shortest timeout.
+#include <dlfcn.h>
 #include <rcl/client.h>
 #include <rcl/error_handling.h>
 #include <rcl/event.h>
@@ -131,6 +132,24 @@ void keep_only(Item **items, std::size_t size, std::size_t place) {
   }
 }
 
+// With the one that was found all that are triggered, for rclpy: it looks at them in the order of
+// their creation. (rclcpp goes by addresses, and gets one at a time.)
+void keep_conditions(rcl_wait_set_t &set, const Wanted &wanted, const Found &found) {
+  static const bool takes_all = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
+  std::vector<bool> kept(set.size_of_guard_conditions, false);
+  if (found.kind == Found::Kind::CONDITION) kept[wanted.conditions[found.index].place] = true;
+  for (const auto &one : wanted.conditions) {
+    const bool is_there = found.kind == Found::Kind::CONDITION && takes_all && one.place != NONE &&
+                          one.condition->is_triggered;
+    if (!is_there) continue;
+    one.condition->is_triggered = false;
+    kept[one.place] = true;
+  }
+  for (std::size_t i = 0; i < kept.size(); i++) {
+    if (!kept[i]) set.guard_conditions[i] = nullptr;
+  }
+}
+
 }  // namespace
 
 RSLTRACE_EXPORT rcl_ret_t rcl_wait(rcl_wait_set_t *set, int64_t timeout) {
@@ -161,8 +180,7 @@ RSLTRACE_EXPORT rcl_ret_t rcl_wait(rcl_wait_set_t *set, int64_t timeout) {
   keep_only(set->subscriptions, set->size_of_subscriptions, place(SUBSCRIPTION));
   keep_only(set->services, set->size_of_services, place(SERVICE));
   keep_only(set->clients, set->size_of_clients, place(CLIENT));
-  keep_only(set->guard_conditions, set->size_of_guard_conditions,
-            found.kind == Found::Kind::CONDITION ? wanted.conditions[found.index].place : NONE);
+  keep_conditions(*set, wanted, found);
   keep_only(set->timers, set->size_of_timers,
             found.kind == Found::Kind::TIMER ? waited.timer_places[found.index] : outcome.due);
   keep_only(set->events, set->size_of_events, place(EVENT));

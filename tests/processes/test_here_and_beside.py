@@ -1,0 +1,105 @@
+"""Programs say the same in rsltrace's process and in processes of their own: every example, and all
+mains of ``tests/demos``."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import sys
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from rsltrace.job import load_job
+from rsltrace.run.recording import run
+from rsltrace.trace.reader import Trace
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.long,
+    pytest.mark.skipif(
+        importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs"
+    ),
+]
+
+ROOT = Path(__file__).parents[2]
+SPIN = Path(__file__).with_name("spin_node.py")
+_GOAL_IDS = re.compile(r"^/[^/]+/_action/")
+
+Said = dict[str, list[Any]]
+
+
+def _said(job: dict[str, Any], folder: Path, name: str) -> Said:
+    """Run a job; return what was published on each topic, and logged by each node, with stamps.
+
+    Of what actions publish only the stamps: the ids of goals are chance, drawn elsewhere.
+    """
+    (folder / f"{name}.yaml").write_text(yaml.safe_dump(job, sort_keys=False))
+    result = run(load_job(folder / f"{name}.yaml"), folder / f"{name}.mcap")
+    assert result.error is None
+    said: defaultdict[str, list[Any]] = defaultdict(list)
+    with Trace.open(folder / f"{name}.mcap") as trace:
+        for topic in {channel.topic for channel in trace.channels.values()}:
+            for stamp, _, data in trace.messages(topic):
+                if topic == "/rosout":
+                    record: Any = trace.decode(topic, data)
+                    said[f"log of {record.name}"].append((stamp, record.msg))
+                elif topic.startswith("/") and not topic.startswith("/rsltrace/"):
+                    content = b"" if _GOAL_IDS.match(topic) else bytes(data)
+                    said[topic].append((stamp, content))
+    return said
+
+
+def _compare(job: dict[str, Any], folder: Path) -> Said:
+    here = _said(job, folder, "here")
+    for node in job["nodes"]:
+        node["isolated"] = True
+    beside = _said(job, folder, "beside")
+    assert {topic: len(said) for topic, said in here.items()} == {
+        topic: len(said) for topic, said in beside.items()
+    }
+    assert not [topic for topic, said in here.items() if said != beside[topic]]
+    return here
+
+
+@pytest.mark.parametrize(
+    ("example", "seconds", "topics"),
+    [
+        ("ping_pong", 0.2, {"/ping", "/pong"}),
+        ("rslcpp_determinism", 3.0, {"/t1", "/t2", "/t3", "/t4", "/t5"}),
+        ("sensor_fusion", 1.5, {"/imu/data", "/odometry/filtered", "/cmd_vel", "log of planner"}),
+        ("benchmark8", 0.1, {"/g0/imu", "/g0/command"}),
+    ],
+)
+def test_examples(
+    compiled: object, tmp_path: Path, example: str, seconds: float, topics: set[str]
+) -> None:
+    job = yaml.safe_load((ROOT / "examples" / example / "job.yaml").read_text())
+    for node in job["nodes"]:
+        node["script"] = str(SPIN)
+        node["arguments"] = [node.pop("node"), json.dumps(node.pop("arguments", {}))]
+    job |= {"search_path": [str(ROOT / "examples" / example)], "stop": {"duration": seconds}}
+    assert topics <= set(_compare(job, tmp_path))
+
+
+def test_all_mains_of_the_demos(
+    compiled: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "tests" / "run"))
+    monkeypatch.delitem(sys.modules, "demo_packages", raising=False)
+    import demo_packages as demos
+
+    prefix = demos.install_demos(tmp_path)
+    names = (*demos.SERVERS, *demos.CLIENTS)
+    job = {
+        "nodes": [{"executable": f"{demos.package_of(name)}/{name}"} for name in names],
+        "search_path": [str(prefix)],
+        "stop": {"duration": 10.0},
+    }
+    said = _compare(job, tmp_path)
+    assert said["log of listener"][-1][1] == "141 letters"
+    assert {f"log of {name}" for name in names if name != "adder"} <= set(said)
