@@ -81,7 +81,9 @@ def view(
     what it changed in its node and with the source of its callback. This runs code, under the
     conditions of "rsltrace replay".
 
-    Without a TRACE, offers those of this folder. Inside, ? shows all keys and q quits.
+    Without a TRACE, offers those of this folder, and its bags. One trace opens with an overview
+    (Esc leaves it for the events; so do --at and --filter), two where they diverge. Inside, ?
+    shows all keys and q quits.
     """
     _check_installed("textual")
     if len(traces) > 2:
@@ -97,24 +99,25 @@ def view(
     if serve:
         _serve(port)
         return
-    chosen = traces or _choose(exporting=export is not None)
+    chosen = traces or _choose(exporting=export is not None, light=light)
     if not chosen:
         return
     if any(is_recording(path) for path in chosen):
-        if at is not None or filter_text or follow or live or rerun:
-            raise click.UsageError(
-                "--at, --filter, --follow, --live and --rerun need traces; these are recordings"
-            )
-        _show(_recordings(chosen, light=light), export, size, keys)
+        if follow or live or rerun:
+            raise click.UsageError("--follow, --live and --rerun need traces; these are recordings")
+        _show(_recordings(chosen, at, filter_text, light=light), export, size, keys)
         return
+    from rsltrace_viewer.model.query.parser import parse
+
     with ExitStack() as stack:
         session, made = _opened(stack, chosen, live=live, job_folder=job_folder, trust=trust)
         app = made(
             start=None if at is None else _place(session, at),
             light=light,
             follow=follow,
-            filter_text=_checked_filter(session, filter_text),
+            filter_text=_checked_filter(filter_text, lambda text: parse(text, session.a)),
             rerun=_follower(stack, chosen) if rerun else None,
+            overview=len(chosen) == 1 and at is None and not (filter_text or follow or live),
         )
         _show(app, export, size, keys)
 
@@ -126,11 +129,25 @@ def _show(app: Shown, export: Path | None, size: str, keys: str) -> None:
         _run(app)
 
 
-def _recordings(paths: tuple[Path, ...], *, light: bool) -> RecordingApp:
+def _recordings(
+    paths: tuple[Path, ...], at: str | None, filter_text: str, *, light: bool
+) -> RecordingApp:
     """Return the app for bags and native recordings, or one of them beside a trace."""
+    from rsltrace_viewer.model.recordings.filter import read_filter
     from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 
-    return RecordingApp(open_recordings(paths), light=light)
+    session = open_recordings(paths)
+    start = None
+    if at is not None:
+        start = (int(at), 0) if at.isdecimal() else (None, _time(at, "a message"))
+    return RecordingApp(
+        session,
+        light=light,
+        start=start,
+        filter_text=_checked_filter(
+            filter_text, lambda text: read_filter(text, session.recordings)
+        ),
+    )
 
 
 def _opened(
@@ -190,40 +207,45 @@ def _check_installed(package: str) -> None:
         )
 
 
-def _choose(*, exporting: bool) -> tuple[Path, ...]:
-    """Offer the traces of the current folder."""
-    from rsltrace_viewer.terminal.choose import ChooseApp, traces_in
+def _choose(*, exporting: bool, light: bool) -> tuple[Path, ...]:
+    """Offer the traces and recordings of the current folder."""
+    from rsltrace_viewer.model.folder import found_in
+    from rsltrace_viewer.terminal.choose import ChooseApp
 
-    found = traces_in(Path())
+    found = found_in(Path())
     if not found:
         raise TraceError(
-            "there is no trace in this folder; name one, or make one with `rsltrace record`"
+            "there is no trace and no bag in this folder; name one, or make a trace with "
+            "`rsltrace record`"
         )
     if exporting or not _has_terminal():
-        names = ", ".join(str(entry.path) for entry in found[:8])
-        raise TraceError(f"name a trace; this folder has {names}")
-    chosen = ChooseApp(found).run()
+        names = ", ".join(entry.name for entry in found[:8])
+        raise TraceError(f"name a trace or a bag; this folder has {names}")
+    chosen = ChooseApp(found, light=light).run()
     return tuple(chosen or ())
 
 
 def _place(session: Any, at: str) -> int:
-    from rsltrace.words.times import parse_stamp
-
     if at.isdecimal():
         return int(session.view.place_of(min(int(at), max(session.a.count - 1, 0))))
-    try:
-        stamp_ns = parse_stamp(at)
-    except ValueError as error:
-        raise click.BadParameter(f"{error}; or the number of an event", param_hint="--at") from None
+    stamp_ns = _time(at, "an event")
     return int(session.place_at_time(stamp_ns)) if not session.empty else 0
 
 
-def _checked_filter(session: Any, text: str) -> str:
-    from rsltrace_viewer.model.query.parser import parse
+def _time(at: str, what: str) -> int:
+    from rsltrace.words.times import parse_stamp
+
+    try:
+        return parse_stamp(at)
+    except ValueError as error:
+        raise click.BadParameter(f"{error}; or the number of {what}", param_hint="--at") from None
+
+
+def _checked_filter(text: str, read: Callable[[str], object]) -> str:
     from rsltrace_viewer.model.query.tokens import QueryError
 
     try:
-        parse(text, session.a)
+        read(text)
     except QueryError as error:
         message = f"{error}\n  {text}\n  {' ' * error.start}{'^' * max(error.end - error.start, 1)}"
         raise click.BadParameter(message, param_hint="--filter") from None

@@ -14,6 +14,7 @@ import math
 import re
 import struct
 from copy import copy
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -150,12 +151,12 @@ def to_plain(value: object) -> Any:
 
     JSON has no NaN or infinity; they become the strings ``NaN``, ``Infinity``, ``-Infinity``.
     """
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {
-            field.name: to_plain(getattr(value, field.name))
-            for field in dataclasses.fields(value)
-            if field.name not in _NOT_OF_THE_MESSAGE
-        }
+    kind: Any = type(value)
+    if kind in _PLAIN:
+        return value
+    names = field_names(kind)
+    if names is not None:
+        return {name: to_plain(getattr(value, name)) for name in names}
     if isinstance(value, np.ndarray):
         values = value.tolist()
         if value.dtype.kind == "f" and not np.isfinite(value).all():
@@ -166,6 +167,18 @@ def to_plain(value: object) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return value
+
+
+_PLAIN = (int, str, bool, type(None))
+
+
+@lru_cache(maxsize=4096)
+def field_names(kind: Any) -> tuple[str, ...] | None:
+    """Return the names of the fields of decoded messages of a class; None if it is none."""
+    if not dataclasses.is_dataclass(kind):
+        return None
+    names = (field.name for field in dataclasses.fields(kind))
+    return tuple(name for name in names if name not in _NOT_OF_THE_MESSAGE)
 
 
 class _UnsafeSchema(ValueError):

@@ -136,9 +136,11 @@ class Feeder:
         return sequence
 
     def output(
-        self, kind: OutputKind, entity: int, content: bytes, sequence: int = NO_SEQUENCE
+        self, kind: OutputKind, entity: int, content: bytes | int, sequence: int = NO_SEQUENCE
     ) -> None:
-        output = Output(len(self.events), entity, kind, hash64(content), sequence)
+        """Add what was sent; of a draw its number."""
+        number = content if isinstance(content, int) else hash64(content)
+        output = Output(len(self.events), entity, kind, number, sequence)
         self.pending.append(output)
         self.writer.add_output(pack_output(output)[OUTPUT_HASHED])
         if kind is not OutputKind.DRAW:

@@ -18,7 +18,8 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner, Result
-from rsltrace_viewer.terminal.choose import ChooseApp, traces_in
+from rsltrace_viewer.model.folder import found_in
+from rsltrace_viewer.terminal.choose import ChooseApp
 
 from rsltrace.cli.main import cli
 from rsltrace.trace.reader import Trace
@@ -35,7 +36,7 @@ def test_a_screen_as_text_and_as_a_picture(made: Path, tmp_path: Path) -> None:
     lines = text.read_text().splitlines()
     assert len(lines) == 30
     assert any(line.startswith(">") and "/listener" in line for line in lines)
-    assert view(made, "--export", picture, "--keys", "end d").exit_code == 0
+    assert view(made, "--at", 0, "--export", picture, "--keys", "end d").exit_code == 0
     svg = picture.read_text()
     assert svg.startswith("<svg")
     assert "too&#160;many" in svg
@@ -105,14 +106,15 @@ def test_the_traces_of_a_folder(
     made: Path, long: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert "there is no trace in this folder" in view().output
+    assert "there is no trace and no bag in this folder" in view().output
     shutil.copy(made, tmp_path / "made.mcap")
     (tmp_path / "sub").mkdir()
     shutil.copy(long, tmp_path / "sub" / "long.mcap")
     (tmp_path / "junk.mcap").write_bytes(b"junk")
     assert "this folder has" in view().output
-    found = traces_in(Path())
+    found = found_in(Path())
     assert {str(entry.path) for entry in found} == {"made.mcap", "sub/long.mcap"}
+    assert {entry.amount for entry in found} == {"603 events", "30,003 events"}
 
     async def choose(*keys: str) -> Any:
         app = ChooseApp(found)
@@ -148,7 +150,9 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
     command = f"{sys.executable} -m rsltrace view {made}; echo left with $?; cat"
     tmux("new-session", "-d", "-x", "80", "-y", "24", command)
     try:
-        wait_for("made.mcap", "1/603", "/talker")
+        wait_for("made.mcap", "what went wrong", "/talker")
+        tmux("send-keys", "Escape")
+        wait_for("1/603")
         tmux("send-keys", "j", "Down")
         wait_for("3/603")
         tmux("send-keys", "PPage", "End")

@@ -11,7 +11,15 @@ from typing import Any
 
 import pytest
 from rsltrace_viewer.model.logs import LogLine, event_of, read_logs
-from rsltrace_viewer.model.overview import nodes_of, read_overview, topics_of, troubles_of
+from rsltrace_viewer.model.overview import (
+    Met,
+    Times,
+    callbacks_of,
+    nodes_of,
+    read_overview,
+    topics_of,
+    troubles_of,
+)
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import source_of
 from rsltrace_viewer.terminal.editor import command
@@ -19,7 +27,9 @@ from rsltrace_viewer.terminal.screens.logs import LogScreen
 from rsltrace_viewer.terminal.screens.overview import OverviewScreen
 from rsltrace_viewer.terminal.widgets.source import SourceView
 
-from rsltrace.model.event import OutputKind
+from rsltrace.model.draw import Draw, encode_draw
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.trace.counts import count
 
 Drive = Callable[..., None]
@@ -33,8 +43,7 @@ def test_the_overview_counts_what_the_trace_has(long_run: Run) -> None:
         e: s.count for e, s in counts.events.items()
     }
     assert overview.share == 1.0
-    assert overview.raised_count == 1
-    assert overview.raised == [long_run.count - 1]
+    assert overview.raised == Met(1, long_run.count - 1)
     topics = {part.name: part for part in topics_of(long_run, overview)}
     assert topics["/count"].rate_hz == pytest.approx(50, rel=0.01)
     parts = nodes_of(long_run, overview)
@@ -56,6 +65,67 @@ def test_log_records_lead_to_the_events_that_logged_them(long_run: Run) -> None:
         assert line.sequence in [output.sequence for output in logged]
     nowhere = LogLine(long_run.end_ns, 10**6, logs.lines[0].record)
     assert event_of(long_run, nowhere) is None
+
+
+def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: Path) -> None:
+    from trace_maker import Opened
+
+    path = tmp_path / "drawn.mcap"
+    took_ns = [3_000_000, 5_000_000, 1_000_000]
+    with Opened(path) as feeder:
+        node = feeder.entity(EntityKind.NODE, "/worker")
+        timer = feeder.entity(EntityKind.TIMER, "tick", node=node)
+        publisher = feeder.entity(EntityKind.PUBLISHER, "/out", node=node)
+        feeder.event(EventKind.CONSTRUCT, 0, 0)
+        for place, value in enumerate(took_ns):
+            feeder.output(OutputKind.DRAW, timer, encode_draw(Draw.EXECUTION, value))
+            if place == 1:
+                feeder.output(OutputKind.DRAW, publisher, encode_draw(Draw.BURST))
+            feeder.event(EventKind.TIMER, timer, 10_000_000 * place)
+        feeder.writer.close(result={"stop_reason": "done", "exit_code": "0"})
+    run = Run.open(path)
+    overview = list(read_overview(run))[-1]
+    assert overview.took == {timer: Times(3, 9_000_000, 5_000_000)}
+    assert overview.lost == Met(1, 2)
+    assert overview.sent == {}
+    (callback,) = callbacks_of(run, overview)
+    assert callback.took == overview.took[timer]
+    assert callback.share == pytest.approx(9 / 20)
+    assert nodes_of(run, overview)[0].share == callback.share
+    assert any("lost" in one.what for one in troubles_of(run, overview, None))
+    run.close()
+
+
+def test_one_trace_opens_with_the_overview(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        app = viewer.app
+        assert isinstance(app.screen, OverviewScreen)
+        assert "what went wrong" in viewer.text
+        assert "301" in viewer.text
+        await viewer.press("question_mark", "escape", "escape")
+        assert app.focused is app.timeline
+        assert viewer.text.splitlines()[-1].endswith("1/603")
+        assert ">      0 10.000000" in viewer.text
+        assert app.lanes.lanes is not None
+        assert any(level for lane in app.lanes.lanes.lanes for level in lane.levels)
+        await viewer.press("O", "x")  # a key of the events does what it does there
+        assert app.session.current()[1] == 602
+        await viewer.press("O", "slash")
+        await viewer.type("kind:srv")
+        assert app.session.search_text == "kind:srv"
+        assert not isinstance(app.screen, OverviewScreen)
+        await viewer.press("O", "q")
+        assert len(app.screen_stack) == 1
+
+    drive(made, steps, overview=True)
+
+
+def test_the_viewer_can_be_left_from_its_first_screen(made: Path, drive: Drive) -> None:
+    async def steps(viewer: Any) -> None:
+        await viewer.press("q")
+        assert not viewer.app.is_running
+
+    drive(made, steps, overview=True)
 
 
 def test_the_overview_leads_to_events(made: Path, drive: Drive) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import shutil
+import sqlite3
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,16 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
+from rsltrace_viewer.model.folder import found_in
 from rsltrace_viewer.model.plots.data import difference
 from rsltrace_viewer.model.plots.series import Series
+from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.recordings.pairs import Pairs
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Topic
+from rsltrace_viewer.model.recordings.session import RecordingSession
 from rsltrace_viewer.model.view import Sign
+from rsltrace_viewer.terminal.choose import ChooseApp
 from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 from rsltrace_viewer.terminal.screens.help import KeysScreen
 from rsltrace_viewer.terminal.screens.plot import PlotScreen
@@ -26,6 +32,8 @@ from rsltrace_viewer.terminal.screenshot import settle, text_of
 from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
+from rsltrace.trace.decode import to_plain
+from rsltrace.words.times import parse_stamp
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces" / "delayed_input"
 
@@ -43,8 +51,9 @@ def bags(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def drive(paths: tuple[Path, ...], steps: Callable[..., Awaitable[None]], **options: Any) -> None:
     async def run() -> None:
-        app = RecordingApp(open_recordings(paths))
-        async with app.run_test(size=options.get("size", (120, 36))) as pilot:
+        size = options.pop("size", (120, 36))
+        app = RecordingApp(open_recordings(paths), **options)
+        async with app.run_test(size=size) as pilot:
 
             async def press(*keys: str) -> str:
                 for key in keys:
@@ -56,6 +65,12 @@ def drive(paths: tuple[Path, ...], steps: Callable[..., Awaitable[None]], **opti
             await steps(app, press)
 
     asyncio.run(run())
+
+
+def typed(text: str) -> list[str]:
+    """Return the keys that type a text."""
+    names = {" ": "space", ":": "colon", "/": "slash", ".": "full_stop", ">": "greater_than_sign"}
+    return [names.get(character, character) for character in text]
 
 
 def topic_of(hashes: list[int]) -> Topic:
@@ -138,6 +153,148 @@ def test_a_bag_beside_the_trace_it_was_made_from(bags: tuple[Path, Path]) -> Non
     drive((bags[0], SAMPLES / "a.mcap"), steps)
 
 
+def _chosen(session: RecordingSession, text: str) -> set[tuple[str, int]]:
+    list(session.set_filter(text))
+    session.show_found()
+    chosen = set()
+    for place, (name, _) in enumerate(session.keys):
+        session.place = place
+        chosen |= {(name, int(number)) for number in session.pairs.a}
+    return chosen
+
+
+@pytest.mark.parametrize("kept", [1 << 28, 4000], ids=["in memory", "read again"])
+def test_filters_mean_the_messages_that_they_say(
+    bags: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, kept: int
+) -> None:
+    monkeypatch.setattr("rsltrace_viewer.model.recordings.recording._KEPT_BYTES", kept)
+    session = open_recordings(bags[:1])
+    list(session.read())
+    recording = session.recordings[0]
+    everything = {}
+    for topic in recording.topics:
+        for number, stamp in enumerate(topic.stamps):
+            *_, message = recording.message(topic, number)
+            text = str(to_plain(message)).casefold()
+            everything[topic.name, number] = (stamp - recording.start_ns) / 1e9, text
+    texts = {key: text for key, (_, text) in everything.items()}
+    for text, means in {
+        "topic:/pose": lambda key: key[0] == "/pose",
+        "-topic:/pose": lambda key: key[0] != "/pose",
+        "pose": lambda key: "pose" in key[0],
+        "type:Pose2D or index:<3": lambda key: key[0] == "/pose" or key[1] < 3,
+        "time:0.5..1": lambda key: 0.5 <= everything[key][0] <= 1,
+        "time:>1.5 index:100..": lambda key: everything[key][0] > 1.5 and key[1] >= 100,
+        "text:0.55": lambda key: "0.55" in texts[key],
+        "topic:/pose (text:0.55 or text:0.56) -index:140": lambda key: (
+            key[0] == "/pose" and ("0.55" in texts[key] or "0.56" in texts[key]) and key[1] != 140
+        ),
+        "level:warn": lambda key: False,
+        "time:>1700000000": lambda key: False,
+        "": lambda key: True,
+    }.items():
+        assert _chosen(session, text) == {key for key in everything if means(key)}, text
+    for text in ("nod:/x", "topic:/nothing", "time:soon", "index:x", "level:loud", "text:", '""'):
+        with pytest.raises(QueryError):
+            session.set_filter(text)
+
+
+def test_filters_and_searches_on_the_screen(bags: tuple[Path, Path]) -> None:
+    async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
+        session = app.session
+        topics = len(session.keys)
+        text = await press("F", *typed("top"))
+        assert "topic:" in text
+        text = await press("tab", *typed("/pose time:>1"), "enter")
+        assert [name for name, _ in session.keys] == ["/pose"]
+        assert f"{session.pairs.count} of 250" in text
+        assert f"filter: {session.pairs.count} messages" in text
+        assert session.pairs.at(0) == (100, None)
+        text = await press("escape")
+        assert len(session.keys) == topics
+        assert "filter:" not in text
+        assert session.keys[session.place][0] == "/pose"
+        assert session.pairs.at(session.row) == (100, None)
+        await press("slash", *typed("text:0.559"), "enter")
+        found = session.row
+        assert "0.559" in "".join(session.message_text(found)[2])
+        assert app.focused is app.messages
+        await press("n", "N")
+        assert session.row == found
+        assert "no match" in await press("slash", *typed("text:qzx"), "enter")
+        await press("escape", "escape")
+        assert not session.search_text
+
+    drive(bags[:1], steps)
+
+
+def test_a_filter_of_two_recordings_keeps_what_either_has(bags: tuple[Path, Path]) -> None:
+    async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
+        session = app.session
+        assert session.pairs.at(session.row) == (144, 144)
+        assert session.filter_text == "topic:/pose index:140..150"
+        assert session.pairs.count == 11
+        assert session.row == 4
+        await press("n")
+        assert "no later difference" in text_of(app)
+
+    drive(bags, steps, filter_text="topic:/pose index:140..150")
+
+
+@pytest.mark.parametrize(
+    ("at", "expected"),
+    [("1.445s", ("/pose", 144)), ("0", ("", 0)), ("99999", ("", -1)), ("99s", ("", -1))],
+)
+def test_starting_somewhere_in_a_recording(
+    bags: tuple[Path, Path], tmp_path: Path, at: str, expected: tuple[str, int]
+) -> None:
+    session = open_recordings(bags[:1])
+    list(session.read())
+    session.go_to_message(*((int(at), 0) if at.isdecimal() else (None, parse_stamp(at))))
+    recording = session.recordings[0]
+    name, number = session.keys[session.place][0], session.number_of(session.row)
+    topic = session.topics(session.keys[session.place])[0]
+    assert topic is not None
+    if expected[0]:
+        assert (name, number) == expected
+    else:
+        edge = recording.start_ns if expected[1] == 0 else recording.end_ns
+        assert topic.stamps[number] == edge
+    screen = tmp_path / "screen.txt"
+    done = CliRunner().invoke(cli, ["view", str(bags[0]), "--at", at, "--export", str(screen)])
+    assert done.exit_code == 0, done.output
+    assert f"message {number}" in screen.read_text()
+
+
+def test_the_chooser_knows_recordings(
+    bags: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(bags[0], tmp_path / "bag")
+    (file,) = (tmp_path / "bag").glob("*.mcap")
+    shutil.copy(file, tmp_path / "plain.mcap")
+    (tmp_path / "sub").mkdir()
+    shutil.copy(SAMPLES / "a.mcap", tmp_path / "sub" / "run.mcap")
+    sqlite3.connect(tmp_path / "broken.db3").close()
+    (tmp_path / "cut.mcap.zstd").write_bytes(b"\x28\xb5\x2f\xfd")
+    monkeypatch.chdir(tmp_path)
+    found = {entry.name: entry for entry in found_in(Path())}
+    assert set(found) == {"bag/", "plain.mcap", "sub/run.mcap", "cut.mcap.zstd"}
+    assert found["bag/"].amount == found["plain.mcap"].amount == "316 messages"
+    assert "mcap recording" in found["bag/"].what
+    assert "events" in found["sub/run.mcap"].amount
+
+    async def choose(*keys: str) -> Any:
+        app = ChooseApp(list(found.values()))
+        async with app.run_test(size=(80, 24)) as pilot:
+            await pilot.press(*keys)
+        return app.return_value
+
+    chosen = asyncio.run(choose("space", "down", "enter"))
+    assert chosen == [entry.path for entry in found.values()][:2]
+    monkeypatch.chdir(tmp_path / "bag")
+    assert [entry.name for entry in found_in(Path())] == ["./"]
+
+
 def test_messages_that_are_not_kept_are_read_again(
     bags: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -162,7 +319,10 @@ def test_recordings_that_cannot_be_opened(tmp_path: Path, bags: tuple[Path, Path
     (tmp_path / "folder").mkdir()
     for arguments, words in (
         ([tmp_path / "folder"], "metadata.yaml"),
-        ([bags[0], "--at", "3"], "need traces"),
+        ([bags[0], "--follow"], "need traces"),
+        ([bags[0], "--at", "soon"], "or the number of a message"),
+        ([bags[0], "--filter", "topic:/nothing"], "there are"),
+        ([bags[0], "--filter", "node:/base"], "there is no field"),
         ([bags[0], tmp_path / "none.mcap"], "none.mcap"),
     ):
         done = CliRunner().invoke(

@@ -29,6 +29,7 @@ SCREENS: dict[str, list[str]] = {
     "help": ["question_mark"],
     "plot": ["p"],
     "palette": ["ctrl+p"],
+    "overview": ["O"],
 }
 SCREENS_OF_TWO: dict[str, list[str]] = {"divergence": [], "report": ["v"], "plot_of_two": ["p"]}
 

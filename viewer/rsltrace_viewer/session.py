@@ -21,6 +21,7 @@ from rsltrace_viewer.model.inspector.lines import Line, Openness
 from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.lanes import Lanes
 from rsltrace_viewer.model.logs import Logs, mark_lanes, read_logs
+from rsltrace_viewer.model.overview import Overview, read_overview
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.parser import parse
@@ -72,13 +73,20 @@ class Session:
         self.effects: Effects | None = None
         self.base_ns = a.start_ns if a.since_epoch else 0
         """What times count from: the start of the run, where they would be those since 1970."""
-        runs = {"a": a} if b is None else {"a": a, "b": b}
+        runs = self.runs
         self._texts = {name: EventTexts(run, self.base_ns) for name, run in runs.items()}
         self.values = {name: RowValues(run) for name, run in runs.items()}
         self._names = self._short_names()
         self.lane_window = LaneWindow([run for run in (a, b) if run is not None])
         self.logs: dict[str, Logs] = {}
         """The log records of each run, once they are read."""
+        self.overviews: dict[str, Overview] = {}
+        """What is counted of each run so far, once counting was asked for."""
+
+    @property
+    def runs(self) -> dict[str, Run]:
+        """The runs by their names, ``a`` and ``b``."""
+        return {"a": self.a} if self.b is None else {"a": self.a, "b": self.b}
 
     def close(self) -> None:
         """Close the files."""
@@ -110,6 +118,7 @@ class Session:
         self.rows = AllRows(run.count)
         self.lane_window.replace_run(run)
         self.logs.clear()
+        self.overviews = {}  # another one: the old is still filled for a moment
         old.close()
 
     def next_side(self) -> str:
@@ -247,17 +256,31 @@ class Session:
 
     def look_through(self) -> Iterator[int]:
         """Read, a bit at a time, what the lanes need: how busy nodes are, and what went wrong."""
-        runs = {"a": self.a} if self.b is None else {"a": self.a, "b": self.b}
         for maker in self.lane_window.makers:
             for number in maker.order():
                 maker.summarise(number)
                 yield number
-        for (name, run), maker in zip(runs.items(), self.lane_window.makers, strict=True):
+        for (name, run), maker in zip(self.runs.items(), self.lane_window.makers, strict=True):
             logs = Logs([])
             for logs in read_logs(run):
                 yield len(logs.lines)
             yield from mark_lanes(run, maker, logs)
             self.logs[name] = logs
+
+    def survey(self) -> Iterator[float]:
+        """Count each run for its overview, a segment at a time; nothing if that is done, or under
+        way. The lanes are filled on the way. Yields the part of a run that is read."""
+        if self.overviews:
+            return iter(())
+        self.overviews.update((name, Overview()) for name in self.runs)
+        return self._survey(self.overviews)
+
+    def _survey(self, overviews: dict[str, Overview]) -> Iterator[float]:
+        for (name, run), maker in zip(self.runs.items(), self.lane_window.makers, strict=True):
+            for number, overviews[name] in enumerate(read_overview(run)):
+                if number < len(run.segments):
+                    maker.summarise(number)
+                yield overviews[name].share
 
     def _in_lanes(self) -> tuple[int, int] | None:
         here = self.current()

@@ -10,64 +10,96 @@ import numpy.typing as npt
 
 from rsltrace.errors import TraceError
 from rsltrace.model.built_in import is_built_in
+from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.counts import Series
 from rsltrace.words.entities import RUN_NAME
 from rsltrace.words.logs import LEVEL_WARN
+from rsltrace.words.silent_topics import silent_topics
 from rsltrace_viewer.model.logs import Logs
-from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.run import Run, Segment
 
 _LEVEL_ERROR = 40
+_DRAW = int(OutputKind.DRAW)
+_NOT_SENT = (_DRAW, int(OutputKind.ENTITY))
+_VALUE_BITS = np.uint64(encode_draw(1).bit_length() - 1)
+_VALUE = np.uint64(encode_draw(1) - 1)
+_LOST = (int(Draw.DROP), int(Draw.BURST), int(Draw.OUTAGE))
 
 
 @dataclass(slots=True)
-class Waiting:
-    """How long messages of an entity were on their way, in simulated ns."""
+class Times:
+    """Durations of an entity in simulated ns: how many, their sum, and the longest."""
 
     count: int = 0
     total_ns: int = 0
     most_ns: int = 0
+
+    @property
+    def mean_ns(self) -> int:
+        """The mean; there must be one."""
+        return self.total_ns // self.count
+
+
+@dataclass(slots=True)
+class Met:
+    """Something that events did: how often, and the first event that did."""
+
+    count: int = 0
+    first: int | None = None
+
+    def add(self, indexes: npt.NDArray[np.integer]) -> None:
+        """Add events by their indexes, which ascend."""
+        if len(indexes):
+            self.count += len(indexes)
+            self.first = int(indexes[0]) if self.first is None else self.first
 
 
 @dataclass(slots=True)
 class Overview:
     """Counts of a run, so far: ``share`` of it is read (0 to 1). Keys are ids of entities.
 
-    ``sent`` counts the messages of publishers, ``raised`` are the first events with exceptions.
+    ``sent`` counts the messages of publishers, ``waited`` is how long messages were on their way,
+    ``took`` how long callbacks took, where the job gives them execution times, ``paused`` how long
+    they waited themselves, in a call or a sleep.
     """
 
     events: dict[int, Series] = field(default_factory=dict)
     sent: dict[int, Series] = field(default_factory=dict)
-    waited: dict[int, Waiting] = field(default_factory=dict)
-    raised: list[int] = field(default_factory=list)
-    raised_count: int = 0
+    waited: dict[int, Times] = field(default_factory=dict)
+    took: dict[int, Times] = field(default_factory=dict)
+    paused: dict[int, Times] = field(default_factory=dict)
+    raised: Met = field(default_factory=Met)
+    lost: Met = field(default_factory=Met)
+    qos: Met = field(default_factory=Met)
     share: float = 0.0
 
 
 def read_overview(run: Run) -> Iterator[Overview]:
-    """Yield the counts of a run as they become known. What is damaged is left out."""
+    """Yield the counts of a run after each segment. What is damaged is left out."""
     found = Overview()
-    before: tuple[int, npt.NDArray[np.uint64]] = (0, np.zeros(0, dtype=np.uint64))
+    before: Segment | None = None
     for number in range(len(run.segments)):
+        found.share = (number + 1) / len(run.segments)
         try:
             segment, outputs = run.segment(number), run.segment_outputs(number)
         except TraceError:
+            yield found
             continue
         events, stamps = segment.events, segment.events["stamp"]
         _add(found.events, events["entity"], stamps)
-        places = (outputs["event"] - np.uint64(segment.first)).astype(np.intp)
-        _add(found.sent, outputs["entity"], stamps[places])
-        first, known = before[0], np.concatenate((before[1], stamps))
-        if first + len(before[1]) != segment.first:
-            first, known = segment.first, stamps
-        _add_waiting(found.waited, events, first, known)
-        before = segment.first, stamps
-        raised = np.flatnonzero(events["flags"] & int(EventFlag.RAISED))
-        found.raised_count += len(raised)
-        if len(found.raised) < 100:
-            found.raised += (raised[:100] + segment.first).tolist()
-        found.share = (number + 1) / len(run.segments)
+        draws = outputs[outputs["kind"] == _DRAW]
+        sent = outputs[~np.isin(outputs["kind"], _NOT_SENT)]
+        _add(found.sent, sent["entity"], stamps[(sent["event"] - np.uint64(segment.first))])
+        _add_since_causes(found, segment, before)
+        before = segment
+        kinds, values = draws["hash"] >> _VALUE_BITS, (draws["hash"] & _VALUE).astype(np.int64)
+        took = kinds == np.uint64(Draw.EXECUTION)
+        _add_times(found.took, draws["entity"][took], values[took])
+        found.lost.add(draws["event"][np.isin(kinds, _LOST)])
+        found.raised.add(events["index"][(events["flags"] & int(EventFlag.RAISED)) != 0])
+        found.qos.add(events["index"][events["kind"] == int(EventKind.QOS_EVENT)])
         yield found
     found.share = 1.0
     yield found
@@ -86,30 +118,41 @@ def _add(
         series.setdefault(entity, Series()).add(number, first_ns, last_ns)
 
 
-def _add_waiting(
-    waited: dict[int, Waiting],
-    events: npt.NDArray[np.void],
-    first: int,
-    stamps: npt.NDArray[np.uint64],
+def _add_since_causes(found: Overview, segment: Segment, before: Segment | None) -> None:
+    """Add how long after their causes events came, if these are in the segment or that before."""
+    first, known = segment.first, segment.events
+    if before is not None and before.last == first:
+        first, known = before.first, np.concatenate((before.events, known))
+    causes = segment.events["cause_event"]
+    own = segment.events[(causes != np.uint64(NO_EVENT)) & (causes >= np.uint64(first))]
+    causes = known[(own["cause_event"] - np.uint64(first)).astype(np.intp)]
+    took_ns = (own["stamp"] - causes["stamp"]).astype(np.int64)
+    resumed = own["kind"] == int(EventKind.RESUME)
+    waited = resumed & (causes["entity"] == own["entity"])
+    _add_times(found.waited, own["entity"][~resumed], took_ns[~resumed])
+    _add_times(found.paused, own["entity"][waited], took_ns[waited])
+
+
+def _add_times(
+    times: dict[int, Times], entities: npt.NDArray[np.uint32], took_ns: npt.NDArray[np.int64]
 ) -> None:
-    """Add the time from what caused an event to the event; ``stamps`` are those from ``first``."""
-    causes = events["cause_event"]
-    usable = (causes != np.uint64(NO_EVENT)) & (causes >= np.uint64(first))
-    own = events[usable]
-    sent = stamps[(causes[usable] - np.uint64(first)).astype(np.intp)]
-    took = (own["stamp"] - sent).astype(np.int64)
-    for entity in np.unique(own["entity"]).tolist():
-        mine = took[own["entity"] == entity]
-        wait = waited.setdefault(entity, Waiting())
-        wait.count += len(mine)
-        wait.total_ns += int(mine.sum())
-        wait.most_ns = max(wait.most_ns, int(mine.max()))
+    ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
+    total, most = np.zeros((2, len(ids)), dtype=np.int64)
+    np.add.at(total, places, took_ns)
+    np.maximum.at(most, places, took_ns)
+    rows = zip(ids.tolist(), counts.tolist(), total.tolist(), most.tolist(), strict=True)
+    for entity, number, total_ns, most_ns in rows:
+        known = times.setdefault(entity, Times())
+        known.count += number
+        known.total_ns += total_ns
+        known.most_ns = max(known.most_ns, most_ns)
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A node, callback or topic of the overview. ``share`` is its part of all events (or of all
-    messages), ``wait_ns`` the mean and longest time that its messages were on their way."""
+    """A node, callback or topic of the overview. ``share`` is its part of all events (of all
+    messages; of the simulated time, where ``took`` is known). ``waited`` says how long its messages
+    were on their way, ``took`` how long it ran, ``paused`` how long it waited while it ran."""
 
     name: str
     kind: str
@@ -117,51 +160,81 @@ class Part:
     count: int
     rate_hz: float | None
     share: float
-    wait_ns: tuple[int, int] | None = None
+    waited: Times | None = None
+    took: Times | None = None
+    paused: Times | None = None
 
 
 def nodes_of(run: Run, overview: Overview) -> list[Part]:
     """Return the nodes, the busiest first."""
-    total = sum(series.count for series in overview.events.values())
-    nodes: dict[str, Series] = {node.name: Series() for node in run.nodes}
+    nodes: dict[str, tuple[Series, Times]] = {node.name: (Series(), Times()) for node in run.nodes}
     for entity, series in overview.events.items():
         if entity:
-            own = nodes.setdefault(run.node_name(entity), Series())
-            own.add(series.count, series.first_ns, series.last_ns)
+            own = nodes.setdefault(run.node_name(entity), (Series(), Times()))
+            own[0].add(series.count, series.first_ns, series.last_ns)
+            took = overview.took.get(entity, Times())
+            own[1].count += took.count
+            own[1].total_ns += took.total_ns
+            own[1].most_ns = max(own[1].most_ns, took.most_ns)
     return _sorted(
-        Part(name, "node", name, one.count, one.rate_hz, one.count / max(total, 1))
-        for name, one in nodes.items()
+        Part(
+            name,
+            "node",
+            name,
+            series.count,
+            series.rate_hz,
+            _share(run, overview, series.count, took),
+            took=took if overview.took else None,
+        )
+        for name, (series, took) in nodes.items()
         if name != RUN_NAME
     )
 
 
 def callbacks_of(run: Run, overview: Overview) -> list[Part]:
     """Return what ran callbacks, the busiest first."""
-    total = sum(series.count for series in overview.events.values())
     parts = []
     for entity, series in overview.events.items():
         found = run.entities.get(entity)
         if found is None or found.kind in (EntityKind.SYSTEM, EntityKind.NODE):
             continue
-        waited = overview.waited.get(entity)
-        wait = None
-        if waited is not None and found.kind is EntityKind.SUBSCRIPTION:
-            wait = (waited.total_ns // waited.count, waited.most_ns)
-        name, node = run.entity_name(entity), run.node_name(entity)
-        share = series.count / max(total, 1)
-        parts.append(Part(name, found.kind.label, node, series.count, series.rate_hz, share, wait))
+        took = overview.took.get(entity, Times())
+        parts.append(
+            Part(
+                run.entity_name(entity),
+                found.kind.label,
+                run.node_name(entity),
+                series.count,
+                series.rate_hz,
+                _share(run, overview, series.count, took),
+                overview.waited.get(entity) if found.kind in _RECEIVERS else None,
+                took if overview.took else None,
+                overview.paused.get(entity),
+            )
+        )
     return _sorted(parts)
+
+
+_RECEIVERS = (EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
+
+
+def _share(run: Run, overview: Overview, count: int, took: Times) -> float:
+    """Return the part of the simulated time; without execution times, of all events."""
+    if overview.took:
+        return took.total_ns / max(run.end_ns - run.start_ns, 1)
+    return count / max(sum(series.count for series in overview.events.values()), 1)
 
 
 def topics_of(run: Run, overview: Overview) -> list[Part]:
     """Return the topics that messages were sent on, the busiest first."""
     topics: dict[tuple[str, str], Series] = {}
-    for entity, series in overview.sent.items():
-        found = run.entities.get(entity)
-        if found is None or found.kind is not EntityKind.PUBLISHER or is_built_in(found):
+    for entity in run.entities.values():
+        if entity.kind is not EntityKind.PUBLISHER or is_built_in(entity):
             continue
-        own = topics.setdefault((run.entity_name(entity), found.type), Series())
-        own.add(series.count, series.first_ns, series.last_ns)
+        own = topics.setdefault((run.entity_name(entity.id), entity.type), Series())
+        series = overview.sent.get(entity.id)
+        if series is not None:
+            own.add(series.count, series.first_ns, series.last_ns)
     total = sum(series.count for series in topics.values())
     return _sorted(
         Part(name, kind, "", one.count, one.rate_hz, one.count / max(total, 1))
@@ -170,29 +243,42 @@ def topics_of(run: Run, overview: Overview) -> list[Part]:
 
 
 def _sorted(parts: Iterator[Part] | Sequence[Part]) -> list[Part]:
-    return sorted(parts, key=lambda part: (-part.count, part.name))
+    return sorted(parts, key=lambda part: (-part.share, -part.count, part.name))
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """Something that went wrong: how often, and the key that goes from one to the next."""
+    """Something that went wrong: how often, and the key that goes from one to the next. ``first``
+    is the first event with it, ``filter`` what shows all of them."""
 
     what: str
     count: int
-    key: str
-    bad: bool
+    key: str = ""
+    bad: bool = False
     first: int | None = None
+    filter: str = ""
 
 
 def troubles_of(run: Run, overview: Overview, logs: Logs | None) -> list[Trouble]:
-    """Return what went wrong; things that did not happen are said, too."""
+    """Return what went wrong; the usual things also where they did not happen."""
     findings = run.trace.findings
-    first = overview.raised[0] if overview.raised else None
-    found = [Trouble("exceptions", overview.raised_count, "x", True, first)]
+    raised, lost, qos = overview.raised, overview.lost, overview.qos
+    found = [Trouble("exceptions", raised.count, "x", True, raised.first)]
     if logs is not None:
         errors = logs.count(_LEVEL_ERROR)
-        found.append(Trouble("errors logged", errors, "g", True))
-        found.append(Trouble("warnings logged", logs.count(LEVEL_WARN) - errors, "w", False))
+        warnings = logs.count(LEVEL_WARN) - errors
+        found.append(Trouble("errors logged", errors, "g", True, filter="level:error"))
+        found.append(Trouble("warnings logged", warnings, "w", filter="level:warn"))
     count = sum(len(one) for one in findings.values())
-    found.append(Trouble("findings of the guard", count, "u", False, min(findings, default=None)))
+    first = min(findings, default=None)
+    found.append(Trouble("findings of the guard", count, "u", first=first))
+    if lost.count:
+        found.append(Trouble("messages lost on the way", lost.count, first=lost.first))
+    if qos.count:
+        found.append(Trouble("QoS events", qos.count, first=qos.first, filter="kind:qos"))
     return found
+
+
+def unheard_of(run: Run) -> str:
+    """Return what is listened to and never published, in a sentence; empty if there is none."""
+    return silent_topics(run.entities.values())

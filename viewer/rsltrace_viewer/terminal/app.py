@@ -27,6 +27,7 @@ from rsltrace_viewer.terminal.keys import KEYS, keys_of
 from rsltrace_viewer.terminal.questions import parse_index, question_of
 from rsltrace_viewer.terminal.rerun_follower import RerunFollower
 from rsltrace_viewer.terminal.screens.help import HelpScreen
+from rsltrace_viewer.terminal.screens.overview import Choice, OverviewScreen
 from rsltrace_viewer.terminal.shell import SHARES, WIDE
 from rsltrace_viewer.terminal.stepping import Stepping
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
@@ -53,13 +54,21 @@ class ViewerApp(Stepping):
         follow: bool = False,
         filter_text: str = "",
         rerun: RerunFollower | None = None,
+        overview: bool = False,
     ) -> None:
-        """Show ``session``, at place ``start`` (None: where it is)."""
+        """Show ``session``, at place ``start`` (None: where it is); its ``overview`` first, if
+        that is wanted."""
         super().__init__(session, start=start, light=light)
+        self._overview_first = overview
         self._rerun = rerun
         self._first_filter = filter_text
         self._follow: Follow | None = None
         self._follow_at_once = follow
+
+    def on_mount(self) -> None:
+        """Show the overview first, if that was asked for."""
+        if self._overview_first and not self.session.empty:
+            self._push_overview(first=True)
 
     def first_shown(self) -> None:
         """Filter and follow, if that was asked for at the start."""
@@ -87,13 +96,15 @@ class ViewerApp(Stepping):
     def check_action(self, action: str, parameters: tuple[object, ...]) -> bool | None:
         """Some keys come before the pane that has the focus, but not while one types."""
         if action == "ask":
-            return not self.prompt.asking and len(self.screen_stack) == 1
+            alone = len(self.screen_stack) == 1 or isinstance(self.screen, OverviewScreen)
+            return not self.prompt.asking and alone
         if action == "pane":
             return not self.prompt.asking
         return True
 
     def action_ask(self, kind: str) -> None:
         """Ask for a search, a filter, a time or an index."""
+        self._leave_overview()
         self.prompt.ask(question_of(kind, self.session))
 
     def on_prompt_answered(self, event: Prompt.Answered) -> None:
@@ -215,6 +226,8 @@ class ViewerApp(Stepping):
 
     def action_pane(self, step: int) -> None:
         """Go to the next part of the screen."""
+        if self._leave_overview():
+            return
         if len(self.screen_stack) > 1:
             self.screen.focus_next()
             return
@@ -248,21 +261,32 @@ class ViewerApp(Stepping):
 
     def action_overview(self) -> None:
         """Show the run at a glance."""
-        from rsltrace_viewer.terminal.screens.overview import Choice, OverviewScreen
+        self._push_overview(first=False)
+        if not self.session.overviews:
+            walk(self, "overview", self.session.survey(), self._looked)
 
+    def _leave_overview(self) -> bool:
+        if not isinstance(self.screen, OverviewScreen):
+            return False
+        self.screen.dismiss(None)
+        return True
+
+    def _push_overview(self, *, first: bool) -> None:
         def chosen(choice: Choice | None) -> None:
             if choice is None:
                 return
             what, text = choice
             if what == "event":
                 self.go(self.session.view.place_of(int(text)), centre=True)
-                return
-            try:
-                self._filter(text)
-            except QueryError as error:
-                self.notify(f"{text}: {error}", severity="error")
+            elif what == "key":
+                self.call_next(self.run_action, text)
+            else:
+                try:
+                    self._filter(text)
+                except QueryError as error:
+                    self.notify(f"{text}: {error}", severity="error")
 
-        self.push_screen(OverviewScreen(self.session), chosen)
+        self.push_screen(OverviewScreen(self.session, first=first), chosen)
 
     def action_log(self) -> None:
         """Show all log records."""
@@ -393,13 +417,7 @@ class ViewerApp(Stepping):
         if run.trace.complete:
             self._follow, self.following = None, False
             self._say("the recording has ended")
-        walk(
-            self,
-            "lanes",
-            self.session.look_through(),
-            lambda _, done: self._show_lanes(),
-            at_once_s=0,
-        )
+        self.look_through()
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterator[SystemCommand]:
         """Offer all keys by their help in the command palette."""
@@ -409,6 +427,7 @@ class ViewerApp(Stepping):
 
     def _runner(self, action: str) -> Any:
         async def run() -> None:
+            self._leave_overview()
             await self.run_action(action)
 
         return run

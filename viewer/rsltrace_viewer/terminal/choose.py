@@ -1,9 +1,8 @@
-"""What to open when no trace was named: the traces of the folder, the newest first."""
+"""What to open when nothing was named: the traces and recordings of the folder, newest first."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
 
@@ -13,49 +12,11 @@ from textual.content import Content
 from textual.widgets import OptionList, Static
 from textual.widgets.option_list import Option
 
-from rsltrace.errors import RsltraceError
-from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration
-from rsltrace.trace.reader import Trace
+from rsltrace_viewer.model.cells import cells, fit
+from rsltrace_viewer.model.folder import Found
 
-_LOOKED_AT_MAX = 200
-_FOLDERS_DEEP = ("*.mcap", "*/*.mcap")
-
-
-@dataclass(frozen=True, slots=True)
-class Found:
-    """A trace of the folder."""
-
-    path: Path
-    events: int
-    duration_ns: int
-    digest: str
-    complete: bool
-
-    @property
-    def text(self) -> str:
-        """One line about it."""
-        state = "" if self.complete else "  not finished"
-        return (
-            f"{printable(str(self.path))}  {self.events:,} events  "
-            f"{format_duration(self.duration_ns)}  {self.digest}{state}"
-        )
-
-
-def traces_in(folder: Path) -> list[Found]:
-    """Return the traces in a folder and the folders in it, the newest first. Others are left out:
-    recordings that are no traces, and what cannot be read."""
-    paths = [path for pattern in _FOLDERS_DEEP for path in folder.glob(pattern) if path.is_file()]
-    paths.sort(key=lambda path: (-path.stat().st_mtime, str(path)))
-    found = []
-    for path in paths[:_LOOKED_AT_MAX]:
-        try:
-            with Trace.open(path) as trace:
-                length = trace.end_ns - trace.start_ns
-                found.append(Found(path, trace.event_count, length, trace.digest, trace.complete))
-        except RsltraceError:
-            continue
-    return found
+_MARK = 4
+_FRAME = 4
 
 
 class ChooseApp(App[list[Path]]):
@@ -74,14 +35,15 @@ class ChooseApp(App[list[Path]]):
     OptionList, OptionList:focus { height: 1fr; border: none; }
     """
 
-    def __init__(self, found: Sequence[Found]) -> None:
+    def __init__(self, found: Sequence[Found], *, light: bool = False) -> None:
         super().__init__()
         self._found = found
         self._marked: list[int] = []
+        self.theme = "textual-light" if light else "textual-dark"
 
     def compose(self) -> ComposeResult:
         """Make the list."""
-        yield Static("Traces of this folder: which one?")
+        yield Static("Traces and recordings of this folder: which one?")
         yield OptionList(*(Option(Content(self._text(i))) for i in range(len(self._found))))
         yield Static("Enter opens   Space marks one to compare with   q quits")
 
@@ -89,22 +51,39 @@ class ChooseApp(App[list[Path]]):
         """Take the first."""
         self.query_one(OptionList).highlighted = 0
 
+    def on_resize(self) -> None:
+        """Use the width there is."""
+        self._show()
+
     def _text(self, place: int) -> str:
-        mark = f"[{'ab'[self._marked.index(place)]}]" if place in self._marked else "   "
-        return f"{mark} {self._found[place].text}"
+        mark = f"[{'ab'[self._marked.index(place)]}] " if place in self._marked else ""
+        columns = [(one.name, one.amount, one.length, one.what) for one in self._found]
+        name, amount, length, what = (
+            max(map(cells, column)) for column in zip(*columns, strict=True)
+        )
+        room = self.size.width - _FRAME - _MARK - amount - length - what - 3 * 2
+        row = self._found[place]
+        return (
+            f"{fit(mark, _MARK)}{fit(row.name, min(name, max(room, 20)))}  "
+            f"{fit(row.amount, amount, right=True)}  {fit(row.length, length, right=True)}  "
+            f"{row.what}"
+        )
+
+    def _show(self) -> None:
+        options = self.query_one(OptionList)
+        for number in range(len(self._found)):
+            options.replace_option_prompt_at_index(number, Content(self._text(number)))
 
     def action_mark(self) -> None:
         """Mark or unmark."""
-        options = self.query_one(OptionList)
-        place = options.highlighted
+        place = self.query_one(OptionList).highlighted
         if place is None:
             return
         if place in self._marked:
             self._marked.remove(place)
         else:
             self._marked = [*self._marked[-1:], place]
-        for number in range(len(self._found)):
-            options.replace_option_prompt_at_index(number, Content(self._text(number)))
+        self._show()
 
     def action_move(self, step: int) -> None:
         """Move in the list."""

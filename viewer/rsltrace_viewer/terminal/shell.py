@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from itertools import chain
 from time import perf_counter
 from typing import Any
 
@@ -24,7 +25,8 @@ from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.source import Source, source_of
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.background import walk
-from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar
+from rsltrace_viewer.terminal.screens.overview import OverviewScreen
+from rsltrace_viewer.terminal.widgets.bars import FooterBar, HeaderBar, verdict_lines
 from rsltrace_viewer.terminal.widgets.inspector import Inspector
 from rsltrace_viewer.terminal.widgets.lanes import LanesView
 from rsltrace_viewer.terminal.widgets.prompt import Prompt
@@ -133,19 +135,29 @@ class Shell(App[None]):
         self._show_values()
         self.busy = False
         self.first_shown()
-        walk(
-            self,
-            "lanes",
-            self.session.look_through(),
-            lambda _, done: self._show_lanes(),
-            at_once_s=0,
-        )
+        self.look_through()
         comparison = self.session.comparison
         if comparison is not None and not comparison.identical:
             self.run_worker(self._explain, group="diff", thread=True, exit_on_error=False)
 
     def first_shown(self) -> None:
         """Do what was asked for at the start, once the first screen is there."""
+
+    def look_through(self) -> None:
+        """Read the runs in the background for what lanes, log and overview show."""
+        overview = self.overview
+        steps = () if overview is None else self.session.survey()
+        walk(self, "lanes", chain(steps, self.session.look_through()), self._looked, at_once_s=0)
+
+    def _looked(self, _: float | None, done: bool) -> None:
+        self._show_lanes()
+        if self.overview is not None:
+            self.overview.update_lines()
+
+    @property
+    def overview(self) -> OverviewScreen | None:
+        """The overview, if one looks at it."""
+        return next((one for one in self.screen_stack if isinstance(one, OverviewScreen)), None)
 
     def _explain(self) -> None:
         """Let the diff find the reason, then match the rest of the runs. Runs in a thread."""
@@ -231,7 +243,7 @@ class Shell(App[None]):
             self._mode(),
             verdict,
             bad=bad,
-            lines=2 if size.height >= 20 else 1 if size.height >= 10 else 0,
+            lines=verdict_lines(size.height),
             width=size.width,
         )
 

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
+
 from rsltrace_viewer.model.query.fields import FIELDS
 from rsltrace_viewer.model.run import Run
+
+Choices = Mapping[str, Callable[[], list[str]]]
+"""What could follow each field."""
 
 
 def completions(text: str, run: Run) -> list[str]:
     """Return what ``text`` could become by finishing its last word, most likely first."""
+    return complete(text, {name: partial(field.choices, run) for name, field in FIELDS.items()})
+
+
+def complete(text: str, fields: Choices) -> list[str]:
+    """Return what ``text`` could become in a language with these fields."""
     head, word = _last_word(text)
     sign = "-" if word.startswith("-") else ""
     name, colon, value = word[len(sign) :].partition(":")
     if not colon:
         if not name:
             return []
-        return [f"{head}{sign}{field}:" for field in FIELDS if field.startswith(name.lower())]
-    field = FIELDS.get(name.lower())
-    if field is None:
+        return [f"{head}{sign}{field}:" for field in fields if field.startswith(name.lower())]
+    find = fields.get(name.lower())
+    if find is None:
         return []
     done, comma, last = value.rpartition(",")
-    choices = field.choices(run)
+    choices = find()
     folded = last.casefold()
     begins = [c for c in choices if c.casefold().startswith(folded)]
     contains = [c for c in choices if folded and folded in c.casefold() and c not in begins]

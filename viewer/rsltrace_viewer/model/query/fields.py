@@ -108,8 +108,13 @@ def _read_out(run: Run, token: Token) -> Condition:
     return conditions.WithOutput(frozenset(OutputKind(kind) for kind in kinds))
 
 
+def level_of(token: Token) -> int:
+    """Read a level of log records, of several the least. Raises QueryError."""
+    return min(_choose(token, LOG_LEVELS, "level"))
+
+
 def _read_level(run: Run, token: Token) -> Condition:
-    return conditions.log_at_least(min(_choose(token, LOG_LEVELS, "level")))
+    return conditions.log_at_least(level_of(token))
 
 
 _STATES: dict[str, Condition] = {
@@ -129,7 +134,8 @@ def _read_is(run: Run, token: Token) -> Condition:
     return found[0] if len(found) == 1 else conditions.Any(tuple(found))
 
 
-def _index(text: str) -> int:
+def whole_number(text: str) -> int:
+    """Read a whole number. Raises ValueError."""
     if not text.isdecimal():
         raise ValueError(f"{text!r} is no whole number")
     return min(int(text), LARGEST)
@@ -140,7 +146,7 @@ def _read_time(run: Run, token: Token) -> Condition:
 
 
 def _read_index(run: Run, token: Token) -> Condition:
-    return conditions.Between("index", *number_range(token, _index, "an index"))
+    return conditions.Between("index", *number_range(token, whole_number, "an index"))
 
 
 def _read_hash(run: Run, token: Token) -> Condition:

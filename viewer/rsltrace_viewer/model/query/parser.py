@@ -9,6 +9,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Generic, TypeVar
+
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.fields import FIELDS, bare_word
@@ -16,28 +21,56 @@ from rsltrace_viewer.model.query.message_text import MessageText
 from rsltrace_viewer.model.query.tokens import QueryError, Token, tokens
 from rsltrace_viewer.model.run import Run
 
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Language(Generic[T]):
+    """What the terms of a filter mean: of its ``fields`` by name, of a ``bare`` word, and of terms
+    taken together. All of these raise QueryError."""
+
+    fields: Mapping[str, Callable[[Token], T]]
+    bare: Callable[[Token], T]
+    negated: Callable[[T], T]
+    all_of: Callable[[Sequence[T]], T]
+    any_of: Callable[[Sequence[T]], T]
+
 
 def parse(text: str, run: Run) -> Condition | None:
     """Return the condition that ``text`` stands for in a trace; None if it is empty.
 
     Raises QueryError.
     """
+    return read(
+        text,
+        Language[Condition](
+            {name: partial(field.read, run) for name, field in FIELDS.items()},
+            partial(bare_word, run),
+            conditions.Not,
+            lambda parts: conditions.All(tuple(sorted(parts, key=_cost))),
+            lambda parts: conditions.Any(tuple(parts)),
+        ),
+    )
+
+
+def read(text: str, language: Language[T]) -> T | None:
+    """Return what ``text`` stands for in a language; None if it is empty. Raises QueryError."""
     try:
-        return _Parser(text, run).whole()
+        return _Parser(text, language).whole()
     except RecursionError:
         raise QueryError("brackets and negations are nested too deeply", 0, len(text)) from None
 
 
-class _Parser:
+class _Parser(Generic[T]):
     """Reads ``or`` of ``and`` of terms, by recursive descent."""
 
-    def __init__(self, text: str, run: Run) -> None:
+    def __init__(self, text: str, language: Language[T]) -> None:
         self._tokens = tokens(text)
         self._length = len(text)
         self._place = 0
-        self._run = run
+        self._language = language
 
-    def whole(self) -> Condition | None:
+    def whole(self) -> T | None:
         if not self._tokens:
             return None
         condition = self._alternatives()
@@ -49,15 +82,15 @@ class _Parser:
     def _peek(self) -> Token | None:
         return self._tokens[self._place] if self._place < len(self._tokens) else None
 
-    def _alternatives(self) -> Condition:
+    def _alternatives(self) -> T:
         parts = [self._conjunction()]
         while (token := self._peek()) is not None and token.text.lower() == "or":
             self._place += 1
             parts.append(self._conjunction())
-        return parts[0] if len(parts) == 1 else conditions.Any(tuple(parts))
+        return parts[0] if len(parts) == 1 else self._language.any_of(parts)
 
-    def _conjunction(self) -> Condition:
-        parts: list[Condition] = []
+    def _conjunction(self) -> T:
+        parts: list[T] = []
         while (token := self._peek()) is not None and token.text.lower() not in ("or", ")"):
             if token.text.lower() == "and":
                 self._place += 1
@@ -67,10 +100,9 @@ class _Parser:
             token = self._peek()
             start = token.start if token else self._length
             raise QueryError("something to look for is missing here", start, start + 1)
-        parts.sort(key=_cost)
-        return parts[0] if len(parts) == 1 else conditions.All(tuple(parts))
+        return parts[0] if len(parts) == 1 else self._language.all_of(parts)
 
-    def _term(self) -> Condition:
+    def _term(self) -> T:
         token = self._peek()
         if token is None:
             raise QueryError(
@@ -78,7 +110,7 @@ class _Parser:
             )
         self._place += 1
         if token.text.lower() == "not" or token.text == "-":
-            return conditions.Not(self._term())
+            return self._language.negated(self._term())
         if token.text == "(":
             inner = self._alternatives()
             closing = self._peek()
@@ -89,16 +121,17 @@ class _Parser:
         if token.text == ")":
             raise QueryError("there is no opening bracket for this", token.start, token.end)
         if token.text.startswith("-"):
-            return conditions.Not(self._condition(Token(token.text[1:], token.start + 1)))
+            inner = self._condition(Token(token.text[1:], token.start + 1))
+            return self._language.negated(inner)
         return self._condition(token)
 
-    def _condition(self, token: Token) -> Condition:
+    def _condition(self, token: Token) -> T:
         name, colon, _ = token.text.partition(":")
         if not colon or '"' in name or "/" in name:
-            return bare_word(self._run, token)
-        field = FIELDS.get(name.lower())
+            return self._language.bare(token)
+        field = self._language.fields.get(name.lower())
         if field is None:
-            known = ", ".join(FIELDS)
+            known = ", ".join(self._language.fields)
             raise QueryError(
                 f"there is no field {name!r}; there are {known}",
                 token.start,
@@ -107,7 +140,7 @@ class _Parser:
         rest = Token(token.text[len(name) + 1 :], token.start + len(name) + 1)
         if not rest.text:
             raise QueryError(f"a value is missing after {name}:", rest.start, rest.start + 1)
-        return field.read(self._run, rest)
+        return field(rest)
 
 
 def _cost(condition: Condition) -> int:

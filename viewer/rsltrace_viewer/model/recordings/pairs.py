@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from copy import copy
+
 import numpy as np
 import numpy.typing as npt
 
@@ -39,6 +42,20 @@ class Pairs:
         self.a, self.b = np.concatenate(parts_a), np.concatenate(parts_b)
         self.differs = np.concatenate(differs)
 
+    def of_masks(self, masks: Sequence[npt.NDArray[np.bool_]]) -> npt.NDArray[np.bool_]:
+        """Return the rows with a message for which the mask of its recording says yes."""
+        found = np.zeros(self.count, dtype=np.bool_)
+        for places, mask in zip((self.a, self.b), masks, strict=False):
+            there = places >= 0
+            found[there] |= mask[places[there]]
+        return found
+
+    def only(self, rows: npt.NDArray[np.bool_]) -> Pairs:
+        """Return these rows alone."""
+        found = copy(self)
+        found.a, found.b, found.differs = self.a[rows], self.b[rows], self.differs[rows]
+        return found
+
     @property
     def count(self) -> int:
         """How many rows there are."""
@@ -48,6 +65,15 @@ class Pairs:
         """Return the numbers of the messages in a row."""
         a, b = int(self.a[row]), int(self.b[row])
         return (a if a >= 0 else None), (b if b >= 0 else None)
+
+    def row_of(self, at: tuple[int | None, int | None]) -> int | None:
+        """Return the row with the messages of these numbers (None: whatever there is)."""
+        there = np.ones(self.count, dtype=np.bool_)
+        for places, number in zip((self.a, self.b), at, strict=True):
+            if number is not None:
+                there &= places == number
+        rows = np.flatnonzero(there)
+        return int(rows[0]) if len(rows) else None
 
     def sign(self, row: int) -> Sign:
         """Return how a row compares, as far as its bytes tell."""

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Iterator
+
+import numpy as np
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.result.bags import BagDiff
@@ -12,14 +15,14 @@ from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.decode import to_plain
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.inspector.message_tree import message_lines
+from rsltrace_viewer.model.recordings.filter import read_filter
+from rsltrace_viewer.model.recordings.matches import Key, Matches
 from rsltrace_viewer.model.recordings.pairs import Pairs
 from rsltrace_viewer.model.recordings.recording import Recording, Topic
 from rsltrace_viewer.model.timeline.message_values import differing_values, message_values
 from rsltrace_viewer.model.view import Sign
 
 _PREVIEW_BYTES = 1 << 16
-Key = tuple[str, str]
-"""A topic by its name and type."""
 
 
 class RecordingSession:
@@ -28,17 +31,26 @@ class RecordingSession:
     def __init__(self, a: Recording, b: Recording | None = None) -> None:
         self.recordings = [a] if b is None else [a, b]
         self.keys: list[Key] = []
+        """The topics that are shown."""
         self._by_key: list[dict[Key, Topic]] = []
         for recording in self.recordings:
             topics = {(topic.name, topic.type): topic for topic in recording.topics}
             self._by_key.append(topics)
             self.keys += [key for key in topics if key not in self.keys]
+        self._all_keys = self.keys
         self.place = 0
         self.row = 0
         self.openness = Openness()
         self.diff: BagDiff | None = None
         self.damage = ""
-        self._pairs: dict[tuple[Key, int], Pairs] = {}
+        self.filter_text = ""
+        self.search_text = ""
+        self._filter: Matches | None = None
+        self._search: Matches | None = None
+        self._kept: tuple[Key | None, tuple[int | None, int | None]] = (None, (None, None))
+        self._left_at = (0, 0)
+        """Which message the filter should leave selected, and where it did."""
+        self._pairs: tuple[object, Pairs] = (None, Pairs(None, None))
 
     @property
     def two(self) -> bool:
@@ -69,37 +81,127 @@ class RecordingSession:
     @property
     def pairs(self) -> Pairs:
         """The rows of the selected topic, as far as they are known."""
-        if not self.keys:
+        if not self.keys or (self.two and not self.done):
             return Pairs(None, None)
         key = self.keys[self.place]
+        state = key, self._length(key), self._filter
+        if self._pairs[0] != state:
+            self._pairs = state, self._pairs_of(key)
+        return self._pairs[1]
+
+    def _pairs_of(self, key: Key) -> Pairs:
         found = self.topics(key)
-        known = sum(len(topic.stamps) for topic in found if topic is not None)
-        if (key, known) not in self._pairs:
-            self._pairs = {
-                (key, known): Pairs(found[0], found[1] if self.two else None)
-                if self.done or not self.two
-                else Pairs(None, None)
-            }
-        return self._pairs[key, known]
+        pairs = Pairs(found[0], found[1] if self.two else None)
+        masks = self._filter.masks(key) if self._filter is not None else None
+        return pairs if masks is None else pairs.only(pairs.of_masks(masks))
+
+    def _length(self, key: Key) -> int:
+        return sum(len(topic.stamps) for topic in self.topics(key) if topic is not None)
+
+    # Filters and searches.
+
+    def set_filter(self, text: str) -> Iterator[int]:
+        """Show only messages that a filter means (empty: all). Raises QueryError.
+
+        Finding them goes on with the iterator, which yields how many were looked at, and raises
+        BagError or TraceError; ``show_found`` shows what is found by then.
+        """
+        condition = read_filter(text, self.recordings)
+        self.filter_text = text.strip()
+        self._kept, self._left_at = self._selected(), (self.place, self.row)
+        matches = self._filter = Matches(condition) if condition is not None else None
+        self.show_found()
+        return iter(()) if matches is None else self._look(matches)
+
+    def _look(self, matches: Matches) -> Iterator[int]:
+        before = 0
+        for key in self._all_keys:
+            for looked in matches.look(key, self._sides(key)):
+                yield before + looked
+            before += self._length(key)
+
+    def show_found(self) -> None:
+        """Show the topics with messages that the filter is known to mean; the selected message
+        stays selected, and is again once it is among them."""
+        if (self.place, self.row) != self._left_at:
+            self._kept = self._selected()
+        found = self._filter
+        self.keys = [key for key in self._all_keys if found is None or any(found.counts(key))]
+        key, at = self._kept
+        there = key in self.keys
+        self.place = self.keys.index(key) if key is not None and there else 0
+        self.row = (self.pairs.row_of(at) or 0) if there else 0
+        self._left_at = self.place, self.row
+
+    def _selected(self) -> tuple[Key | None, tuple[int | None, int | None]]:
+        if not self.keys:
+            return None, (None, None)
+        at = self.pairs.at(self.row) if self.row < self.pairs.count else (None, None)
+        return self.keys[self.place], at
+
+    @property
+    def found_count(self) -> int:
+        """How many messages the filter is known to mean."""
+        found = self._filter
+        return 0 if found is None else sum(sum(found.counts(key)) for key in self._all_keys)
+
+    def set_search(self, text: str) -> None:
+        """Set what ``seek`` looks for (empty: nothing). Raises QueryError."""
+        condition = read_filter(text, self.recordings)
+        self._search = Matches(condition) if condition is not None else None
+        self.search_text = text.strip()
+
+    def seek(self, step: int) -> Iterator[tuple[int, int] | int]:
+        """Look for the next message (``step`` -1: the previous) that the search means, on this
+        topic and then on the others. Yields how many were looked at, and at last the topic's
+        place and the row, if there is such a message. Raises BagError, TraceError."""
+        search, keys, here, at_row = self._search, self.keys, self.place, self.row
+        if search is None or not keys:
+            return
+        looked = 0
+        for away in range(len(keys) + 1):
+            place = (here + step * away) % len(keys)
+            for count in search.look(keys[place], self._sides(keys[place])):
+                yield looked + count
+            looked += self._length(keys[place])
+            masks = search.masks(keys[place]) or []
+            rows = np.flatnonzero(self._pairs_of(keys[place]).of_masks(masks))
+            if away == 0:
+                rows = rows[rows > at_row] if step > 0 else rows[rows < at_row]
+            if len(rows):
+                yield place, int(rows[0] if step > 0 else rows[-1])
+                return
+
+    def _sides(self, key: Key) -> list[tuple[Recording, Topic | None]]:
+        return list(zip(self.recordings, self.topics(key), strict=True))
 
     # Rows, in words.
 
     def topic_text(self, place: int) -> tuple[str, str, list[str], bool]:
         """Return name, type, (count and rate) in each recording, and whether these differ."""
-        name, type_name = self.keys[place]
-        topics = self.topics((name, type_name))
+        key = name, type_name = self.keys[place]
+        topics = self.topics(key)
         texts = []
-        for topic in topics:
+        for number, topic in enumerate(topics):
             if topic is None:
                 texts.append("-")
                 continue
             rate = "" if topic.rate_hz is None else f"{topic.rate_hz:.4g} Hz"
-            texts.append(f"{len(topic.stamps):,}  {rate:>8}")
+            found = self._filter.counts(key) if self._filter is not None else []
+            if found:
+                texts.append(f"{found[number]:,} of {len(topic.stamps):,}")
+            else:
+                texts.append(f"{len(topic.stamps):,}  {rate:>8}")
         counts = {len(topic.stamps) if topic is not None else -1 for topic in topics}
         differ = self.done and len(counts) > 1
         if self.diff is not None:
             differ = differ or any(t.topic == name and t.diverged for t in self.diff.topics)
         return printable(name), printable(type_name), texts, differ
+
+    def number_of(self, row: int) -> int:
+        """Return the number of a row's message on its topic, in recording a where it is there."""
+        a, b = self.pairs.at(row)
+        return a if a is not None else b or 0
 
     def message_text(self, row: int) -> tuple[str, Sign | None, list[str]]:
         """Return the time of a row, how it compares, and the values in each recording."""
@@ -175,6 +277,36 @@ class RecordingSession:
                 lines.append(Line(1, "", printable(str(error)), Role.ERROR, f"{name}.error"))
             yield lines
         yield lines
+
+    # Going somewhere.
+
+    def go_to_time(self, since_ns: int) -> None:
+        """Select the first message of the topic at a time since the start or later; the last, if
+        there is none."""
+        topic, pairs = self.topics(self.keys[self.place])[0] if self.keys else None, self.pairs
+        if topic is None or not pairs.count:
+            return
+        place = bisect_left(topic.stamps, self.recordings[0].start_ns + since_ns)
+        later = np.flatnonzero(pairs.a >= place)
+        self.row = int(later[0]) if len(later) else pairs.count - 1
+
+    def go_to_message(self, number: int | None, since_ns: int = 0) -> None:
+        """Select a message of the first recording by its number in the order of time, or the first
+        at a time since the start or later; the last, if there is none."""
+        recording = self.recordings[0]
+        stamps = [np.array(topic.stamps, dtype=np.int64) for topic in recording.topics]
+        every = np.concatenate([*stamps, np.zeros(0, dtype=np.int64)])
+        if not len(every):
+            return
+        order = np.argsort(every, kind="stable")
+        if number is None:
+            number = int(np.searchsorted(every[order], recording.start_ns + since_ns))
+        found = int(order[min(number, len(every) - 1)])
+        ends = np.cumsum([len(one) for one in stamps])
+        which = int(np.searchsorted(ends, found, side="right"))
+        topic = recording.topics[which]
+        self.place = self.keys.index((topic.name, topic.type))
+        self.row = self.pairs.row_of((found - int(ends[which]) + len(stamps[which]), None)) or 0
 
     # Words about all of it.
 

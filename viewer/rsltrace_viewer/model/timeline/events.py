@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from rsltrace.errors import TraceError
+from rsltrace.model.draw import Draw, duration_of
 from rsltrace.model.event import Event, EventFlag, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
@@ -109,6 +110,11 @@ def event_text(run: Run, event: Event) -> str:
     return f"{event.index}  {node_of(run, event)} {kind} {entity_of(run, event)}".rstrip()
 
 
+def _is_execution_time(output: Output) -> bool:
+    is_draw = output.kind is OutputKind.DRAW
+    return is_draw and duration_of(output.hash, Draw.EXECUTION) is not None
+
+
 def outputs_text(
     run: Run,
     outputs: Sequence[Output],
@@ -118,7 +124,9 @@ def outputs_text(
     """Return what an event did as one line; ``more`` gives what else to say of an output."""
     parts: list[str] = []
     length = 0
-    for text in run.words.outputs(outputs, more):
+    # How long a callback took says least of what it did.
+    ordered = sorted(outputs, key=_is_execution_time)
+    for text in run.words.outputs(ordered, more):
         parts.append(text)
         length += len(text)
         if length > width:

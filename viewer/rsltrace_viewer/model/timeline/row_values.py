@@ -51,7 +51,7 @@ class RowValues:
         try:
             event = run.event(index)
             outputs = run.outputs(index)
-            if outputs:
+            if any(output.kind is not OutputKind.DRAW for output in outputs):
                 budget = iter(range(_OUTPUTS_MAX))
                 return outputs_text(
                     run, outputs, more=lambda o: "" if next(budget, None) is None else self._of(o)
@@ -60,7 +60,8 @@ class RowValues:
             if source is None or source.kind not in _MESSAGES:
                 return ""
             values = self._of(source)
-            return f"got {values}" if values else ""
+            drawn = outputs_text(run, outputs)
+            return ", ".join(filter(None, (values and f"got {values}", drawn)))
         except TraceError:
             return ""  # the row says what is wrong, without values
 

@@ -2,179 +2,287 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import ClassVar
 
+from textual import events
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.content import Content
 from textual.screen import Screen
 from textual.widgets import Static
 
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
-from rsltrace_viewer.model.cells import fit, wrap
+from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.overview import (
     Overview,
     Part,
+    Times,
+    Trouble,
     callbacks_of,
     nodes_of,
-    read_overview,
     topics_of,
     troubles_of,
+    unheard_of,
 )
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.session import Session
-from rsltrace_viewer.terminal.background import walk
+from rsltrace_viewer.terminal.keys import KEYS
+from rsltrace_viewer.terminal.widgets.bars import HeaderBar
 from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
 
 _BAR = 12
-_CALLBACKS_MAX = 12
 _NUMBERS = 19
-_WAITS = 24
+_TIMES = 24
+_WHAT = 26
+_WIDTH_MAX = 140
+_NAMES_LEAST = 26
+_LINES_LEAST = 5
+_OTHER_LINES = 16
+_UNTIMED = "Callbacks take no simulated time in this job (execution: gives them some)."
+_FIRST = "↓↑ Enter shows the events of a line   Esc all events   ? keys   q quits"
+_LATER = "↓↑ Enter shows the events of a line   Esc closes"
+_OWN_KEYS = ("help", "theme", "overview", "escape", "quit", "enter", "yank")
 Choice = tuple[str, str]
-"""What was chosen: ``filter`` with its text, or ``event`` with a number."""
-_Make = Callable[[Run, Overview], Sequence[Part]]
+"""What was chosen: ``filter`` with its text, ``event`` with a number, ``key`` with the action that
+a key has among the events, ``more`` with the table to be shown whole."""
+_Line = tuple[Pieces, Choice | None]
+_Row = Sequence[Part | None]
+"""The same node, topic or callback in each run."""
 
 
 class OverviewScreen(Screen[Choice | None]):
-    """Gives what to go to, or None."""
+    """Gives what to go to, or None. What it shows is counted by ``Session.survey``."""
 
-    BINDINGS: ClassVar[list[BindingType]] = [Binding("escape,q,O", "dismiss(None)", "close")]
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape,O", "dismiss(None)", "close"),
+        Binding("q", "leave", "close"),
+        Binding("y", "yank", "copy"),
+    ]
     DEFAULT_CSS = """
-    OverviewScreen Static { background: $panel; padding: 0 1; height: 1; }
+    OverviewScreen #keys { background: $panel; padding: 0 1; height: 1; }
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, *, first: bool) -> None:
+        """Show a session; ``first``: before anything else of it was shown."""
         super().__init__()
         self._session = session
-        runs = (session.a,) if session.b is None else (session.a, session.b)
-        self._runs = [(run, Overview()) for run in runs]
-        self._lines: list[tuple[Pieces, Choice | None]] = []
+        self._first = first
+        self._whole: set[str] = set()
+        self._lines: list[_Line] = []
 
     def compose(self) -> ComposeResult:
         """Make the parts."""
-        yield Static(id="what")
+        yield HeaderBar(id="what")
         yield ListView(id="lines")
-        yield Static("↑↓ choose   Enter shows the events of it   Esc closes")
+        yield Static(_FIRST if self._first else _LATER, id="keys")
 
     def on_mount(self) -> None:
-        """Count in the background, and show what is known."""
+        """Show what is known."""
         self.query_one(ListView).focus()
-        self._show()
-        readers = [read_overview(run) for run, _ in self._runs]
-
-        def steps() -> object:
-            for place, reader in enumerate(readers):
-                for found in reader:
-                    self._runs[place] = (self._runs[place][0], found)
-                    yield place
-
-        walk(self.app, "overview", iter(steps()), lambda _, done: self._show())  # type: ignore[call-overload]
+        self.update_lines()
 
     def on_resize(self) -> None:
         """Use the width there is."""
-        self._show()
+        self.update_lines()
 
-    def _show(self) -> None:
-        if not self.is_attached:
+    def on_key(self, event: events.Key) -> None:
+        """A key of the events: go there, and do what it does."""
+        pressed = [key for key in KEYS if event.key in key.keys.split(",")]
+        if pressed and not pressed[0].action.startswith(_OWN_KEYS):
+            event.stop()
+            self.dismiss(("key", f"app.{pressed[0].action}"))
+
+    async def action_leave(self) -> None:
+        """Leave the viewer, if there was nothing before this screen."""
+        if self._first:
+            await self.app.action_quit()
+        else:
+            self.dismiss(None)
+
+    def action_yank(self) -> None:
+        """Copy the line under the cursor."""
+        text = "".join(piece for piece, _ in self._lines[self.query_one(ListView).cursor][0])
+        self.app.copy_to_clipboard(text.strip())
+        self.app.notify(f"copied: {text.strip()}")
+
+    def update_lines(self) -> None:
+        """Show what is known by now."""
+        if not self.query(ListView):  # it is about to be there, or was closed
             return
         session = self._session
-        share = min(overview.share for _, overview in self._runs)
-        state = "" if share >= 1 else f"  {share:.0%} read"
-        title = f"overview  {session.title()}  {session.facts()}{state}"
-        self.query_one("#what", Static).update(Content(title))
-        self._lines = [*self._troubles(), ((), None)]
-        self._lines += self._table("nodes", nodes_of, "node")
-        self._lines += [((), None), *self._table("topics", topics_of, "topic")]
-        self._lines += [
-            ((), None),
-            *self._table("callbacks", callbacks_of, "entity", _CALLBACKS_MAX),
-        ]
+        runs = [(run, session.overviews.get(name, Overview())) for name, run in _named(session)]
+        share = min(overview.share for _, overview in runs)
+        self.query_one(HeaderBar).show(
+            session.title(),
+            session.facts() if share >= 1 else f"{share:.0%} read  {session.facts()}",
+            "overview" if session.b is None else "overview of a and b",
+            "",
+            bad=False,
+            lines=0,
+            width=self.app.size.width,
+        )
+        self._lines = [*self._verdict(), *self._troubles(runs), ((), None), *self._tables(runs)]
         self.query_one(ListView).show(lambda line: self._lines[line][0], len(self._lines))
 
-    def _troubles(self) -> list[tuple[Pieces, Choice | None]]:
-        session = self._session
-        lines: list[tuple[Pieces, Choice | None]] = []
-        if session.comparison is not None:
-            style = "good" if session.comparison.identical else "error"
-            width = max(self.app.size.width - 4, 20)
-            verdict = printable(session.comparison.verdict())
-            lines += [(((line, style),), None) for line in wrap(verdict, width)]
-        names = ("a", "b")
+    def _verdict(self) -> Iterator[_Line]:
+        comparison = self._session.comparison
+        if comparison is not None:
+            style = "good" if comparison.identical else "error"
+            verdict = printable(comparison.verdict())
+            for line in wrap(verdict, max(self.app.size.width - 4, 20)):
+                yield ((line, style),), None
+
+    def _troubles(self, runs: Sequence[tuple[Run, Overview]]) -> Iterator[_Line]:
+        logs = self._session.logs
         found = [
-            troubles_of(run, overview, session.logs.get(names[place]))
-            for place, (run, overview) in enumerate(self._runs)
+            {one.what: one for one in troubles_of(run, overview, logs.get(name))}
+            for name, (run, overview) in zip("ab", runs, strict=False)
         ]
-        lines.append((((fit("what went wrong", 26), "title"), *self._heads()), None))
-        for row in zip(*found, strict=False):
-            worst = any(one.count for one in row)
-            style = ("error" if row[0].bad else "warning") if worst else "muted"
-            pieces = [(fit(row[0].what, 26), style)]
-            pieces += [(f"{one.count:>10,}", style if one.count else "muted") for one in row]
-            pieces.append((f"   {row[0].key} goes from one to the next" if worst else "", "muted"))
-            first = row[0].first
-            lines.append((pieces, ("event", str(first)) if first is not None else None))
-        for place, (run, _) in enumerate(self._runs):
-            code = run.trace.result.get("exit_code", "0")
-            why = printable(run.trace.result.get("stop_reason", "not finished"))
-            text = f"{'run ' + names[place] if len(self._runs) > 1 else 'the run'} ended: {why}"
-            style = "plain" if code == "0" else "error"
-            if code != "0":
-                text += f", exit code {printable(code)}"
-            lines.append((((text, style),), None))
-        return lines
+        heads = [(f"{f'run {name}':>10}", "muted") for name in "ab"] if len(runs) > 1 else []
+        whole = all(overview.share >= 1 for _, overview in runs) and len(logs) == len(runs)
+        if whole and not any(one.count for known in found for one in known.values()):
+            yield ((("nothing went wrong", "title"),), None)
+            usual = "no exceptions, no errors or warnings logged, no findings of the guard"
+            yield (((usual, "good"),), None)
+        else:
+            yield ((fit("what went wrong", _WHAT), "title"), *heads), None
+            for what in dict.fromkeys(what for known in found for what in known):
+                yield _trouble(what, [known.get(what) for known in found])
+        for name, (run, _) in zip("ab", runs, strict=False):
+            yield (_ending(run, f"run {name}" if len(runs) > 1 else "the run"), None)
+        unheard = list(dict.fromkeys(filter(None, (unheard_of(run) for run, _ in runs))))
+        for text in unheard:
+            for line in wrap(printable(text), max(self.app.size.width - 4, 20)):
+                yield ((line, "warning"),), None
 
-    def _heads(self) -> list[tuple[str, str]]:
-        if len(self._runs) == 1:
-            return []
-        return [(f"{'run ' + name:>10}", "muted") for name in ("a", "b")]
+    def _tables(self, runs: Sequence[tuple[Run, Overview]]) -> Iterator[_Line]:
+        timed = any(overview.took for _, overview in runs)
+        tables = []
+        for title, make, field in (
+            ("nodes", nodes_of, "node"),
+            ("topics", topics_of, "topic"),
+            ("where the time goes: callbacks" if timed else "callbacks", callbacks_of, "entity"),
+        ):
+            made = [make(run, overview) for run, overview in runs]
+            known = [{(part.node, part.kind, part.name): part for part in parts} for parts in made]
+            keys = dict.fromkeys(key for one in known for key in one)
+            tables.append((title, field, [[one.get(key) for one in known] for key in keys]))
+        names = max((cells(_name(row, f)) for _, f, rows in tables for row in rows), default=0)
+        for title, field, rows in tables:
+            yield from self._table(title, field, rows, max(names, _NAMES_LEAST))
+            yield (), None
+        if not timed and all(overview.share >= 1 for _, overview in runs):
+            yield ((_UNTIMED, "muted"),), None
 
-    def _table(
-        self, title: str, make: _Make, field: str, most: int = 10_000
-    ) -> list[tuple[Pieces, Choice | None]]:
-        made = [make(run, overview) for run, overview in self._runs]
-        known = [{(part.node, part.kind, part.name): part for part in parts} for parts in made]
-        keys = list(dict.fromkeys(key for one in known for key in one))
-        width = max(min(self.app.size.width - 4, 140), 40)
+    def _table(self, title: str, field: str, rows: Sequence[_Row], names: int) -> Iterator[_Line]:
+        runs = 1 if self._session.b is None else 2
+        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
         bars = _BAR if width >= 100 else _BAR // 3
-        waits = any(part.wait_ns is not None for parts in made for part in parts)
-        names = max(width - bars - 2 - _NUMBERS * len(made) - (_WAITS if waits else 0), 12)
-        heads: list[tuple[str, str]] = [(fit(f"{title}  {len(keys)}", names + bars + 2), "title")]
+        room = width - bars - 2 - _NUMBERS * runs
+        columns = list(_times_of(rows, runs))
+        columns = columns[: max(room - _NAMES_LEAST, 0) // _TIMES]
+        names = min(names, room - _TIMES * len(columns))
+        heads = [(fit(f"{title}  {len(rows)}", names + bars + 2), "title")]
         what = "sent" if field == "topic" else "events"
-        for name in ("a", "b")[: len(made)] if len(made) > 1 else ("",):
+        for name in ("a", "b") if runs > 1 else ("",):
             heads.append((f"{f'{what} {name}'.strip():>10}{'Hz':>9}", "muted"))
-        if waits:
-            heads.append(("  on the way: mean, max", "muted"))
-        lines: list[tuple[Pieces, Choice | None]] = [(heads, None)]
-        for key in keys[:most]:
-            parts = [one.get(key) for one in known]
-            some = next(part for part in parts if part is not None)
-            text = some.name
-            if field == "entity":
-                text = f"{some.node} {some.kind} {some.name}"
-            elif field == "topic":
-                text = f"{some.name}  {some.kind}"
-            bar = "█" * round(some.share * bars) or "▏"
-            pieces = [(fit(printable(text), names) + " ", "plain"), (fit(bar, bars) + " ", "bar")]
-            differ = len({part.count if part else 0 for part in parts}) > 1
-            for part in parts:
-                pieces.append((_numbers(part), "error" if differ else "plain"))
-            if some.wait_ns is not None:
-                mean, longest = some.wait_ns
-                wait = f"  {_short(mean)}, {_short(longest)}"
-                pieces.append((wait, "muted"))
-            name = some.name if field != "node" else some.node
-            lines.append((pieces, ("filter", _filter_of(field, some, name))))
-        if len(keys) > most:
-            lines.append((((f"… and {len(keys) - most} more", "muted"),), None))
-        return lines
+        heads += [(f"{words:>{_TIMES}}", "muted") for words, _ in columns]
+        yield heads, None
+        most = len(rows)
+        if field not in self._whole:
+            shown = (self.app.size.height - _OTHER_LINES) // 3
+            most = most if most <= shown + 1 else max(shown, _LINES_LEAST)
+        for row in rows[:most]:
+            some = _some(row)
+            bar = "█" * min(round(some.share * bars), bars) or "▏"
+            pieces = [(fit(_name(row, field), names) + " ", "plain"), (fit(bar, bars) + " ", "bar")]
+            differ = len({part.count if part else 0 for part in row}) > 1
+            pieces += [(_numbers(part), "error" if differ else "plain") for part in row]
+            pieces += [(f"{text(row):>{_TIMES}}", "muted") for _, text in columns]
+            yield pieces, ("filter", _filter_of(field, some))
+        if len(rows) > most:
+            more = f"… and {len(rows) - most} more: Enter shows them"
+            yield ((more, "muted"),), ("more", field)
 
     def on_list_view_chosen(self, event: ListView.Chosen) -> None:
-        """Go to what was chosen."""
+        """Go to what was chosen; of a line that stands for nothing, to all events."""
         choice = self._lines[event.line][1]
-        if choice is not None:
+        if choice is not None and choice[0] == "more":
+            self._whole.add(choice[1])
+            self.update_lines()
+        else:
             self.dismiss(choice)
+
+
+def _named(session: Session) -> list[tuple[str, Run]]:
+    return list(session.runs.items())
+
+
+def _trouble(what: str, found: Sequence[Trouble | None]) -> _Line:
+    some = next(one for one in found if one is not None)
+    worst = any(one is not None and one.count for one in found)
+    style = ("error" if some.bad else "warning") if worst else "muted"
+    pieces = [(fit(what, _WHAT), style)]
+    for one in found:
+        count = one.count if one is not None else 0
+        pieces.append((f"{count:>10,}", style if count else "muted"))
+    if not worst:
+        return pieces, None
+    pieces.append((f"   {some.key} goes from one to the next" if some.key else "", "muted"))
+    if some.filter:
+        return pieces, ("filter", some.filter)
+    first = some.first
+    return pieces, ("event", str(first)) if first is not None else None
+
+
+def _ending(run: Run, name: str) -> Pieces:
+    result = run.trace.result
+    code = result.get("exit_code", "0")
+    if not run.trace.complete:
+        return ((f"{name} is not finished, or was cut off", "warning"),)
+    text = f"{name} ended: {printable(result.get('stop_reason', ''))}"
+    if code != "0":
+        return ((f"{text}, exit code {printable(code)}", "error"),)
+    return ((text, "plain"),)
+
+
+_TIMES_OF: dict[str, Callable[[Part], Times | None]] = {
+    "takes": lambda part: part.took,
+    "waits": lambda part: part.paused,
+    "on the way": lambda part: part.waited,
+}
+
+
+def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[tuple[str, Callable[[_Row], str]]]:
+    """Yield the columns of durations that there is something for: their heads, and their texts."""
+    what = "mean, max" if runs == 1 else "means a, b"
+    for words, of in _TIMES_OF.items():
+        if any(part is not None and of(part) for row in rows for part in row):
+            busy = words == "takes" and runs == 1
+            yield f"{words}: {what}{', busy' * busy}", partial(_times, of, busy=busy)
+
+
+def _times(of: Callable[[Part], Times | None], row: _Row, *, busy: bool) -> str:
+    found = [None if part is None else of(part) for part in row]
+    texts = [_short(one.mean_ns) if one is not None and one.count else "" for one in found]
+    if len(found) == 1 and texts[0] and found[0] is not None:
+        texts.append(_short(found[0].most_ns))
+    if busy and texts[0]:
+        texts[-1] += f" {_some(row).share:>4.0%}"
+    return ", ".join(text or "-" for text in texts) if any(texts) else ""
+
+
+def _some(row: _Row) -> Part:
+    return next(part for part in row if part is not None)
+
+
+def _name(row: _Row, field: str) -> str:
+    part = _some(row)
+    if field == "entity":
+        return printable(f"{part.node} {part.kind} {part.name}")
+    return printable(f"{part.name}  {part.kind}" if field == "topic" else part.name)
 
 
 def _numbers(part: Part | None) -> str:
@@ -184,10 +292,10 @@ def _numbers(part: Part | None) -> str:
     return f"{part.count:>10,}{rate:>9}"
 
 
-def _filter_of(field: str, part: Part, name: str) -> str:
+def _filter_of(field: str, part: Part) -> str:
     if field == "entity":
-        return f'node:"{part.node}" entity:"{name}"'
-    return f'{field}:"{name}"'
+        return f'node:"{part.node}" entity:"{part.name}"'
+    return f'{field}:"{part.node if field == "node" else part.name}"'
 
 
 def _short(duration_ns: int) -> str:

@@ -11,6 +11,12 @@ from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.terminal.keys import footer_keys
 
 
+def verdict_lines(height: int) -> int:
+    """Return how many lines a verdict may take on a screen of so many: where there is room, it is
+    not cut."""
+    return 4 if height >= 20 else 1 if height >= 10 else 0
+
+
 class HeaderBar(Static):
     """What is open, in a line; with two traces how they compare, in one or two more."""
 

@@ -1,0 +1,82 @@
+"""What a folder holds that can be looked at: traces, bags and other recordings, newest first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from rsltrace.bag import open_bag
+from rsltrace.bag.metadata import NAME as METADATA
+from rsltrace.diff.file_kind import is_recording, is_trace
+from rsltrace.errors import RsltraceError
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration
+from rsltrace.trace.reader import Trace
+
+_LOOKED_AT_MAX = 200
+_OPENED_BYTES_MAX = 64 << 20
+"""Larger recordings may have to be read to the end to be counted: their size is shown."""
+_FILES = ("*.mcap", "*.db3", "*.mcap.zstd", "*.db3.zstd")
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A trace or a recording: its path, how much is in it, how long it is, and what else to say."""
+
+    path: Path
+    amount: str
+    length: str
+    what: str
+
+    @property
+    def name(self) -> str:
+        """The path; that of a folder ends in a slash."""
+        return printable(f"{self.path}/" if self.path.is_dir() else str(self.path))
+
+
+def found_in(folder: Path) -> list[Found]:
+    """Return the traces and recordings in a folder and the folders in it, the newest first. What
+    cannot be read is left out."""
+    paths = sorted(_paths_in(folder), key=lambda path: (-path.stat().st_mtime, str(path)))
+    found = []
+    for path in paths[:_LOOKED_AT_MAX]:
+        with suppress(RsltraceError, OSError):
+            if path.is_file() and is_trace(path):
+                found.append(_trace(path))
+            elif is_recording(path):
+                found.append(_recording(path))
+    return found
+
+
+def _paths_in(folder: Path) -> Iterator[Path]:
+    bags = {path.parent for deep in ("", "*/", "*/*/") for path in folder.glob(f"{deep}{METADATA}")}
+    yield from bags
+    for pattern in _FILES:
+        for deep in ("", "*/"):
+            for path in folder.glob(f"{deep}{pattern}"):
+                if path.parent not in bags and path.is_file():
+                    yield path
+
+
+def _trace(path: Path) -> Found:
+    with Trace.open(path) as trace:
+        state = "" if trace.complete else "  not finished"
+        length = format_duration(trace.end_ns - trace.start_ns)
+        return Found(path, f"{trace.event_count:,} events", length, f"{trace.digest}{state}")
+
+
+def _recording(path: Path) -> Found:
+    size = sum(one.stat().st_size for one in ([path] if path.is_file() else path.iterdir()))
+    if size > _OPENED_BYTES_MAX or path.suffix == ".zstd":
+        return Found(path, f"{size / 1e6:,.1f} MB", "", "recording")
+    bag = open_bag(path, recover=path.is_file())
+    try:
+        length = format_duration(bag.recording_end_ns - bag.recording_start_ns)
+        state = "  incomplete" if bag.notes else ""
+        return Found(
+            path, f"{bag.message_count:,} messages", length, f"{bag.storage_id} recording{state}"
+        )
+    finally:
+        bag.close()
