@@ -372,6 +372,13 @@ class Trace:
         stamp_ns, data = self._payloads.message(channel.id, output.sequence)
         return stamp_ns, channel.topic, data
 
+    def message(self, channel_id: int, sequence: int) -> tuple[int, bytes]:
+        """Return (stamp in ns, data) of message number ``sequence`` of a channel.
+
+        Raises TraceError if there is none.
+        """
+        return self._payloads.message(channel_id, sequence)
+
     def detail(self, output: Output) -> str | None:
         """Return the text of an output that is no message, or None if it has none."""
         found = self.payload(output)

@@ -12,7 +12,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.built_in import is_built_in
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.trace.counts import Series
 from rsltrace.words.entities import RUN_NAME
 from rsltrace.words.logs import LEVEL_WARN
@@ -91,7 +91,8 @@ def read_overview(run: Run) -> Iterator[Overview]:
         _add(found.events, events["entity"], stamps)
         draws = outputs[outputs["kind"] == _DRAW]
         sent = outputs[~np.isin(outputs["kind"], _NOT_SENT)]
-        _add(found.sent, sent["entity"], stamps[(sent["event"] - np.uint64(segment.first))])
+        places = (sent["event"] - np.uint64(segment.first)).astype(np.intp)
+        _add(found.sent, sent["entity"], stamps[places])
         _add_since_causes(found, segment, before)
         before = segment
         kinds, values = draws["hash"] >> _VALUE_BITS, (draws["hash"] & _VALUE).astype(np.int64)
@@ -118,24 +119,31 @@ def _add(
         series.setdefault(entity, Series()).add(number, first_ns, last_ns)
 
 
+_OF_CAUSES = ("stamp", "entity")
+
+
 def _add_since_causes(found: Overview, segment: Segment, before: Segment | None) -> None:
     """Add how long after their causes events came, if these are in the segment or that before."""
-    first, known = segment.first, segment.events
-    if before is not None and before.last == first:
-        first, known = before.first, np.concatenate((before.events, known))
-    causes = segment.events["cause_event"]
-    own = segment.events[(causes != np.uint64(NO_EVENT)) & (causes >= np.uint64(first))]
-    causes = known[(own["cause_event"] - np.uint64(first)).astype(np.intp)]
-    took_ns = (own["stamp"] - causes["stamp"]).astype(np.int64)
-    resumed = own["kind"] == int(EventKind.RESUME)
-    waited = resumed & (causes["entity"] == own["entity"])
-    _add_times(found.waited, own["entity"][~resumed], took_ns[~resumed])
-    _add_times(found.paused, own["entity"][waited], took_ns[waited])
+    first = segment.first if before is None or before.last != segment.first else before.first
+    read = [one.events for one in (before, segment) if one is not None and one.first >= first]
+    stamps, entities = (np.concatenate([one[name] for one in read]) for name in _OF_CAUSES)
+    causes = segment.events["cause_event"]  # NO_EVENT is larger than any
+    known = (causes >= np.uint64(first)) & (causes < np.uint64(segment.last))
+    places = np.flatnonzero(known)
+    sent = (causes[places] - np.uint64(first)).astype(np.intp)
+    entity = segment.events["entity"][places]
+    took_ns = (segment.events["stamp"][places] - stamps[sent]).astype(np.int64)
+    resumed = segment.events["kind"][places] == int(EventKind.RESUME)
+    waited = resumed & (entities[sent] == entity)
+    _add_times(found.waited, entity[~resumed], took_ns[~resumed])
+    _add_times(found.paused, entity[waited], took_ns[waited])
 
 
 def _add_times(
     times: dict[int, Times], entities: npt.NDArray[np.uint32], took_ns: npt.NDArray[np.int64]
 ) -> None:
+    if not len(entities):
+        return
     ids, places, counts = np.unique(entities, return_inverse=True, return_counts=True)
     total, most = np.zeros((2, len(ids)), dtype=np.int64)
     np.add.at(total, places, took_ns)

@@ -145,7 +145,7 @@ class ViewerApp(Stepping):
             if self.session.rows is not rows:
                 return
             self.timeline.empty = "no event passes the filter" if done else "looking …"
-            part = "" if done else f" ({progress or 0:.0%} read)"
+            part = "" if done else f" ({progress or 0:.0%} read, Esc ends it)"
             self._status = f"filter: {rows.count:,} events{part}"
             if rows.count:
                 self.session.place = rows.at(self.session.row_of_place())
@@ -162,9 +162,11 @@ class ViewerApp(Stepping):
         screen = self.screen_stack[0]
         if self.prompt.asking:
             self.prompt.put_aside()
-        elif any(w.group == "seek" and w.is_running for w in self.workers):
+        elif self._is_running("seek"):
             self.workers.cancel_group(self, "seek")
             self._say("stopped")
+        elif self._is_running("filter"):
+            self._filter("")
         elif any(screen.has_class(name) for name in _ONLY):
             screen.remove_class(*_ONLY)
         elif self.focused is not self.timeline:
@@ -176,6 +178,9 @@ class ViewerApp(Stepping):
             self._filter("")
         elif self._follow is not None:
             self.action_follow()
+
+    def _is_running(self, group: str) -> bool:
+        return any(worker.group == group and worker.is_running for worker in self.workers)
 
     # Looking.
 

@@ -87,6 +87,7 @@ class Stepping(Shell):
 
     def _seek(self, condition: Condition, step: int, name: str, *, wrap: bool = False) -> None:
         """Go to the nearest place where a condition holds, looking for it in the background."""
+        which = "next" if step > 0 else "previous"
 
         def steps() -> Iterator[int | None]:
             looked = enumerate(self.session.seek(condition, step, wrap=wrap), start=1)
@@ -102,8 +103,8 @@ class Stepping(Shell):
             elif done:
                 self._say(f"no {'later' if step > 0 else 'earlier'} {name}")
             elif found is not None:
-                share = -found / max(len(self.session.a.segments), 1)
-                self._say(f"looking for {name} … {share:.0%}, Esc stops")
+                share = min(-found / max(len(self.session.a.segments), 1), 1)
+                self._say(f"looking for the {which} {name} … {share:.0%}, Esc stops")
 
         walk(self, "seek", steps(), arrive)
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_SEQUENCE, EventKind, Output, OutputKind
+from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.segments import output_of
 from rsltrace_viewer.model.query.conditions import Mask
@@ -32,6 +34,7 @@ class MessageText:
     def __init__(self, folded: str) -> None:
         self._folded = folded
         self._keys = lru_cache(maxsize=_SEGMENTS_KEPT)(self._keys_in)
+        self._in_all: dict[int, bool] = {}
 
     def can_be_in(self, run: Run, number: int) -> bool:
         """Return True: only reading the segment tells."""
@@ -67,12 +70,14 @@ class MessageText:
                 channel = run.trace.channel_of(one)
                 if channel is None:
                     continue
-                held = self._held(run, channel, outputs["sequence"][places])
+                if not self._is_in_all(run, channel):
+                    places = places[self._held(run, channel, outputs["sequence"][places])]
+                    sequences = outputs["sequence"][places].tolist()
+                    says = (self._says(run, channel, number) for number in sequences)
+                    places = places[np.fromiter(says, np.bool_, len(places))]
             except TraceError:
                 continue
-            for place in places[held].tolist():
-                if self._says(run, channel, output_of(outputs[place], run.trace.name)):
-                    found.append(place)
+            found += places.tolist()
         result: _Keys = keys[sorted(found)]
         return result
 
@@ -100,14 +105,34 @@ class MessageText:
             and "wstring" not in schema
         )
 
-    def _says(self, run: Run, channel: ChannelInfo, output: Output) -> bool:
+    def _is_in_all(self, run: Run, channel: ChannelInfo) -> bool:
+        """Whether it is in the name of a field that every message of a channel has."""
+        if not self._folded.isidentifier():
+            return False
+        if channel.id not in self._in_all:
+            try:
+                _, data = run.trace.message(channel.id, 0)
+                names = _names(run.trace.decode(channel, data))
+            except TraceError:
+                names = iter(())
+            self._in_all[channel.id] = any(self._folded in name.casefold() for name in names)
+        return self._in_all[channel.id]
+
+    def _says(self, run: Run, channel: ChannelInfo, sequence: int) -> bool:
         from rsltrace.trace.decode import to_plain  # its library takes as long as opening a trace
 
         try:
-            payload = run.trace.payload(output)
-            if payload is None:
-                return False
-            plain = to_plain(run.trace.decode(channel, payload[2]))
+            plain = to_plain(run.trace.decode(channel, run.trace.message(channel.id, sequence)[1]))
         except TraceError:  # one that cannot be decoded says nothing of the others
             return False
         return self._folded in str(plain).casefold()
+
+
+def _names(message: object) -> Iterator[str]:
+    """Yield the names of the fields of a decoded message, but for those in its lists."""
+    from rsltrace.trace.decode import field_names
+
+    kind: Any = type(message)
+    for name in field_names(kind) or ():
+        yield name
+        yield from _names(getattr(message, name))

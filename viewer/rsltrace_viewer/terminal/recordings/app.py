@@ -159,7 +159,7 @@ class RecordingApp(RecordingShell):
         def arrive(looked: int | None, done: bool) -> None:
             session.show_found()
             self.topics.cursor = session.place
-            part = "" if done else f" ({(looked or 0) / total:.0%} read, Esc stops)"
+            part = "" if done else f" ({(looked or 0) / total:.0%} read, Esc ends it)"
             self._status = ""
             self.filtering = f"filter: {session.found_count:,} messages{part}" if text else ""
             self._show_all()
@@ -189,7 +189,8 @@ class RecordingApp(RecordingShell):
                 self._say(f"no match of {session.search_text}")
             elif found is not None:
                 share = min(found / total, 1)
-                self._say(f"looking for {session.search_text} … {share:.0%}, Esc stops")
+                said = f"looking for the {'next' if step > 0 else 'previous'} match"
+                self._say(f"{said} of {session.search_text} … {share:.0%}, Esc stops")
 
         walk(self, "seek", session.seek(step), arrive)
 
