@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.timeline.message_values import message_values
+from rsltrace_viewer.model.timeline.message_values import both_values, message_values
+from rsltrace_viewer.model.view import Sign
 from rsltrace_viewer.session import Session
 from trace_maker import Opened, uint64_message
 
@@ -42,6 +43,47 @@ def message(**fields: Any) -> Any:
 )
 def test_messages_in_a_few_words(made: Any, text: str | None) -> None:
     assert message_values(made) == (text or 'ok=true text="a\\x1b[2J"')
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "text"),
+    [
+        ("/odom x=0.31 ω=-0.05", "/odom x=0.35 ω=-0.05", "/odom x=0.31→0.35 ω=-0.05"),
+        ("/odom x=0.3, takes 2 ms", "/odom x=0.4, takes 2 ms", "/odom x=0.3→0.4, takes 2 ms"),
+        ("/odom x=1, /tf y=2", "/odom x=1, /tf y=3", "/odom x=1, /tf y=2→3"),
+        ("/odom x=1", "/odom x=1", "/odom x=1"),
+        ("/odom x=1", "/odom x=1 y=2", "/odom x=1"),
+        ("/odom x=1", "/scan x=1", "/odom x=1"),
+        ("/torque -1.2", "/torque -1.3", "/torque -1.2→-1.3"),
+        ("/a 1, /b 2", "/a 1, /c 2", "/a 1, /b 2"),
+        ("", "/odom", ""),
+    ],
+)
+def test_a_row_that_differs_has_the_values_of_both(a: str, b: str, text: str) -> None:
+    assert both_values(a, b) == text
+
+
+@pytest.mark.parametrize(
+    ("name", "plot", "text"),
+    [
+        ("schedule", ("/torque", ""), "/torque -1.148→"),
+        ("nondeterministic_callback", ("/push", "x"), "/push x="),
+    ],
+)
+def test_rows_and_plots_of_two_runs_show_what_differs(
+    name: str, plot: tuple[str, str], text: str
+) -> None:
+    session = Session(*(Run.open(SAMPLES / name / f"{run}.mcap") for run in "ab"))
+    try:
+        comparison = session.comparison
+        assert comparison is not None
+        comparison.finish_diff()
+        assert session.plots().first() == plot
+        rows = [row for row in range(comparison.count) if comparison.sign(row) is Sign.DIFFERS]
+        list(session.read_values(rows))
+        assert any(session.row(row)[0].outputs.startswith(text) for row in rows)
+    finally:
+        session.close()
 
 
 def test_rows_have_values_once_they_are_read(made: Path) -> None:

@@ -29,6 +29,7 @@ from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import Columns, layout
 from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
+from rsltrace_viewer.model.timeline.message_values import both_values
 from rsltrace_viewer.model.timeline.row_values import RowValues
 from rsltrace_viewer.model.timeline.short_names import ShortNames
 from rsltrace_viewer.model.view import Sign, SingleView, View
@@ -189,7 +190,7 @@ class Session:
         if index is not None:
             event = self._with_values("a", index)
             if index_b is not None:
-                event = self._with_other(event, index, index_b)
+                event = self._with_other(event, place, index, index_b)
         else:
             assert index_b is not None  # a place stands for something
             event = self._with_values("b", index_b)
@@ -198,7 +199,7 @@ class Session:
     def _with_values(self, name: str, index: int) -> EventText:
         return self.values[name].known(self._texts[name].of(index))
 
-    def _with_other(self, event: EventText, index: int, index_b: int) -> EventText:
+    def _with_other(self, event: EventText, place: int, index: int, index_b: int) -> EventText:
         """Return an event of run a with what is to be said of that of run b beside it."""
         assert self.b is not None  # there is an event of it
         if not event.raised:
@@ -206,6 +207,9 @@ class Session:
             if other.raised:  # what run a did here is not what one looks for
                 outputs = f"b: {other.outputs}; a: {event.outputs or 'nothing'}"
                 event = replace(event, raised=True, outputs=outputs)
+            elif self.view.sign(place) is Sign.DIFFERS:
+                values = self._with_values("b", index_b).outputs
+                event = replace(event, outputs=both_values(event.outputs, values))
         later_ns = self.b.stamp(index_b) - self.a.stamp(index)
         return replace(event, delta=_short_duration(later_ns)) if later_ns else event
 
@@ -215,7 +219,10 @@ class Session:
         found = [(self.view.a(place), self.view.b(place)) for place in places]
         yield from self.values["a"].read([a for a, _ in found if a is not None])
         if self.b is not None:
-            yield from self.values["b"].read([b for a, b in found if a is None and b is not None])
+            differs = {place for place in places if self.view.sign(place) is Sign.DIFFERS}
+            pairs = zip(places, found, strict=True)
+            of_b = [b for place, (a, b) in pairs if a is None or place in differs]
+            yield from self.values["b"].read([b for b in of_b if b is not None])
 
     def _relation(self, place: int) -> str:
         """Return ``cause`` or ``effect`` if that is what the event is to the selected one."""

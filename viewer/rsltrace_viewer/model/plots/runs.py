@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from rsltrace.diff.result.traces import Diff
+from rsltrace.model.built_in import NODE_TOPICS
 from rsltrace_viewer.model.plots.series import (
     Series,
     Source,
@@ -57,10 +58,18 @@ class RunPlots:
     def first(self) -> tuple[str, str]:
         """Return the field that differs first; otherwise the topic of the selected event."""
         known = self.topics()
-        for divergence in self._diff.divergences if self._diff is not None else ():
-            for message in divergence.messages:
-                if message.topic in known and message.fields:
-                    return message.topic, message.fields[0].path
+        diff = self._diff
+        if diff is not None:
+            divergences = [one for one in (diff.shown, *diff.divergences) if one is not None]
+            differing = [
+                (message.topic, message.fields[0].path)
+                for divergence in divergences
+                for message in divergence.messages
+                if message.topic in known and message.fields
+            ]
+            # A parameter that differs is no curve; what a node then sends is.
+            for found in sorted(differing, key=lambda one: one[0] in NODE_TOPICS)[:1]:
+                return found
         return (self._topic if self._topic in known else ""), ""
 
     def cursor_s(self) -> float | None:

@@ -47,6 +47,26 @@ def differing_values(a: object, b: object) -> tuple[str, str]:
     return texts[0], texts[1]
 
 
+def both_values(a: str, b: str) -> str:
+    """Return what two events did in one text, where only values differ: ``/odom x=0.31→0.35``."""
+    words = list(zip(a.split(" "), b.split(" "), strict=False))
+    if a.count(" ") != b.count(" ") or not all(_are_alike(*both) for both in words):
+        return a
+    return " ".join(one if one == other else _both(one, other) for one, other in words)
+
+
+def _are_alike(a: str, b: str) -> bool:
+    """Whether two words may stand for the same thing: values of a field, of a whole message."""
+    name, equals, _ = a.partition("=")
+    alike = b.startswith(f"{name}=") if equals else not (a.startswith("/") or "=" in b)
+    return a == b or (alike and not b.startswith("/") and a.endswith(",") == b.endswith(","))
+
+
+def _both(a: str, b: str) -> str:
+    value = b.partition("=")[2] or b
+    return f"{a.removesuffix(',')}→{value}"
+
+
 def _leaves(value: Any, path: str, in_full: bool = False) -> Iterator[tuple[str, str]]:
     if isinstance(value, (bool, np.bool_)):
         yield path, "true" if value else "false"

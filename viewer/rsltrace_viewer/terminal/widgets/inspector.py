@@ -16,6 +16,8 @@ from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.inspector.lines import Line, Role
 from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
 
+_IN_FULL = (Role.NOTE, Role.ERROR, Role.WARNING, Role.DIFFERENCE)
+_VALUE_LINES = 4
 _LABEL_MAX = 24
 
 
@@ -122,15 +124,19 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self.post_message(self.Chosen(self._drawn[row][0]))
 
     def _lay_out(self) -> None:
-        """Make screen lines of lines: only notes and errors go on over several."""
+        """Make screen lines of lines. Sections have one; what is long goes on over several."""
         width = max(self.scrollable_content_region.width, 10)
         drawn: list[tuple[Line, str]] = []
         for line in self._lines:
-            if line.role in (Role.NOTE, Role.ERROR, Role.WARNING, Role.DIFFERENCE):
-                room = max(width - _indent(line) - (cells(line.label) + 1 if line.label else 0), 10)
-                drawn += [(line, text) for text in wrap(line.value, room)]
-            else:
+            if line.role is Role.SECTION:
                 drawn.append((line, line.value))
+                continue
+            label = min(cells(line.label), _LABEL_MAX)
+            room = max(width - _indent(line) - (label + 1 if label else 0), 10)
+            shown = wrap(line.value, room) if cells(line.value) > room else [line.value]
+            if line.role not in _IN_FULL and len(shown) > _VALUE_LINES:
+                shown[_VALUE_LINES - 1 :] = [fit(f"{shown[_VALUE_LINES - 1]} …", room)]
+            drawn += [(line, text) for text in shown]
         self._drawn = drawn
         set_virtual_size(self, Size(width, len(drawn)))
 
@@ -161,7 +167,7 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             ]
         else:
             label = fit(label, _LABEL_MAX) if cells(label) > _LABEL_MAX else label
-            gap = " " * (cells(line.label) if again else 0)
+            gap = " " * (min(cells(line.label), _LABEL_MAX) if again else 0)
             pieces = [
                 Piece(
                     "  " * line.depth + sign[2 if line.open is None else 0 :], self._style("label")
