@@ -22,6 +22,7 @@ PICTURES = ROOT / "docs" / "pictures"
 HUSKY = ROOT.parent / "shared" / "data" / "husky_outdoor"
 LIVE = "B slash t o r q u e colon space d a t a space greater_than_sign space 1 enter full_stop"
 VIEWS = {
+    "view_overview.svg": ("delayed_input", "a.mcap", "--size", "100x22"),
     "view.svg": ("delayed_input", "a.mcap", "--at", "252"),
     "view_two.svg": ("nondeterministic_callback", "a.mcap", "b.mcap"),
     "view_live.svg": ("schedule", "a.mcap", "--live", "--at", "20", "--keys", LIVE),
