@@ -8,6 +8,7 @@ import sys
 from types import FrameType, MethodType
 from weakref import WeakSet
 
+from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.model.finding import Source
 
@@ -35,8 +36,8 @@ def is_by_address(thing: object) -> bool:
 
 def hashed_by_address(frame: FrameType) -> None:
     """Remember of the ``__hash__`` method that runs in ``frame`` that addresses are in its hash."""
-    names = frame.f_code.co_varnames
-    if names and frame.f_code.co_argcount:
+    names = code_of(frame).co_varnames
+    if names and code_of(frame).co_argcount:
         _by_address.add(type(frame.f_locals.get(names[0])))
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import sysconfig
-from functools import cache
 from types import FrameType
 
+from rsltrace.guard.frames import code_of
 from rsltrace.guard.libraries import is_library
 
 _HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
@@ -19,7 +19,10 @@ _INSTALLED = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}"
 _MIDDLEWARE = ("rclpy", "rpyutils", "ament_index_python", "rosidl_parser", "rosidl_pycommon")
 _LINES_MAX = 6
 
-_USER, _STANDARD, _LIBRARY, _OURS, _IMPORT = range(5)
+USER, OURS, STANDARD, _PACKAGE, _LIBRARY, _IMPORT = range(6)
+"""Whose a file is: the user's (a ``_PACKAGE`` is installed), Python's, a library's, rclpy's or
+ours, or a part of importing."""
+
 _DOOR = os.path.join(_HERE, "doors", "rclpy")
 _CALLS_BACK = os.path.join(_HERE, "middleware", "events", "dispatcher.py")
 """The one of our files that calls callbacks; rclpy's own do, too."""
@@ -29,31 +32,37 @@ _STANDS_IN = (
     os.path.join(_DOOR, "terminals", "calls.py"),
 )
 """Parts of asyncio, os and select, as far as it matters who called whom."""
-_kinds: dict[str, int] = {}
+
+
+class _Kinds(dict[str, int]):
+    """Whose files are, by name."""
+
+    def __missing__(self, file: str) -> int:
+        """Find out and remember it."""
+        kind = self[file] = _kind_of(file)
+        return kind
 
 
 def _kind_of(file: str) -> int:
-    kind = _kinds.get(file)
-    if kind is None:
-        if file.startswith("<frozen importlib"):
-            kind = _IMPORT
-        elif file.startswith(_GUARD) or file in _STANDS_IN:
-            kind = _STANDARD  # a redirected function: its caller counts
-        elif file.startswith(_HERE) or any(
-            f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
-        ):
-            kind = _OURS  # rclpy, too: what it looks at is not the user's doing
-        elif is_library(file):
-            kind = _LIBRARY
-        elif file.startswith(("<frozen", *_PYTHON)) and not any(p in file for p in _INSTALLED):
-            kind = _STANDARD
-        else:
-            kind = _USER
-        _kinds[file] = kind
-    return kind
+    if file.startswith("<frozen importlib"):
+        return _IMPORT
+    if file.startswith(_GUARD) or file in _STANDS_IN:
+        return STANDARD  # a redirected function: its caller counts
+    if file.startswith(_HERE) or any(
+        f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
+    ):
+        return OURS  # rclpy, too: what it looks at is not the user's doing
+    if is_library(file):
+        return _LIBRARY
+    if is_installed(file):
+        return _PACKAGE
+    return STANDARD if file.startswith(("<frozen", *_PYTHON)) else USER
 
 
-@cache
+KINDS = _Kinds()
+"""Whose each source file is; calls that are made often look here themselves."""
+
+
 def is_installed(file: str) -> bool:
     """Whether a file lies among what is installed, be it a library's or the user's."""
     return any(part in file for part in _INSTALLED)
@@ -72,32 +81,28 @@ def is_own(module: str) -> bool:
 
 def is_user_file(file: str) -> bool:
     """Return whether a source file is neither Python's nor a library's nor ours."""
-    return _kind_of(file) == _USER
+    return KINDS[file] in (USER, _PACKAGE)
 
 
 def is_telling(file: str) -> bool:
     """Return whether a source file is of the user's code or of what that uses: neither Python's,
     nor rclpy's, nor ours."""
-    return _kind_of(file) in (_USER, _LIBRARY)
+    return KINDS[file] in (USER, _PACKAGE, _LIBRARY)
 
 
 def is_of_python(frame: FrameType) -> bool:
     """Return whether a frame is one of Python's own modules (or of the guard)."""
-    file = frame.f_code.co_filename
-    kind = _kinds.get(file)
-    return (_kind_of(file) if kind is None else kind) == _STANDARD
+    return KINDS[code_of(frame).co_filename] == STANDARD
 
 
 def is_nobodys(frame: FrameType | None) -> bool:
     """Return whether it is seen at once that ``user_frame`` is None: rclpy, rsltrace or an import
     asks, by way of Python's own modules at most."""
     while frame is not None:
-        file = frame.f_code.co_filename
-        kind = _kinds.get(file)
-        if kind is None:
-            kind = _kind_of(file)
-        if kind != _STANDARD:
-            return kind == _IMPORT or (kind == _OURS and file != _THREADS)
+        file = code_of(frame).co_filename
+        kind = KINDS[file]
+        if kind != STANDARD:
+            return kind == _IMPORT or (kind == OURS and file != _THREADS)
         frame = frame.f_back
     return False
 
@@ -112,25 +117,23 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
     """
     installed = library = standard = None
     while frame is not None:
-        file = frame.f_code.co_filename
-        kind = _kinds.get(file)
-        if kind is None:
-            kind = _kind_of(file)
-        if kind == _OURS:  # at first: most calls of a run are rclpy's, for itself
+        file = code_of(frame).co_filename
+        kind = KINDS[file]
+        if kind == USER:
+            return installed or frame
+        if kind == OURS:
             if file == _THREADS:
                 return installed or library or standard
-            return installed or (library if _calls_back(file) else None)
+            return installed or (library and (library if _calls_back(file) else None))
         if packages and is_in(frame, packages):
             return installed or frame
-        if kind == _USER:
-            if not is_installed(file):
-                return installed or frame
-            installed = installed or frame  # unless it is being imported
-        elif kind == _LIBRARY:
+        if kind == _LIBRARY:
             library = frame
-        elif kind == _STANDARD:
+        elif kind == STANDARD:
             standard = frame
-        elif kind == _IMPORT:
+        elif kind == _PACKAGE:
+            installed = installed or frame  # unless it is being imported
+        else:
             return None
         frame = frame.f_back
     return installed
@@ -139,9 +142,8 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
 def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
     """Return whether something that is installed is being imported, rather than user code run."""
     while frame is not None:
-        file = frame.f_code.co_filename
-        kind = _kind_of(file)
-        if kind == _OURS or (kind == _USER and not is_installed(file)):
+        kind = KINDS[code_of(frame).co_filename]
+        if kind in (USER, OURS):
             return False
         if packages and is_in(frame, packages):
             return False
@@ -153,7 +155,20 @@ def in_import(frame: FrameType | None, packages: frozenset[str]) -> bool:
 
 def is_in(frame: FrameType, packages: frozenset[str]) -> bool:
     """Return whether a frame's module is in one of the packages."""
-    return module_of(frame).partition(".")[0] in packages
+    file = code_of(frame).co_filename
+    top = _tops.get(file)
+    return (_top_of(frame, file) if top is None else top) in packages
+
+
+_tops: dict[str, str] = {}
+"""The packages that files belong to."""
+
+
+def _top_of(frame: FrameType, file: str) -> str:
+    top = module_of(frame).partition(".")[0]
+    if top != "__main__":  # a program in this run, perhaps a module in the next
+        _tops[file] = top
+    return top
 
 
 def module_of(frame: FrameType) -> str:
@@ -165,15 +180,15 @@ def stack_of(frame: FrameType | None, packages: frozenset[str]) -> str:
     """Return the lines of user code from ``frame`` outwards, without paths of this machine."""
     lines: list[str] = []
     while frame is not None and len(lines) < _LINES_MAX:
-        kind = _kind_of(frame.f_code.co_filename)
-        if kind == _USER or (packages and is_in(frame, packages)):
-            code = frame.f_code
+        kind = KINDS[code_of(frame).co_filename]
+        if kind in (USER, _PACKAGE) or (packages and is_in(frame, packages)):
+            code = code_of(frame)
             folder = module_of(frame).rpartition(".")[0].replace(".", "/")
             file = os.path.basename(code.co_filename)
             place = f"{folder}/{file}" if folder else file
             name = getattr(code, "co_qualname", code.co_name)  # from Python 3.11 on
             lines.append(f"{place}:{frame.f_lineno} in {name}")
-        elif kind == _OURS:
+        elif kind == OURS:
             break
         frame = frame.f_back
     return "\n".join(lines)

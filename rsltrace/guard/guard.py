@@ -16,8 +16,18 @@ from types import FrameType
 from typing import Any, Protocol
 
 from rsltrace.errors import GuardError
-from rsltrace.guard.callers import in_import, is_of_python, module_of, stack_of, user_frame
+from rsltrace.guard.callers import (
+    KINDS,
+    OURS,
+    STANDARD,
+    USER,
+    in_import,
+    module_of,
+    stack_of,
+    user_frame,
+)
 from rsltrace.guard.descriptor_table import DescriptorTable
+from rsltrace.guard.frames import code_of
 from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
 from rsltrace.guard.random_streams import RandomStreams
@@ -28,6 +38,8 @@ from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
+_here = _process_id()
+"""This process; asking the system each time would cost more than all the rest."""
 
 FINDINGS_PER_EVENT = 100
 """An event that looks at the address of a million objects is one problem, not a million."""
@@ -37,6 +49,15 @@ _BUSY_NS = 10_000
 _LOOK_NS = 1_000
 """What looking at a clock again takes: ``time.time()`` of this century cannot show much less."""
 _AHEAD_NS_MAX = 1_000_000
+_NEVER = (0, -1 << 63)
+
+
+def _forked() -> None:
+    global _here
+    _here = _process_id()
+
+
+os.register_at_fork(after_in_child=_forked)
 
 
 class Context(Protocol):
@@ -44,6 +65,9 @@ class Context(Protocol):
 
     def now_ns(self) -> int:
         """Return simulated time."""
+
+    def look(self) -> tuple[int, str, int]:
+        """Return the index of the event under way, the node and simulated time."""
 
     def node(self) -> str:
         """Return the node whose code runs, or an empty text."""
@@ -74,7 +98,8 @@ class Context(Protocol):
 class Guard:
     """State of one run. ``on_finding`` takes what is worth a line in the trace.
 
-    ``counts`` says how often each call was met: by (source, mode, node, call).
+    ``modes`` says what is done about each source if that is the same for all code (``one_policy``,
+    and no module is exempt), which spares most calls a question.
     """
 
     def __init__(
@@ -85,11 +110,16 @@ class Guard:
         seed: int = 0,
         packages: frozenset[str] = frozenset(),
         on_finding: Callable[[Finding], None] = lambda finding: None,
+        one_policy: bool = False,
     ) -> None:
         self.context = context
+        self._look = context.look
         self.packages = packages
         self.on_finding = on_finding
-        self.counts: Counter[tuple[Source, Mode, str, str]] = Counter()
+        self._found: Counter[tuple[Source, Mode, str, str]] = Counter()
+        self._answered: dict[Source, dict[str, dict[str, int]]] = {source: {} for source in Source}
+        self._clock_looks = self._answered[Source.CLOCK]
+        self._draws = self._answered[Source.RANDOM]
         self.streams = RandomStreams(seed)
         self.answers = RecordedAnswers()
         self.descriptors = DescriptorTable()
@@ -97,7 +127,10 @@ class Guard:
         self.numbers = ObjectNumbers()
         self.shown = ShownNumbers()
         self._policy = policy
-        self._thread = _thread_id()
+        self.modes = policy.modes if one_policy and not any(policy.allowed.values()) else None
+        self.makes_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
+        self.makes_chance = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
+        self.thread = _thread_id()
         self.process = _process_id()
         self._event = -1
         self._in_event = 0
@@ -106,12 +139,20 @@ class Guard:
         self._passes = 0
         self._shown: dict[str, tuple[int, int]] = {}
 
-    def in_charge(self) -> bool:
-        """Return whether the calling thread is the simulation's (and no child process)."""
-        return bool(_thread_id() == self._thread and _process_id() == self.process)
+    @property
+    def counts(self) -> dict[tuple[Source, Mode, str, str], int]:
+        """How often each call was met: by source, mode, node and call."""
+        counts: dict[tuple[Source, Mode, str, str], int] = dict(self._found)
+        for source, calls in self._answered.items():
+            for call, nodes in calls.items():
+                for node, count in nodes.items():
+                    counts[source, Mode.VIRTUAL, node, call] = count
+        return counts
 
     def mode(self, source: Source, frame: FrameType) -> Mode:
         """Return what the job says about ``source`` in the code of ``frame``."""
+        if self.modes is not None:
+            return self.modes[source]
         policy = self.context.policy() or self._policy
         allowed = policy.allowed.get(source) if policy.allowed else None
         if allowed:
@@ -132,26 +173,57 @@ class Guard:
         loaded already.
         """
         node = self.context.node()
-        if node and not in_import(frame, self.packages):
+        is_users = KINDS[code_of(frame).co_filename] == USER
+        if node and (is_users or not in_import(frame, self.packages)):
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 
+    def drawn(self, call: str, frame: FrameType) -> str:
+        """Count a draw that the run makes; return the name of its stream."""
+        node = self.context.node()
+        if KINDS[code_of(frame).co_filename] != USER:
+            self.count(Source.RANDOM, call, frame)
+            return self.stream(frame)
+        try:
+            self._draws[call][node] += 1
+        except KeyError:
+            self._draws.setdefault(call, {})[node] = 1
+        return node or self.stream(frame)
+
     def is_user(self, frame: FrameType) -> bool:
         """Return whether a frame is user code itself."""
-        return user_frame(frame, self.packages) is frame
+        is_users = KINDS[code_of(frame).co_filename] == USER
+        return is_users or user_frame(frame, self.packages) is frame
 
-    def count(self, source: Source, mode: Mode, call: str, frame: FrameType) -> None:
-        """Count a call of user code that is no finding."""
-        if user_frame(frame, self.packages) is not None:
-            self.counts[source, mode, self.context.node(), call] += 1
+    def is_for_user(self, frame: FrameType) -> bool:
+        """Return whether user code has led to a frame."""
+        kind = KINDS[code_of(frame).co_filename]
+        return kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None)
 
-    def found(self, source: Source, mode: Mode, call: str, value: object, frame: FrameType) -> None:
-        """Report a call; ``frame`` is where it was made.
+    def count(self, source: Source, call: str, frame: FrameType) -> None:
+        """Count a call of user code that the run answers itself."""
+        if self.is_for_user(frame):
+            node = self.context.node()
+            try:
+                self._answered[source][call][node] += 1
+            except KeyError:
+                self._answered[source].setdefault(call, {})[node] = 1
+
+    def found(
+        self,
+        source: Source,
+        mode: Mode,
+        call: str,
+        value: object,
+        frame: FrameType,
+        told: Callable[[Any], str] | None = None,
+    ) -> None:
+        """Report a call; ``frame`` is where it was made, ``told`` makes a text of its answer.
 
         :raises GuardError: if the job says that it is an error.
         """
         node = self.context.node()
-        self.counts[source, mode, node, call] += 1
+        self._found[source, mode, node, call] += 1
         event, entity = self.context.place()
         if event != self._event:
             self._event, self._in_event = event, 0
@@ -159,7 +231,10 @@ class Guard:
         if self._in_event <= FINDINGS_PER_EVENT or mode in (Mode.ERROR, Mode.RECORD):
             user = user_frame(frame, self.packages)
             stack = stack_of(user or frame, self.packages)
-            text = value if isinstance(value, str) else repr(value)
+            if told is not None:
+                text = told(value)
+            else:
+                text = value if isinstance(value, str) else repr(value)
             self.on_finding(Finding(event, entity, node, source, mode, call, text, stack))
             if mode is Mode.ERROR:
                 where = stack.partition("\n")[0] or module_of(frame)
@@ -187,42 +262,53 @@ class Guard:
         self.found(source, Mode.RECORD, call, finding_value(of, 0, text) if of else text, frame)
         return decoded(text)
 
-    def watched(self, source: Source, call: str, value: object, frame: FrameType) -> None:
+    def watched(
+        self,
+        source: Source,
+        call: str,
+        value: object,
+        frame: FrameType,
+        told: Callable[[Any], str] | None = None,
+    ) -> None:
         """Report a call that cannot be virtual, if user code made it and the job wants to know."""
-        user = user_frame(frame, self.packages)
-        if user is None:
+        if not self.is_for_user(frame):
             return
         mode = self.mode(source, frame)
         if mode is Mode.ALLOW:
             return
         # What can be neither made virtual nor recorded is at least reported.
-        told = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
-        self.found(source, told, call, value, frame)
+        at_least = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
+        self.found(source, at_least, call, value, frame, told)
 
-    def clock_ns(self, frame: FrameType) -> int:
+    def clock_ns(self, call: str, frame: FrameType, kind: int) -> int:
         """Return what a clock of the node (of the module, where no node runs) shows: now.
 
         Real clocks never show the same twice, and code that measures durations (to divide by them,
         say) relies on it. So whoever looks again at one instant sees a little more each time;
         not so Python's own modules, which wait by what they see. Whoever looks until time has
         passed makes it pass. A library that is being imported has a clock of its own.
+        ``kind`` says whose file the code of ``frame`` is of.
         """
+        event, node, now_ns = self._look()
+        if kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None):
+            try:
+                self._clock_looks[call][node] += 1
+            except KeyError:
+                self._clock_looks.setdefault(call, {})[node] = 1
         library = present_import()
         if library is not None:
-            return self.context.now_ns() + library.look()
-        event = self.context.place()[0]
+            return now_ns + library.look()
         if event != self._reads_event:
             self._reads_event, self._reads, self._passes = event, 0, 0
         self._reads += 1
         if self._reads > _READS_PER_EVENT:
             self._passes += 1  # the longer the wait, the longer the steps: about a thousandth
             self.context.pass_time(_BUSY_NS * (1 + self._passes // 100))
-            self._reads_event = self.context.place()[0]
-        now_ns = self.context.now_ns()
-        if is_of_python(frame):
+            self._reads_event, node, now_ns = self._look()
+        if kind == STANDARD:
             return now_ns
-        who = self.context.node() or module_of(frame)
-        before_ns, shown_ns = self._shown.get(who, (now_ns, now_ns - 1))
+        who = node or module_of(frame)
+        before_ns, shown_ns = self._shown.get(who, _NEVER)
         if now_ns > shown_ns or now_ns < before_ns:  # a node's clock may jump backwards
             shown_ns = now_ns
         elif shown_ns - now_ns < _AHEAD_NS_MAX:
@@ -250,10 +336,10 @@ _engaged: list[Guard] = []
 
 
 def engaged() -> Guard | None:
-    """Return the guard in charge of the calling thread, or None."""
+    """Return the guard in charge of the calling thread (and of no child process), or None."""
     if _engaged:
         guard = _engaged[-1]
-        if guard.in_charge():
+        if guard.thread == _thread_id() and guard.process == _here:
             return guard
     return None
 

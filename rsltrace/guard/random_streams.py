@@ -32,11 +32,17 @@ class RandomStreams:
 
     def random(self, name: str) -> Random:
         """Return the stand-in for the generator behind ``random``'s functions."""
-        return _made(self._random, f"random {self._seed_of(name)}", name)
+        found = self._random.get(name)
+        if found is None:
+            found = self._random[name] = Random(f"random {self._seed_of(name)} {name}")
+        return found
 
     def entropy(self, name: str, size: int) -> bytes:
         """Return the next bytes in place of the operating system's."""
-        return _made(self._entropy, f"entropy {self._seed_of(name)}", name).randbytes(size)
+        found = self._entropy.get(name)
+        if found is None:
+            found = self._entropy[name] = Random(f"entropy {self._seed_of(name)} {name}")
+        return found.randbytes(size)
 
     def numpy(self, name: str) -> Any:
         """Return the stand-in for the generator behind ``numpy.random``'s functions."""
@@ -47,10 +53,3 @@ class RandomStreams:
             seed = Random(f"numpy {self._seed_of(name)} {name}").getrandbits(32)
             found = self._numpy[name] = np.random.RandomState(seed)
         return found
-
-
-def _made(streams: dict[str, Random], kind: str, name: str) -> Random:
-    found = streams.get(name)
-    if found is None:
-        found = streams[name] = Random(f"{kind} {name}")
-    return found

@@ -2,9 +2,9 @@
 
 ``time.time = ours`` misses ``from time import time``, default arguments and tables of functions
 that were made before. All of them hold the same function object, so the object itself is turned:
-its method definition becomes one that calls our function (CPython's ``PyObject_Call`` has just the
-signature that a built-in with keywords needs). Nothing is compiled, a call costs what a call of a
-Python function costs, exceptions pass, and ``restore`` puts three pointers back.
+its method definition becomes one that calls our function (CPython's ``PyObject_Vectorcall`` has
+just the signature that a built-in with keywords needs). Nothing is compiled, a call costs what a
+call of a Python function costs, exceptions pass, and ``restore`` puts three pointers back.
 
 The layout is CPython's and has not changed since 3.8; it is checked before anything is written.
 """
@@ -20,12 +20,16 @@ from typing import Any
 
 from rsltrace.errors import SetupError
 
-_VARARGS_KEYWORDS = 0x3
+_FASTCALL_KEYWORDS = 0x82
+_NO_ARGUMENTS = 0x4
 _api = ctypes.pythonapi
-_CALL = ctypes.cast(_api.PyObject_Call, ctypes.c_void_p).value
+_CALL = ctypes.cast(_api.PyObject_Vectorcall, ctypes.c_void_p).value
 _new_function = ctypes.PYFUNCTYPE(
     ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p
 )(("PyCFunction_NewEx", _api))
+_new_descriptor = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object, ctypes.c_void_p)(
+    ("PyDescr_NewMethod", _api)
+)
 _count_up = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("Py_IncRef", _api))
 _count_down = ctypes.PYFUNCTYPE(None, ctypes.c_void_p)(("Py_DecRef", _api))
 
@@ -60,6 +64,16 @@ class _Method(ctypes.Structure):
     )
 
 
+def _vectorcall() -> int:
+    """Return how Python calls built-in functions with the flags of ours."""
+    definition = _MethodDef(b"", _CALL, _FASTCALL_KEYWORDS, None)
+    function = _new_function(ctypes.addressof(definition), id(None), None)
+    return int(_Function.from_address(id(function)).vectorcall)
+
+
+_VECTORCALL = _vectorcall()
+
+
 class Redirected:
     """A built-in function that calls something else until ``restore``. ``real`` is what it was."""
 
@@ -70,11 +84,11 @@ class Redirected:
         place = _Function.from_address(id(function))
         self._saved = (place.definition, place.owner, place.vectorcall)
         name = function.__name__.encode()
-        self._definition = _MethodDef(name, _CALL, _VARARGS_KEYWORDS, None)
+        self._definition = _MethodDef(name, _CALL, _FASTCALL_KEYWORDS, None)
         _count_up(id(target))
         place.definition = ctypes.addressof(self._definition)
         place.owner = id(target)
-        place.vectorcall = None
+        place.vectorcall = _VECTORCALL
 
     def restore(self) -> None:
         """Let the function be what it was."""
@@ -130,6 +144,18 @@ def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
         raise _unknown_layout()
     copy: Callable[..., Any] = _new_function(definition, place.owner, place.module)
     return copy
+
+
+def method_of(kind: type, name: str, function: Any) -> Callable[..., Any]:
+    """Return a function of CPython's that takes an object of ``kind`` as one of Python."""
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    definition = _MethodDef(name.encode(), address, _NO_ARGUMENTS, None)
+    _kept.append(definition)
+    method: Callable[..., Any] = _new_descriptor(kind, ctypes.addressof(definition))
+    return method
+
+
+_kept: list[_MethodDef] = []
 
 
 def _unknown_layout() -> SetupError:

@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.guard.callers import USER
 from rsltrace.guard.guard import Guard
 from rsltrace.model.finding import Policy
 from tests.guard.conftest import node_code
@@ -322,6 +324,9 @@ class Standing:
     def now_ns(self) -> int:
         return self.time_ns
 
+    def look(self) -> tuple[int, str, int]:
+        return *self.place()[:1], self.runs, self.time_ns
+
     def node(self) -> str:
         return self.runs
 
@@ -333,6 +338,10 @@ class Standing:
 
     def pass_time(self, for_ns: int) -> None:
         self.time_ns += for_ns
+
+
+def _look(guard: Guard, frame: FrameType) -> int:
+    return guard.clock_ns("a clock", frame, USER)
 
 
 @given(
@@ -352,7 +361,7 @@ def test_no_clock_shows_the_same_twice(steps: list[tuple[str, int]]) -> None:
             context.time_ns += advance_ns
             context.runs = node
             if node in nodes:
-                found.append((node, guard.clock_ns(frame), context.time_ns))
+                found.append((node, _look(guard, frame), context.time_ns))
         assert all(0 <= clock_ns - now_ns <= 60_000 for _, clock_ns, now_ns in found)
         return [clock_ns for node, clock_ns, _ in found if node == "/a"]
 
@@ -388,7 +397,7 @@ def test_a_long_busy_wait_takes_few_events_and_ends_in_time() -> None:
     context = Waiting()
     guard = Guard(context, policy=Policy())
     frame = sys._getframe()
-    while guard.clock_ns(frame) < 10**9:
+    while _look(guard, frame) < 10**9:
         pass
     assert 10**9 <= context.time_ns < 1.001 * 10**9
     assert context.passes < 5_000
@@ -399,6 +408,6 @@ def test_a_clock_that_jumps_backwards_is_followed() -> None:
     guard = Guard(context, policy=Policy())
     frame = sys._getframe()
     context.time_ns = 10**9
-    assert [guard.clock_ns(frame), guard.clock_ns(frame)] == [10**9, 10**9 + 1_000]
+    assert [_look(guard, frame), _look(guard, frame)] == [10**9, 10**9 + 1_000]
     context.time_ns = 10**8
-    assert [guard.clock_ns(frame), guard.clock_ns(frame)] == [10**8, 10**8 + 1_000]
+    assert [_look(guard, frame), _look(guard, frame)] == [10**8, 10**8 + 1_000]

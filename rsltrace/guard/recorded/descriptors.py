@@ -18,7 +18,6 @@ from functools import partial
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.callers import user_frame
 from rsltrace.guard.descriptor_table import Descriptor, number_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.process_ids import meant_path
@@ -42,9 +41,9 @@ _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 def recording(source: Source, frame: FrameType) -> Guard | None:
     """Return the guard if user code asks and the job records this source."""
     guard = engaged()
-    if guard is None or user_frame(frame, guard.packages) is None:
+    if guard is None or guard.mode(source, frame) is not Mode.RECORD:
         return None
-    return guard if guard.mode(source, frame) is Mode.RECORD else None
+    return guard if guard.is_for_user(frame) else None
 
 
 def tracked(fd: object) -> tuple[Guard, Descriptor] | None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import io
 import os
 import stat
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from sys import _getframe
 from typing import Any
 
 from rsltrace.guard.callers import is_nobodys
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard
 from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.recorded.descriptors import (
@@ -52,7 +53,7 @@ def _opening(real: Callable[..., Any]) -> Any:
         opener: Any = None,
     ) -> Any:
         file = meant_path(file)
-        frame = sys._getframe(1)
+        frame = caller()
         text = (buffering, encoding, errors, newline)
         if isinstance(file, int):
             if frame.f_globals.get("__name__") == "subprocess":  # a pipe to a program to be started
@@ -95,7 +96,7 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
             raise OSError(27, f"{name} is too large to be recorded")
         return data
 
-    data = guard.recorded(Source.FILE, f"open({name!r})", content, sys._getframe(2))
+    data = guard.recorded(Source.FILE, f"open({name!r})", content, _getframe(2))
     if data is not None:
         held = _Content(data, name)
         _, encoding, errors, newline = text
@@ -111,16 +112,16 @@ _REAL = {"stat": _real_stat, "lstat": copy_of(os.lstat)}  # type: ignore[arg-typ
 
 
 def _looking(name: str, plain: Callable[..., Any], real: Callable[..., Any]) -> Any:
-    def stat(path: Any, *more: Any, **options: Any) -> Any:
+    def stat(path: Any, **options: Any) -> Any:
         path = meant_path(path)
-        frame = sys._getframe(1)
+        frame = caller()
         if is_nobodys(frame):  # nor does the watch below have to know
-            return plain(path, *more, **options)
+            return plain(path, **options) if options else plain(path)
         guard = None if isinstance(path, int) else recording(Source.FILE, frame)
         if guard is None:
-            return real(path, *more, **options)
+            return real(path, **options)
         call = f"{name}({os.fsdecode(path)!r})"
-        return recorded_stat(guard, Source.FILE, call, lambda: real(path, *more, **options), frame)
+        return recorded_stat(guard, Source.FILE, call, lambda: real(path, **options), frame)
 
     return stat
 

@@ -17,7 +17,9 @@ from functools import partial
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
+from rsltrace.guard.callers import KINDS, OURS
 from rsltrace.guard.extension_types import put_member
+from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import Redirected, copy_of, redirect
 from rsltrace.model.finding import Mode, Source
@@ -68,8 +70,7 @@ def clock_call(
         )
     mode = guard.mode(Source.CLOCK, frame)
     if mode is Mode.VIRTUAL:
-        guard.count(Source.CLOCK, mode, call, frame)
-        return virtual(guard.clock_ns(frame))
+        return virtual(guard.clock_ns(call, frame, KINDS[code_of(frame).co_filename]))
     if mode is Mode.ALLOW:
         return real()
     if mode is Mode.RECORD:
@@ -97,7 +98,11 @@ def _reading(name: str, virtual: Callable[[int], Any], real: Callable[..., Any])
         guard = None if arguments else engaged()
         if guard is None:
             return real(*arguments)
-        return clock_call(guard, sys._getframe(1), call, virtual, real)
+        frame = caller()
+        kind = KINDS[code_of(frame).co_filename]
+        if kind <= OURS and guard.makes_clocks:  # of users and of rclpy: most calls
+            return virtual(guard.clock_ns(call, frame, kind))
+        return clock_call(guard, frame, call, virtual, real)
 
     return read
 
@@ -110,7 +115,7 @@ def _clock_gettime(name: str, virtual: Callable[[int], Any], real: Callable[...,
             return value
         return clock_call(
             guard,
-            sys._getframe(1),
+            caller(),
             f"time.{name}()",
             virtual,
             lambda: value,
@@ -128,7 +133,7 @@ def _broken_down(name: str, real: Callable[..., Any]) -> Any:
         if guard is None:
             return real(*arguments)
         return clock_call(
-            guard, sys._getframe(1), f"time.{name}()", lambda now_ns: real(now_ns // _NS), real
+            guard, caller(), f"time.{name}()", lambda now_ns: real(now_ns // _NS), real
         )
 
     return read
@@ -145,7 +150,7 @@ def _formatting(
             return real(*arguments)
         return clock_call(
             guard,
-            sys._getframe(1),
+            caller(),
             f"time.{name}()",
             lambda now_ns: real(*arguments, localtime(now_ns // _NS)),
             lambda: real(*arguments),
@@ -166,7 +171,7 @@ def _now(real: Any) -> Any:
             return real.__get__(None, cls)(tz)  # type: ignore[no-any-return]
         return clock_call(  # type: ignore[no-any-return]
             guard,
-            sys._getframe(1),
+            caller(),
             "datetime.now()",
             virtual,
             lambda: real.__get__(None, cls)(tz),
@@ -186,7 +191,7 @@ def _utcnow(real: Any) -> Any:
         if guard is None:
             return real.__get__(None, cls)()  # type: ignore[no-any-return]
         return clock_call(  # type: ignore[no-any-return]
-            guard, sys._getframe(1), "datetime.utcnow()", virtual, real.__get__(None, cls)
+            guard, caller(), "datetime.utcnow()", virtual, real.__get__(None, cls)
         )
 
     return utcnow
@@ -200,7 +205,7 @@ def numpy_now(function: Any, text: str, *more: Any) -> Any:
         return real
     return clock_call(
         guard,
-        sys._getframe(1),
+        caller(),
         f"datetime64({text!r})",
         lambda now_ns: function(now_ns, "ns").astype(real.dtype),
         lambda: real,
@@ -215,7 +220,7 @@ def opencv_clock(stack: ExitStack) -> None:
             guard = engaged()
             if guard is None:
                 return real()
-            return clock_call(guard, sys._getframe(1), "cv2.getTickCount()", lambda ns: ns, real)
+            return clock_call(guard, caller(), "cv2.getTickCount()", lambda ns: ns, real)
 
         return read
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.redirect import redirect
@@ -47,10 +47,10 @@ def _listing(name: str, arrange: Callable[[Any], Any], real: Callable[..., Any])
         guard = engaged()
         if guard is None:
             return value
-        frame = sys._getframe(1)
+        frame = caller()
         mode = guard.mode(Source.DIRECTORY, frame)
         if mode is Mode.VIRTUAL:
-            guard.count(Source.DIRECTORY, mode, call, frame)
+            guard.count(Source.DIRECTORY, call, frame)
             return arrange(value)
         if mode is not Mode.ALLOW:
             shown = repr(value[:10]) if isinstance(value, list) else ""

@@ -11,11 +11,11 @@ import ctypes
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from sys import _getframe
 from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
 from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.model.finding import Mode, Source
 
@@ -38,7 +38,7 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
     def __repr__(self: Any, /) -> str:  # noqa: N807
         text = real(self)
         guard = engaged()
-        if guard is None or guard.mode(Source.ADDRESS, _getframe(1)) is Mode.ALLOW:
+        if guard is None or guard.mode(Source.ADDRESS, caller()) is Mode.ALLOW:
             return text
         with engage(None):
             address = f"0x{id(self):x}"

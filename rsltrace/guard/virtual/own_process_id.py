@@ -41,7 +41,7 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         shown = module_of(frame) == _LOGGING  # which notes it in every record, whoever logs
         if mode is Mode.VIRTUAL and (shown or guard.is_user(frame)):
             if not shown:
-                guard.count(Source.PID, mode, _CALL, frame)
+                guard.count(Source.PID, _CALL, frame)
             return virtual_id(guard)
         if shown:
             return real()

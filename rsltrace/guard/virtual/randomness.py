@@ -15,9 +15,11 @@ import uuid
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
-from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
+from sys import _getframe
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import (
     Redirected,
@@ -28,6 +30,7 @@ from rsltrace.guard.redirect import (
 )
 from rsltrace.model.finding import Mode, Source
 
+_RANDOM = Source.RANDOM
 _NODE_ID = 0x02_00_00_00_00_01
 """A locally administered MAC address, for ``uuid1`` and ``getnode``."""
 
@@ -38,7 +41,7 @@ _real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
 def _drawn(
     call: str,
     real: Callable[..., Any],
-    virtual: Callable[[Guard, FrameType], Callable[..., Any]],
+    virtual: Callable[[Guard, str], Callable[..., Any]],
     *,
     is_method: bool = False,
 ) -> Any:
@@ -50,23 +53,20 @@ def _drawn(
         guard = engaged()
         if guard is None:
             return real(*arguments, **options)
-        frame = sys._getframe(1)
-        mode = guard.mode(Source.RANDOM, frame)
+        frame = caller()
+        if guard.makes_chance or (mode := guard.mode(_RANDOM, frame)) is Mode.VIRTUAL:
+            return virtual(guard, guard.drawn(call, frame))(*arguments, **options)
         if mode is Mode.RECORD:
+            stream = guard.stream(frame)
             guard.streams.begin(
-                guard.stream(frame),
-                lambda: guard.recorded(
-                    Source.RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame
-                ),
+                stream,
+                lambda: guard.recorded(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
             )
-            return virtual(guard, frame)(*arguments, **options)
-        if mode is Mode.VIRTUAL:
-            guard.count(Source.RANDOM, mode, call, frame)
-            return virtual(guard, frame)(*arguments, **options)
+            return virtual(guard, stream)(*arguments, **options)
         if mode is Mode.ALLOW:
             return real(*arguments, **options)
         value = real(*arguments, **options)
-        guard.found(Source.RANDOM, mode, call, _shown(value), frame)
+        guard.found(_RANDOM, mode, call, value, frame, _shown)
         return value
 
     return draw
@@ -108,12 +108,12 @@ class _Shared(random.Random):
         return vars(random).get(name) or super().__getattribute__(name)
 
 
-def _random_of(guard: Guard, frame: FrameType) -> Any:
-    return guard.streams.random(guard.stream(frame))
+def _random_of(guard: Guard, stream: str) -> Any:
+    return guard.streams.random(stream)
 
 
-def _numpy_of(guard: Guard, frame: FrameType) -> Any:
-    return guard.streams.numpy(guard.stream(frame))
+def _numpy_of(guard: Guard, stream: str) -> Any:
+    return guard.streams.numpy(stream)
 
 
 def _module_functions(
@@ -121,7 +121,7 @@ def _module_functions(
     module: Any,
     owner: Any,
     prefix: str,
-    generator: Callable[[Guard, FrameType], Any],
+    generator: Callable[[Guard, str], Any],
 ) -> None:
     """Redirect a module's functions that are methods of one shared generator."""
     for name, function in sorted(vars(module).items()):
@@ -130,8 +130,8 @@ def _module_functions(
         kind = RedirectedMethod if isinstance(function, MethodType) else Redirected
         real = getattr(owner, name)  # a new object: only the module's own is redirected
 
-        def virtual(guard: Guard, frame: FrameType, name: str = name) -> Any:
-            return getattr(generator(guard, frame), name)
+        def virtual(guard: Guard, stream: str, name: str = name) -> Any:
+            return getattr(generator(guard, stream), name)
 
         is_method = kind is RedirectedMethod
         draw = _drawn(f"{prefix}.{name}()", real, virtual, is_method=is_method)
@@ -139,11 +139,11 @@ def _module_functions(
 
 
 def _entropy(stack: ExitStack) -> None:
-    def bytes_of(guard: Guard, frame: FrameType) -> Callable[..., bytes]:
+    def bytes_of(guard: Guard, stream: str) -> Callable[..., bytes]:
         def entropy(size: int = 0, flags: int = 0) -> bytes:
             if not isinstance(size, int) or size < 0:
                 raise ValueError("negative argument not allowed")
-            return guard.streams.entropy(guard.stream(frame), size)
+            return guard.streams.entropy(stream, size)
 
         return entropy
 
@@ -196,7 +196,7 @@ def uuid1(node: int | None, clock_seq: int | None) -> uuid.UUID:
     if guard is None:
         return real(node, clock_seq)
     module: Any = uuid
-    last, stream = guard.streams.last_uuid, guard.stream(sys._getframe(2))
+    last, stream = guard.streams.last_uuid, guard.stream(_getframe(2))
     module._last_timestamp = last.get(stream)
     made = real(node, clock_seq)
     last[stream] = module._last_timestamp
@@ -209,8 +209,8 @@ def _shared_numpy(stack: ExitStack, module: Any) -> None:
     stack.callback(shared.set_state, shared.get_state())
     real = module.seed  # a function of its own that goes past the redirected methods
 
-    def seeding(guard: Guard, frame: FrameType) -> Callable[..., Any]:
-        seed: Callable[..., Any] = _numpy_of(guard, frame).seed
+    def seeding(guard: Guard, stream: str) -> Callable[..., Any]:
+        seed: Callable[..., Any] = _numpy_of(guard, stream).seed
         return seed
 
     draw = _drawn("numpy.random.seed()", real, seeding)
@@ -225,7 +225,7 @@ def _emptying(real: Callable[..., Any]) -> Any:
         made = real(*arguments, **options)
         guard = engaged()
         if guard is not None and not made.dtype.hasobject:
-            frame = sys._getframe(1)
+            frame = caller()
             if guard.is_user(frame) and guard.mode(Source.RANDOM, frame) is not Mode.ALLOW:
                 made.fill(0)
         return made

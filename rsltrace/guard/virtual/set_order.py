@@ -20,6 +20,7 @@ from typing import Any
 
 from rsltrace.guard.addresses import is_by_address
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.library_imports import importing
@@ -52,14 +53,15 @@ def ordered(thing: Any) -> Any:
     guard = engaged()
     if guard is None:
         return thing
-    frame = sys._getframe(1)
+    frame = caller()
     mode = guard.mode(Source.ORDER, frame)
-    if mode is Mode.ALLOW or not any(map(_has_no_order, thing)):
+    are_texts = _TEXTS.issuperset(map(type, thing))
+    if mode is Mode.ALLOW or not (are_texts or any(map(_has_no_order, thing))):
         return thing
     if mode is Mode.VIRTUAL:
-        in_order = _in_order(guard, thing)
+        in_order = sorted(thing) if are_texts else _in_order(guard, thing)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
-            guard.count(Source.ORDER, mode, "order of a set", frame)
+            guard.count(Source.ORDER, "order of a set", frame)
             return _Watched(thing, in_order)
     kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
     guard.watched(
@@ -69,8 +71,6 @@ def ordered(thing: Any) -> Any:
 
 
 def _in_order(guard: Guard, thing: Any) -> list[Any] | None:
-    if _TEXTS.issuperset(map(type, thing)):
-        return sorted(thing)
     try:
         return sorted(thing, key=_key)
     except TypeError:

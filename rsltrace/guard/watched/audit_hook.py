@@ -13,6 +13,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.callers import user_frame
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engage, engaged
 from rsltrace.model.finding import Mode, Source
 
@@ -51,6 +53,7 @@ _SOCKETS = {
     "socket.gethostbyaddr",
     "socket.gethostname",
 }
+_ADDRESSES = ("ctypes.addressof", "builtins.id")
 _FOREIGN = {
     "time": Source.CLOCK,
     "clock": Source.CLOCK,
@@ -80,19 +83,22 @@ _is_hooked = False
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     """Take an audit event: hundreds of kinds, of which few matter."""
     handle = _HANDLERS.get(event)
-    if handle is not None:
-        guard = engaged()
-        if guard is not None:
-            frame: Any = sys._getframe(1)
-            with engage(None):  # what a finding costs is no finding
-                wanted = handle(arguments, frame)
-            if wanted is not None:
-                source, call, value = wanted
-                if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
-                    return  # starting it is recorded, or else is a finding of its own
-                if source is Source.ADDRESS and not guard.is_user(frame):
-                    return  # libraries use id() for bookkeeping
-                guard.watched(source, call, value, frame)
+    guard = engaged() if handle is not None else None
+    if handle is None or guard is None:
+        return
+    frame: Any = caller()
+    if event in _ADDRESSES:
+        if not guard.is_user(frame):
+            return  # libraries use id() for bookkeeping
+    elif user_frame(frame, guard.packages) is None:
+        return
+    with engage(None):  # what a finding costs is no finding
+        wanted = handle(arguments, frame)
+    if wanted is not None:
+        source, call, value = wanted
+        if event == "subprocess.Popen" and guard.mode(source, frame) is Mode.RECORD:
+            return  # starting it is recorded, or else is a finding of its own
+        guard.watched(source, call, value, frame)
 
 
 _Wanted = tuple[Source, str, object] | None
@@ -146,8 +152,11 @@ def is_installed(path: object) -> bool:
     """Return whether a file is part of what is installed, whose versions a trace knows."""
     if not isinstance(path, (str, bytes, os.PathLike)):
         return False
-    with engage(None):  # the working directory that is asked for is no finding
-        return os.path.abspath(os.fsdecode(path)).startswith(_INSTALLED)
+    name = os.fsdecode(path)
+    if not name.startswith(os.sep) or "/." in name or "//" in name:
+        with engage(None):  # the working directory that is asked for is no finding
+            name = os.path.abspath(name)
+    return name.startswith(_INSTALLED)
 
 
 def _one(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Wanted]:

@@ -17,7 +17,8 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.callers import is_of_python, module_of, user_frame
+from rsltrace.guard.callers import is_of_python, module_of
+from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.model.finding import READ_BY, Mode, Source
@@ -39,12 +40,9 @@ class _Watched(_Environ):  # type: ignore[misc]
         guard = _guard_of(self, name)
         if guard is None:
             return str(super().__getitem__(name))
-        frame = sys._getframe(1)
+        frame = caller()
         call = f"os.environ[{name!r}]"
-        if (
-            guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD
-            and user_frame(frame, guard.packages) is not None
-        ):
+        if guard.mode(Source.ENVIRONMENT, frame) is Mode.RECORD and guard.is_for_user(frame):
             kept = guard.recorded(
                 Source.ENVIRONMENT, call, lambda: self._data.get(self.encodekey(name)), frame
             )
@@ -62,7 +60,7 @@ class _Watched(_Environ):  # type: ignore[misc]
     def __iter__(self) -> Iterator[str]:
         guard = _guard_of(self)
         if guard is not None:
-            frame = sys._getframe(1)
+            frame = caller()
             call = "os.environ" + _reader(frame)
             guard.watched(Source.ENVIRONMENT, call, f"{len(self)} variables", frame)
         names: Iterator[str] = super().__iter__()
@@ -102,7 +100,7 @@ def _reader(frame: FrameType | None) -> str:
     """Name the library that reads a variable, if the node itself does not."""
     while frame is not None and is_of_python(frame):
         frame = frame.f_back
-    if frame is None or not is_library(frame.f_code.co_filename):
+    if frame is None or not is_library(code_of(frame).co_filename):
         return ""
     return f"{READ_BY}{module_of(frame).partition('.')[0]}"
 

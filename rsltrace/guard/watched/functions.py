@@ -19,7 +19,7 @@ from types import BuiltinFunctionType
 from typing import Any
 
 from rsltrace.guard.addresses import hashed_by_address, is_by_address
-from rsltrace.guard.callers import is_nobodys, user_frame
+from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.watched.audit_hook import (
@@ -57,36 +57,31 @@ def _statement(sql: str) -> None:
     if guard is not None and match is not None:
         chance = match.group().lower().startswith("random")
         source = Source.RANDOM if chance else Source.CLOCK
-        guard.watched(source, f"SQLite: {match.group()}", sql[:200], sys._getframe(1))
+        guard.watched(source, f"SQLite: {match.group()}", sql[:200], caller())
 
 
 def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
+    made_of = _RECORDED.get(name)
+
     def call(*arguments: Any, **options: Any) -> Any:
         guard = engaged()
         if guard is None:
             return real(*arguments, **options)
-        frame = sys._getframe(1)
-        if is_nobodys(frame):
-            return real(*arguments, **options)
+        frame = caller()
+        if not guard.is_for_user(frame):
+            return real(*arguments, **options)  # ROS and Python, for themselves
         if source is not Source.THREAD and asking_module(frame) in _NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
         if source is Source.FILE:
-            if user_frame(frame, guard.packages) is None:
-                return real(*arguments, **options)  # ROS and Python, for themselves
             if is_installed(arguments[0] if arguments else options.get("path")):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
         said = f"{name}({shown})"
-        made_of = _RECORDED.get(name)
-        if (
-            made_of is not None
-            and guard.mode(source, frame) is Mode.RECORD
-            and user_frame(frame, guard.packages) is not None
-        ):
+        if made_of is not None and guard.mode(source, frame) is Mode.RECORD:
             return made_of(guard.recorded(source, said, lambda: real(*arguments, **options), frame))
         value = real(*arguments, **options)
-        guard.watched(source, said, _told(value), frame)
+        guard.watched(source, said, value, frame, _told)
         return value
 
     return call
@@ -122,10 +117,10 @@ def _hashing(real: Callable[[Any], int]) -> Any:
         value = real(thing)
         if is_by_address(thing):
             guard = engaged()
-            frame = sys._getframe(1)
+            frame = caller()
             if guard is None:
                 return value
-            if frame.f_code.co_name == "__hash__":
+            if code_of(frame).co_name == "__hash__":
                 hashed_by_address(frame)  # matters where a set of such objects is gone through
             elif guard.is_user(frame):
                 kind = type(thing).__qualname__

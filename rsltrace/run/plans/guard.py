@@ -66,6 +66,7 @@ class RunGuard:
                 seed=job.seed,
                 packages=_packages(job.nodes),
                 on_finding=on_finding,
+                one_policy=all(spec.guard is None for spec in job.nodes),
             )
             begin_shared(job.seed)
             if replay is not None:
