@@ -1,8 +1,8 @@
 """Pinning the process: what can only be set before Python starts, and what libraries read once.
 
 ``pin`` starts the same command once more in the same process, with a fixed hash seed, without
-address-space randomisation (where the kernel allows it), in UTC, in the C.UTF-8 locale, and with
-one thread for each numerical library. It costs what starting Python costs. ``unpin`` goes back.
+address-space randomisation (where the kernel allows it), in UTC, in the C.UTF-8 locale, with one
+thread for each numerical library and one order of the folders of libraries. It costs what starting Python costs. ``unpin`` goes back.
 """
 
 from __future__ import annotations
@@ -30,6 +30,10 @@ THREADS = (
 )
 PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 
+_LIBRARIES = "LD_LIBRARY_PATH"
+_BY_WHEELS = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
+"""Set by ROS's wheels once they have started Python again with their folders."""
+
 _ADDR_NO_RANDOMIZE = 0x0040000
 _ASK = 0xFFFFFFFF
 _UNPINNED = "off"
@@ -52,9 +56,22 @@ def pin() -> None:
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
         return
-    before = {name: os.environ.get(name) for name in PINNED}
+    changes = {**PINNED, **_libraries()}
+    before = {name: os.environ.get(name) for name in changes}
     fixed = fix_addresses(True)
-    _start_again({**PINNED, _MARK: json.dumps({**before, "addresses": fixed})})
+    _start_again({**changes, _MARK: json.dumps({**before, "addresses": fixed})})
+
+
+def _libraries() -> dict[str, str]:
+    """Return where libraries are looked for, in one order.
+
+    ROS's wheels put their folders there in the order of a set, another one at each start, and have
+    copies of one library in several: which is loaded, and where, would differ from run to run.
+    """
+    folders = os.environ.get(_LIBRARIES, "")
+    if _BY_WHEELS not in os.environ or not folders:
+        return {}
+    return {_LIBRARIES: os.pathsep.join(sorted(folders.split(os.pathsep)))}
 
 
 def unpin() -> None:

@@ -68,6 +68,9 @@ class CallSites:
             _tell(self._dispatcher, self._entity, code, found.f_globals, found.f_lineno, output)
 
 
+_address = object.__hash__  # as id(), but no audit hook is told of it; nor of __code__, if need be
+
+
 class Functions:
     """The functions of the user's that events run beside the callbacks of their entities."""
 
@@ -85,7 +88,8 @@ class Functions:
         plain = callback.__func__ if type(callback) is MethodType else callback
         is_plain = type(plain) is FunctionType and not args
         if is_plain and (
-            (entity, id(plain.__code__)) in self._known or (entity, id(plain)) in self._known
+            (entity, _address(plain)) in self._known
+            or (entity, _address(plain.__code__)) in self._known
         ):
             return
         self._met += 1
@@ -97,7 +101,9 @@ class Functions:
                 # A decorator's function has one code, whatever it decorates.
                 is_itself = found is not None and found[0] is plain.__code__
                 kept = plain.__code__ if is_itself else plain
-                self._known[entity, id(kept)] = kept
+                self._known[entity, _address(kept)] = kept
+                if plain.__closure__ is None:  # found at once, and keeps nothing alive
+                    self._known[entity, _address(plain)] = plain
             if found is not None and is_user_file(found[0].co_filename):
                 self._tell(entity, *found)
                 return
