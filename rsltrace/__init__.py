@@ -7,7 +7,7 @@
 >>> rsltrace.diff("run.mcap", "other.mcap").sentence      # doctest: +SKIP
 
 The names below are the public API. They are loaded when first used: importing rsltrace loads
-neither rclpy nor numpy.
+neither rclpy nor numpy. (To pytest, whose plugin it is: PYTEST_DONT_REWRITE.)
 """
 
 from __future__ import annotations

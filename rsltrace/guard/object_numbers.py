@@ -13,6 +13,8 @@ import types
 import weakref
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -93,6 +95,8 @@ class ObjectNumbers:
         elif isinstance(thing, (type, types.FunctionType, types.BuiltinFunctionType)):
             line = thing.__code__.co_firstlineno if isinstance(thing, types.FunctionType) else 0
             parts.append(f"{kind.__name__} {thing.__module__}.{thing.__qualname__} {line}")
+            if isinstance(thing, types.FunctionType) and depth < _DEPTH_MAX:
+                self._describe(_bound_in(thing), parts, depth + 1)
         elif isinstance(thing, (types.ModuleType, enum.Enum)):
             name = thing.__name__ if isinstance(thing, types.ModuleType) else thing.name
             parts.append(f"{kind.__name__} {name}")
@@ -109,6 +113,8 @@ class ObjectNumbers:
         parts.append(f"{kind.__module__}.{kind.__qualname__}")
         if depth >= _DEPTH_MAX:
             return
+        if kind is partial:
+            thing, kind = [thing.func, thing.args, thing.keywords], list
         if kind in (list, tuple):
             parts.append(str(len(thing)))
             held: Iterable[tuple[Any, Any]] = enumerate(thing)
@@ -153,6 +159,15 @@ class ShownNumbers:
                 return None
             kept[key] = (lambda: thing), number
         return number
+
+
+def _bound_in(function: types.FunctionType) -> list[Any]:
+    """Return what tells functions of one line apart: default values, variables around them."""
+    held = []
+    for cell in function.__closure__ or ():
+        with suppress(ValueError):  # it is empty
+            held.append(cell.cell_contents)
+    return [function.__defaults__, function.__kwdefaults__, held]
 
 
 def _has_plain_data(array: np.ndarray[Any, Any]) -> bool:

@@ -2,7 +2,8 @@
 
 ``pin`` starts the same command once more in the same process, with a fixed hash seed, without
 address-space randomisation (where the kernel allows it), in UTC, in the C.UTF-8 locale, with one
-thread for each numerical library and one order of the folders of libraries. It costs what starting Python costs. ``unpin`` goes back.
+thread for each numerical library and one order of the folders of libraries. It costs what starting
+Python costs. ``unpin`` goes back.
 """
 
 from __future__ import annotations

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+import rsltrace.guard.pin as pin
 from rsltrace.campaign.perturb import can_fix_addresses
 from rsltrace.trace.reader import Trace
 
@@ -48,6 +50,26 @@ def test_the_process_is_pinned_whatever_was_set(
     with Trace.open(tmp_path / "run.mcap") as trace:
         assert trace.environment["hash_seed"] == "0"
         assert "numerics" not in trace.environment, "no module of the job uses numbers"
+
+
+def test_libraries_are_looked_for_in_one_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[Mapping[str, str]] = []
+    monkeypatch.setattr(pin, "_before", "")
+    monkeypatch.setattr(pin, "fix_addresses", lambda fixed: False)
+    monkeypatch.setattr(os, "execve", lambda file, words, environment: started.append(environment))
+    monkeypatch.setenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE", "1")
+    for folders in ("/site/ros_b.libs:/mine:/site/ros_a.libs", "/site/ros_a.libs:/mine"):
+        monkeypatch.setenv("LD_LIBRARY_PATH", folders)
+        pin.pin()
+    monkeypatch.delenv("_ROS_WHEELS_BOOTSTRAP_COMPLETE")  # without wheels the order is the user's
+    pin.pin()
+    assert [one["LD_LIBRARY_PATH"] for one in started] == [
+        "/mine:/site/ros_a.libs:/site/ros_b.libs",
+        "/mine:/site/ros_a.libs",
+        "/site/ros_a.libs:/mine",
+    ]
+    before = json.loads(started[0]["RSLTRACE_PINNED"])
+    assert before["LD_LIBRARY_PATH"] == "/site/ros_b.libs:/mine:/site/ros_a.libs"
 
 
 @pytest.mark.parametrize(

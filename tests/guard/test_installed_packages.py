@@ -6,6 +6,7 @@ import gc
 import json
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,10 @@ def test_who_is_a_library() -> None:
         assert not is_user_file(file), file
 
 
+def method_of(name: str) -> Callable[[], str]:
+    return lambda: name
+
+
 def test_numbers_are_kept_for_as_long_as_an_object_lives() -> None:
     class Thing:
         def __init__(self, name: str, other: object = None) -> None:
@@ -140,6 +145,11 @@ def test_numbers_are_kept_for_as_long_as_an_object_lives() -> None:
     circle = Thing("circle")
     circle.other = circle
     assert numbers.in_order([circle, a, 3, "text"]) is not None
+    made = [lambda n=n: n for n in "cab"] + [partial(print, n) for n in "ed"]
+    made += [method_of(name) for name in "gf"]
+    in_order = numbers.in_order(made)
+    assert in_order == [made[n] for n in (6, 5, 1, 2, 0, 4, 3)]  # told apart by what they hold
+    del made, in_order
     del a, b, circle
     gc.collect()
     assert not numbers._kept

@@ -15,7 +15,7 @@ def exit_status(error: SystemExit) -> int:
     """Return the status with which Python would end."""
     if error.code is None:
         return 0
-    return error.code if isinstance(error.code, int) else 1
+    return int(error.code) if isinstance(error.code, int) else 1
 
 
 def end_child(error: BaseException) -> NoReturn:

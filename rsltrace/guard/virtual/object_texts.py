@@ -22,6 +22,9 @@ from rsltrace.model.finding import Mode, Source
 _WORDS_BEFORE_REPR = 11
 _REPR_AT = _WORDS_BEFORE_REPR * ctypes.sizeof(ctypes.c_void_p)
 """Where a type of CPython keeps the function that makes its text, at least since 3.8; checked."""
+_as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
+    ("PyInstanceMethod_New", ctypes.pythonapi)
+)
 _SHOWN_ALIKE = (FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType)
 
 
@@ -44,7 +47,10 @@ def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
             address = f"0x{id(self):x}"
             return text.replace(address, _shown(guard, self) or address)
 
-    return __repr__
+    # Neither a function nor new: numba's jitclass looks for what a class adds to ``object``.
+    vars(__repr__)["__objclass__"] = getattr(real, "__objclass__", None)
+    method: Callable[[Any], str] = _as_method(__repr__)
+    return method
 
 
 def _shown(guard: Guard, thing: Any) -> str | None:
