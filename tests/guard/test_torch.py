@@ -81,3 +81,22 @@ def test_a_seed_of_the_nodes_own_is_its_own_in_torch(said: Said, torch: str) -> 
 def test_torch_that_is_loaded_late_and_seeded_by_chance(said: Said, torch: str) -> None:
     code = node_code(f"{torch}\ntorch.seed()\n{DRAW}")
     assert said(code) == said(code)
+
+
+GRAPH = """
+def weighed(x):
+    first, second = x, x + 1
+    for name in {"aa", "b", "ccc"}:
+        first = first * len(name)
+    names = ["a", "b"]
+    names.pop()
+    return max(len(names), 0) * first.sum() + sum([second.sum() for _ in range(2)]), f"{len(names)}"
+"""
+
+
+def test_code_with_sets_in_order_is_one_graph(said: Said) -> None:
+    """``fullgraph``: nothing in it is left to Python. (Twice: it is told for good.)"""
+    pytest.importorskip("torch")
+    tick = "total, text = torch.compile(weighed, backend='eager', fullgraph=True)(torch.ones(2))\n"
+    code = node_code(tick + "self.say(float(total), text)", imports="import torch", module=GRAPH)
+    assert said(code) == said(code) == [[20.0, "1"]] * 2

@@ -20,6 +20,7 @@ from rsltrace.guard.virtual.original_code import READERS, show_original
 from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
+from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
 from rsltrace.guard.virtual.torch_streams import torch_streams
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount, Mode, Source
@@ -138,6 +139,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
+            COMPILES: plain_in_graphs,
             **{name: partial(show_original, name, stack) for name in READERS},
         }
         orders = _orders_sets(job)
