@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterable
-from types import CodeType, ModuleType
+from types import CodeType, FunctionType, ModuleType
 
 from rsltrace.guard.callers import is_own, is_user_file
 from rsltrace.job import Job
@@ -78,10 +78,17 @@ def _modules(job: Job) -> Iterable[ModuleType]:
 
 
 def _uses_numbers(module: ModuleType) -> bool:
+    """Whether a module has something of the libraries, or a function that imports one."""
+    file = getattr(module, "__file__", None)
     for value in list(vars(module).values()):
         name = value.__name__ if isinstance(value, ModuleType) else _home(value)
         if name.partition(".")[0] in _LIBRARIES:
             return True
+        functions = vars(value).values() if isinstance(value, type) else (value,)
+        for one in functions:
+            code = one.__code__ if type(one) is FunctionType else None
+            if code is not None and code.co_filename == file and _imports_numbers(code):
+                return True
     return False
 
 

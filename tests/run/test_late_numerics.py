@@ -28,6 +28,7 @@ _JOB = "nodes: [{{{entry}}}]\nstop: {{time: 1s}}\n"
     [
         ("main: 'm:main'", "import late_numbers", True),
         ("main: 'm:main'", "import late_words", False),
+        ("main: 'm:main'", "import late_tests", True),
         ("script: m.py", "import numpy", True),
         ("script: m.py", "import json", False),
     ],
@@ -42,6 +43,9 @@ def test_libraries_that_a_run_imports_are_named(
 ) -> None:
     (tmp_path / "late_numbers.py").write_text("from numpy.linalg import solve\n")
     (tmp_path / "late_words.py").write_text("import json\n")
+    (tmp_path / "late_tests.py").write_text(
+        "class Tests:\n    def test(self):\n        import numpy as np\n"
+    )
     code = _MAIN.format(imports=imports) + "if __name__ == '__main__':\n    main()\n"
     (tmp_path / "m.py").write_text(code)
     (tmp_path / "job.yaml").write_text(_JOB.format(entry=entry))
@@ -49,7 +53,7 @@ def test_libraries_that_a_run_imports_are_named(
         monkeypatch.setattr(numerical_libraries, "_kernels", lambda name=name: f"openblas {name}")
         assert command("record", "job.yaml", "-o", f"{name}.mcap").returncode == 0
         (tmp_path / "m.py").write_text(code.replace("done", "done otherwise"))
-        for module in ("late_numbers", "late_words", "m"):
+        for module in ("late_numbers", "late_words", "late_tests", "m"):
             sys.modules.pop(module, None)
     with Trace.open(tmp_path / "SkylakeX.mcap") as trace:
         assert trace.environment.get("numerics") == ("openblas SkylakeX" if found else None)
