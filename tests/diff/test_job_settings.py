@@ -34,6 +34,7 @@ class Recorded:
 
     job_text: str
     job: dict[str, str]
+    name: str = "run.mcap"
 
 
 def recorded(folder: Path, text: str = JOB, *overrides: str) -> Recorded:
@@ -137,6 +138,22 @@ def test_without_a_resolved_job_lines_are_compared(tmp_path: Path, resolved: str
     assert key == "robot.yaml:9"
     assert line_a is not None
     assert line_b == line_a.replace("0.05", "0.06")
+
+
+def test_lines_of_a_job_that_was_put_together_are_those_of_the_file_here(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    a = recorded(tmp_path, JOB, "stop.duration=3s")
+    b = recorded(tmp_path, JOB.replace("0.05", "0.06"), "stop.duration=3s")
+    before = told(a, b)
+    ((place, values),) = before.items()
+    assert place.startswith("robot.yaml:9: ")
+    (tmp_path / "robot.yaml").write_text(JOB.replace("0.05", "0.07"))
+    ((key, _),) = told(a, b).items()
+    assert key == place.replace("robot.yaml:9", "job"), "it says neither of the values"
+    (tmp_path / "robot.yaml").unlink()
+    assert told(a, b) == {key: values}
 
 
 @pytest.mark.parametrize("text", ["", "a: [", "- 1\n- 2\n", "\x00", "&a [*a]", "nodes: 3\n"])

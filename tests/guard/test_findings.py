@@ -126,6 +126,31 @@ def test_a_million_calls_in_an_event_are_not_a_million_records(
     assert [met.count for met in result.guarded] == [6000]
 
 
+def test_what_a_main_has_read_is_the_likely_cause(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    import rsltrace
+
+    (tmp_path / "prog.py").write_text(
+        "import os, rclpy\nfrom std_msgs.msg import String\nWHO = os.environ.get('WHO')\n"
+        "def main():\n"
+        "    rclpy.init()\n"
+        "    node = rclpy.create_node('prog')\n"
+        "    who = node.create_publisher(String, 'who', 10)\n"
+        "    rclpy.spin_once(node, timeout_sec=0.1)\n"
+        "    who.publish(String(data=str(WHO)))\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{main: 'prog:main'}]\nsearch_path: [.]\n")
+    for name in "ab":
+        monkeypatch.setenv("WHO", name * 3)
+        job = rsltrace.load_job(tmp_path / "job.yaml")
+        rsltrace.record(job, tmp_path / f"{name}.mcap")
+    found = rsltrace.diff(tmp_path / "a.mcap", tmp_path / "b.mcap")
+    cause = "main prog:main read WHO, aaa in a and bbb in b, at prog.py:3"
+    assert cause in found.sentence
+    assert "not deterministic" not in found.divergences[0].root_sentence
+
+
 def test_info_cat_and_diff_tell(
     recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -7,10 +7,11 @@ from itertools import zip_longest
 
 from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.answers import STARTED_BY, answer_text
-from rsltrace.diff.causes.event_views import node_of
+from rsltrace.diff.causes.event_views import node_of, subject_of
 from rsltrace.diff.causes.module_code import used_by
 from rsltrace.diff.result.divergence import CallDifference
 from rsltrace.diff.result.events import EventView
+from rsltrace.model.entity import EntityKind
 from rsltrace.model.finding import Finding, Mode, Source
 from rsltrace.model.printable import printable, shortened
 
@@ -35,9 +36,9 @@ def call_differences(
     if differing:
         return (*differing, *(call for call in inside if call.a == call.b))[:CALLS_MAX]
     some = a or b
-    node = node_of(some) if some is not None else ""
+    is_somebodys = some is not None and subject_of(some)
     # Where one run has no such event: up to there the two agree, indexes and all.
-    before = _paired(_before(run_a, a or b, node), _before(run_b, b or a, node)) if node else []
+    before = _paired(_before(run_a, a or b), _before(run_b, b or a)) if is_somebodys else []
     earlier = [call for call in before if call.a != call.b][:EARLIER_MAX]
     places = {call.where for call in earlier}
     programs = [c for c in before if c.call.startswith(STARTED_BY) and c.where in places]
@@ -48,7 +49,7 @@ def call_differences(
 def unrecorded_call(run: Run, view: EventView) -> str:
     """Say which answer of a socket or a program nobody kept: the last one in an event, else the
     last one before it in its node; "" if there was none."""
-    found = [*_before(run, view, node_of(view)), *_inside(run, view)]
+    found = [*_before(run, view), *_inside(run, view)]
     kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
     one = next(kept, None)
     if one is None:
@@ -65,16 +66,26 @@ def _inside(run: Run, view: EventView | None) -> list[Finding]:
     return run.trace.findings.get(view.index, []) if view is not None else []
 
 
-def _before(run: Run, view: EventView | None, node: str) -> list[Finding]:
+def _before(run: Run, view: EventView | None) -> list[Finding]:
+    """Return what the node of an event, or its main if it is of none, called before."""
     if view is None:
         return []
-    files = _files_of(run, node)
+    node = node_of(view)
+    files = _files_of(run, view)
     return [
         finding
         for index, found in run.trace.findings.items()
         for finding in found
-        if (index < view.index and finding.node == node) or _is_of_import(finding, files)
+        if (index < view.index and _is_of(run, finding, node, view))
+        or _is_of_import(finding, files)
     ]
+
+
+def _is_of(run: Run, finding: Finding, node: str, view: EventView) -> bool:
+    if finding.node or node:
+        return finding.node == node
+    entity = run.trace.entities.get(finding.entity)
+    return entity is not None and entity.kind is EntityKind.MAIN and entity.name == view.entity.name
 
 
 def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
@@ -83,10 +94,16 @@ def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
     return not finding.node and function == "<module>" and place.rpartition(":")[0] in files
 
 
-def _files_of(run: Run, node: str) -> frozenset[str]:
-    """Return the files of the modules that a node uses, as places in code name them."""
-    found = (e.type for e in run.trace.entities.values() if e.name == node and e.type)
-    module = next(found, "").partition(":")[0]
+def _files_of(run: Run, view: EventView) -> frozenset[str]:
+    """Return the files of the modules that a node or main uses, as places in code name them."""
+    node = node_of(view)
+    entities = run.trace.entities.values()
+    if node:
+        module = next((e.type for e in entities if e.name == node and e.type), "").partition(":")[0]
+    else:
+        mains = (e for e in entities if e.kind is EntityKind.MAIN and e.name == view.entity.name)
+        file = next((e.source for e in mains), "").rpartition(":")[0]
+        module = file.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
     names = [name.replace(".", "/") for name in used_by((run.trace, run.trace), module) if name]
     return frozenset(f"{name}{end}" for name in names for end in (".py", "/__init__.py"))
 

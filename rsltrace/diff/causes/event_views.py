@@ -135,6 +135,12 @@ def node_of(view: EventView) -> str:
     return view.entity.name if is_node else view.entity.node
 
 
+def subject_of(view: EventView) -> str:
+    """Return the node an event is of, ``main package:main`` for a main without one, or ""."""
+    is_main = view.entity.kind == EntityKind.MAIN.label
+    return node_of(view) or (f"main {view.entity.name}" if is_main else "")
+
+
 def phrase(view: EventView) -> str:
     """Return what ran, as part of a sentence: ``subscription /scan of /filter``."""
     return event_phrase(view.kind, view.entity)

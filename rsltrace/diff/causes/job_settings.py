@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from rsltrace.diff.causes.record_command import is_effective, is_of_file
+from rsltrace.diff.causes.record_command import is_effective, is_of_file, job_file
 from rsltrace.diff.causes.relevance import resolved_job
 from rsltrace.diff.result.settings import Setting
 from rsltrace.model.nesting import nested_too_deep
@@ -25,6 +25,7 @@ from rsltrace.trace.reader import Trace
 _LINES_MAX = 20_000
 """Longer job files are compared as a whole: difflib takes time with the square of the lines."""
 
+_BYTES_MAX = 1 << 20
 _NANOSECONDS = "_ns"
 _NOTHING: tuple[object, ...] = (None, [], {})
 _NO_VALUES = tuple((nothing,) for nothing in _NOTHING)
@@ -83,32 +84,55 @@ class _JobText:
 
     def __init__(self, trace: Trace) -> None:
         self.text: str = trace.job_text
-        self.is_file: bool = bool(self.text) and is_of_file(trace) and not is_effective(trace)
-        """An effective job was put together from files and options: its lines are of none."""
+        self._trace = trace
+        self._is_put_together = is_effective(trace)
+        """From files and options: the lines of its text are of none."""
 
     @cached_property
     def _root(self) -> Any:
-        return _composed(self.text)
+        if not self.text or not is_of_file(self._trace):
+            return None
+        return _composed(self._file_here() if self._is_put_together else self.text)
+
+    def _file_here(self) -> str:
+        """Return the text of the job file as it is here now, "" if it is not."""
+        path, _ = job_file(self._trace, self._trace.job["name"])
+        try:
+            with open(path, encoding="utf-8") as file:
+                return file.read(_BYTES_MAX)
+        except (OSError, ValueError):
+            return ""
 
     def place(self, path: Path, leaf: tuple[Any] | None) -> tuple[int, int]:
         """Return how much of a path the file has, and the line (from 1) where that is, or 0, 0.
 
         Where the leaf is not there, neither is the last step: what the file has at an entry's
-        number is another entry.
+        number is another entry. A file that is here has only what it gives the same value.
         """
-        node: Any = self._root if self.is_file else None
+        node: Any = self._root
         path = path if leaf is not None else path[:-1]
         line = 0
         for depth, step in enumerate(path):
             found = _child(node, step)
-            if found is None and path[0] == "nodes" and depth < 2:
+            if found is None and path[0] == "nodes" and depth < 2 and not self._is_put_together:
                 found = _child(self._root, "launch")  # whose nodes come after those of the job
                 return (1, found[0].start_mark.line + 1) if found else (depth, line)
             if found is None:
-                return depth, line
+                return (0, 0) if self._is_put_together else (depth, line)
             place, node = found
             line = place.start_mark.line + 1
+        if self._is_put_together and (leaf is None or not _says(node, leaf[0])):
+            return 0, 0
         return len(path), line
+
+
+def _says(node: Any, value: Any) -> bool:
+    """Whether the text of a YAML node is a value's."""
+    from ruamel.yaml.nodes import ScalarNode
+
+    if not isinstance(node, ScalarNode):
+        return False
+    return bool(node.value == (value if isinstance(value, str) else json.dumps(value)))
 
 
 def _composed(text: str) -> Any:

@@ -10,7 +10,7 @@ from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.answers import STARTED_BY, answers_apart
 from rsltrace.diff.causes.call_differences import unrecorded_call
 from rsltrace.diff.causes.classify import Judgement
-from rsltrace.diff.causes.event_views import node_of
+from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.set_order import set_behind
 from rsltrace.diff.causes.wording import MADE_DIFFERENTLY, NAMED_MAX
@@ -59,7 +59,7 @@ def with_likely_cause(
     if judgement.root not in _OPEN_TO_IT or not judgement.root_sentence or view is None:
         return judgement
     if calls and calls[0].a != calls[0].b:
-        text = calls_sentence(calls, node_of(view), messages)
+        text = calls_sentence(calls, subject_of(view), messages)
     else:
         text = set_behind(run, view, messages, calls, relevance)
     if not text:

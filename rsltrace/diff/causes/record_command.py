@@ -111,7 +111,7 @@ def record_again(trace: Trace) -> RecordAgain:
     if not is_of_file(trace):
         return RecordAgain()
     name = trace.job["name"]
-    path, is_same = _job_file(trace, name)
+    path, is_same = job_file(trace, name)
     words = _Words([path])
     if is_effective(trace):
         for line in trace.job_text.splitlines()[1:]:
@@ -140,7 +140,7 @@ def record_again(trace: Trace) -> RecordAgain:
     return RecordAgain(words.command(), () if is_same or not words.job else (warning,))
 
 
-def _job_file(trace: Trace, name: str) -> tuple[str, bool]:
+def job_file(trace: Trace, name: str) -> tuple[str, bool]:
     """Return the job file, "" if there is none, and whether it is the one that was recorded.
 
     A trace knows its name, and often lies beside it.
