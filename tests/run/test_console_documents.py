@@ -1,8 +1,12 @@
 """What the documents show is run as it stands: files are written, commands give what is shown.
 
 ``<!-- file: NAME -->`` stands before a file's text, ``<!-- run -->`` before commands with what they
-print, ``<!-- setup … -->`` holds commands that a reader does not see. In what is shown, ``...``
-stands for any lines, ``…`` for any text within a line; spaces count once.
+print, ``<!-- run: DATA -->`` before those that need ``shared/data/DATA`` beside the checkout, and
+are left out without it; ``<!-- setup … -->`` holds commands that a reader does not see. In what is
+shown, ``...`` stands for any lines, ``…`` for any text within a line; spaces count once.
+
+What follows a debugger's prompt is typed there, unless ``-c`` says it. A block that begins with
+such a prompt goes on in the session of the block before it.
 """
 
 from __future__ import annotations
@@ -11,7 +15,7 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -20,28 +24,54 @@ pytestmark = [pytest.mark.ros, pytest.mark.long]
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
 DOCUMENTS = sorted(
     path
     for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))
-    if "<!-- run -->" in path.read_text("utf-8")
+    if "<!-- run" in path.read_text("utf-8")
 )
 _BLOCK = re.compile(
-    r"<!-- (?:(?:file: (?P<name>\S+)|run) -->\n```\w+\n(?P<text>.*?)^```"
+    r"<!-- (?:(?:file: (?P<name>\S+)|run(?:: (?P<data>\S+))?) -->\n```\w+\n(?P<text>.*?)^```"
     r"|setup\n(?P<setup>.*?)^-->)",
     re.M | re.S,
 )
+_PROMPT = re.compile(r"\((?:rsltrace|Pdb)\) (.*)")
 
 
-def blocks(text: str) -> Iterator[re.Match[str]]:
-    """Yield what is marked, in order."""
-    return _BLOCK.finditer(text)
+@dataclass
+class Step:
+    """A command with the lines that it is to print, or (None) one that a reader does not see."""
+
+    command: str
+    expected: list[str] | None = None
+    data: str | None = None
+
+    @property
+    def typed(self) -> str:
+        """What is typed while it runs."""
+        if self.expected is None or " -c " in self.command:
+            return ""
+        typed = filter(None, map(_PROMPT.fullmatch, self.expected))
+        return "".join(f"{line[1]}\n" for line in typed)
 
 
-def commands(text: str) -> Iterator[tuple[str, list[str]]]:
-    """Yield each command of a console block with the lines that it is to print."""
-    for part in re.split(r"^\$ ", text, flags=re.M)[1:]:
-        command, *expected = part.rstrip("\n").split("\n")
-        yield command, expected
+def steps(text: str) -> list[Step]:
+    """Return what a document has done, in order."""
+    found: list[Step] = []
+    for block in _BLOCK.finditer(text):
+        if block["setup"]:
+            found.append(Step(f"set -e\n{block['setup']}"))
+        elif block["name"]:
+            end = "END-OF-FILE"
+            found.append(Step(f"cat > {block['name']} <<'{end}'\n{block['text']}{end}"))
+        else:
+            before, *parts = re.split(r"^\$ ", block["text"].rstrip("\n"), flags=re.M)
+            if before:
+                assert found[-1].expected is not None, f"no session before: {before}"
+                found[-1].expected += before.rstrip("\n").split("\n")
+            for command, *expected in (part.rstrip("\n").split("\n") for part in parts):
+                found.append(Step(command, expected, block["data"]))
+    return found
 
 
 def pattern(expected: list[str]) -> str:
@@ -60,7 +90,7 @@ def shown(output: str) -> str:
     return "".join(f"{' '.join(row.split())}\n" for row in output.rstrip("\n").split("\n"))
 
 
-def console(command: str, folder: Path) -> str:
+def console(command: str, folder: Path, typed: str = "") -> str:
     environment = {
         **os.environ,
         "PATH": f"{os.path.dirname(sys.executable)}{os.pathsep}{os.environ['PATH']}",
@@ -68,10 +98,12 @@ def console(command: str, folder: Path) -> str:
         "COLUMNS": "100",
         "ROOT": str(ROOT),
     }
+    environment.pop("PYTHONHASHSEED", None)
     done = subprocess.run(
         ["bash", "-c", command],
         cwd=folder,
         env=environment,
+        input=typed,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -84,24 +116,21 @@ def console(command: str, folder: Path) -> str:
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_every_command_does_what_it_shows(document: Path, tmp_path: Path) -> None:
     ran = 0
-    for block in blocks(document.read_text("utf-8")):
-        if block["setup"]:
-            console(f"set -e\n{block['setup']}", tmp_path)
-        elif block["name"]:
-            (tmp_path / block["name"]).write_text(block["text"])
-        else:
-            for command, expected in commands(block["text"]):
-                printed = console(command, tmp_path)
-                ran += 1
-                output = shown(printed) if printed else ""
-                assert re.fullmatch(pattern(expected), output), f"$ {command}\n{printed}"
+    for step in steps(document.read_text("utf-8")):
+        if step.data is not None and not (DATA / step.data).exists():
+            continue
+        printed = console(step.command, tmp_path, step.typed)
+        if step.expected is not None:
+            ran += 1
+            output = shown(printed) if printed else ""
+            assert re.fullmatch(pattern(step.expected), output), f"$ {step.command}\n{printed}"
     assert ran
 
 
 def test_the_documents_that_show_results_are_run() -> None:
     names = {path.name for path in DOCUMENTS}
     assert names >= {"README.md", "recipes.md", "debugging.md", "what-if.md", "verify.md"}
-    assert names >= {"audit.md", "guard.md", "launch.md"}
+    assert names >= {"audit.md", "guard.md", "launch.md", "bisect.md", "one-node.md"}
 
 
 def test_a_line_that_is_stale_is_noticed() -> None:
