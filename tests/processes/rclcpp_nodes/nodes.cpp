@@ -1,9 +1,10 @@
 // Nodes of rclcpp with most of what rclcpp has: tied timers, parameters, a service and its client, a
 // latched topic, and a listener whose executor runs in a thread of its own, as tf2's does.
 //
-// Usage: nodes single|multi|static
+// Usage: nodes single|multi|static|events
 #include <chrono>
 #include <memory>
+#include <rclcpp/experimental/executors/events_executor/events_executor.hpp>
 #include <rclcpp/rclcpp.hpp>
 #include <std_msgs/msg/u_int64.hpp>
 #include <std_srvs/srv/set_bool.hpp>
@@ -126,6 +127,8 @@ int main(int argc, char **argv) {
   rclcpp::Executor::SharedPtr executor;
   if (kind == "multi") executor = std::make_shared<rclcpp::executors::MultiThreadedExecutor>();
   if (kind == "static") executor = std::make_shared<rclcpp::executors::StaticSingleThreadedExecutor>();
+  if (kind == "events")
+    executor = std::make_shared<rclcpp::experimental::executors::EventsExecutor>();
   if (!executor) executor = std::make_shared<rclcpp::executors::SingleThreadedExecutor>();
   auto talker = std::make_shared<Talker>();
   auto listener = std::make_shared<Listener>();
