@@ -264,6 +264,43 @@ def test_a_process_may_end_or_start_others(
     _no_process_of(counter)
 
 
+LARGE = """
+import sys
+import rclpy
+from std_msgs.msg import UInt8MultiArray
+
+rclpy.init()
+node = rclpy.create_node(sys.argv[1])
+out = node.create_publisher(UInt8MultiArray, sys.argv[1], 10)
+if sys.argv[1] == 'asked':
+    sizes = [10, 20_000, 3_000_000, 70_000, 0, 9_000_000]
+    def ask():
+        if sizes:
+            size = sizes.pop(0)
+            out.publish(UInt8MultiArray(data=(bytes(range(256)) * (size // 256 + 1))[:size]))
+    node.create_timer(0.1, ask)
+else:
+    node.create_subscription(UInt8MultiArray, 'asked', out.publish, 10)
+rclpy.spin(node)
+"""
+
+
+@long
+def test_large_messages_arrive_as_they_were_sent(compiled: Compiled, tmp_path: Path) -> None:
+    (tmp_path / "large.py").write_text(LARGE)
+    entries = "".join(
+        f"  - {{script: large.py, isolated: true, arguments: [{name}]}}\n"
+        for name in ("answered", "asked")
+    )
+    (tmp_path / "job.yaml").write_text(f"nodes:\n{entries}stop: {{duration: 1s}}\n")
+    assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
+    said = _said(tmp_path / "t.mcap", "/asked", "/answered")
+    assert said["/asked"] == said["/answered"]
+    assert [len(data) - 16 for _, data in said["/asked"]] == [
+        10, 20_000, 3_000_000, 70_000, 0, 9_000_000
+    ]  # fmt: skip
+
+
 def _no_process_of(program: Path) -> None:
     """Fail unless every process of a program ends soon: the kernel needs a moment."""
     deadline = time.monotonic() + 60
