@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from rsltrace import DiffOptions, diff_bags
 from tests.diff.judged_messages import Rules, encoded, judged, write_mcap, write_sqlite
+from tests.truth.graph import write_bag
 
 COUNTS = ("equal", "tolerated", "ignored", "differing")
 
@@ -140,3 +141,57 @@ def test_every_message_is_judged_as_its_values_are(
 
 def _plain(options: DiffOptions) -> dict[str, Any]:
     return {name: getattr(options, name) for name in ("ignore", "absolute", "relative")}
+
+
+@st.composite
+def edited(draw: Any) -> tuple[list[float], list[float]]:
+    """Return values, and the same with some missing, extra, changed or in other places, and noise
+    of less than 0.001 in some."""
+    values = st.sampled_from([0.0, 1.0, 2.0, 3.0, *map(float, range(100, 140))])
+    a = draw(st.lists(values, min_size=1, max_size=14))
+    b = list(a)
+    for _ in range(draw(st.integers(0, 3))):
+        at, to = draw(st.integers(0, len(b) - 1)), draw(st.integers(0, len(b) - 1))
+        match draw(st.sampled_from(("missing", "extra", "changed", "swapped", "moved"))):
+            case "missing" if len(b) > 1:
+                del b[at]
+            case "extra":
+                b.insert(at, draw(values))
+            case "changed":
+                b[at] = draw(values)
+            case "swapped":
+                b[at], b[to] = b[to], b[at]
+            case "moved":
+                b.insert(to, b.pop(at))
+    return a, [value + draw(st.sampled_from((0.0, 0.0, 1e-4, -1e-4))) for value in b]
+
+
+@settings(max_examples=40)
+@given(edited(), st.booleans())
+def test_both_orders_say_the_same_and_name_where_the_recordings_first_differ(
+    two: tuple[list[float], list[float]], tolerant: bool
+) -> None:
+    options = DiffOptions(absolute=(("data", 1e-3),) if tolerant else ())
+    most = 1e-3 if tolerant else 0.0
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [Path(folder) / "a.mcap", Path(folder) / "b.mcap"]
+        for path, values in zip(paths, two, strict=True):
+            write_bag(path, [(5 + 10 * n, "/t", value) for n, value in enumerate(values)])
+        (one,) = diff_bags(*paths, options).topics
+        (other,) = diff_bags(*paths[::-1], options).topics
+    for name in ("equal", "tolerated", "differing", "moved"):
+        assert getattr(one, name) == getattr(other, name), name
+    assert (one.only_a, one.only_b) == (other.only_b, other.only_a)
+    paired = one.equal + one.tolerated + one.differing + one.moved
+    assert [paired + one.only_a, paired + one.only_b] == [len(values) for values in two]
+    a, b = two
+    places = (n for n, (x, y) in enumerate(zip(a, b, strict=False)) if abs(x - y) > most)
+    differs = next(places, None if len(a) == len(b) else min(len(a), len(b)))
+    assert (one.first is None) == (differs is None)
+    if one.first is not None and differs is not None:
+        told = [(view.index, side) for view, side in ((one.first.a, a), (one.first.b, b)) if view]
+        # Of several that are alike, any may be called the missing one.
+        assert any(
+            index <= differs and all(abs(side[index] - x) <= 2e-3 for x in side[index:differs])
+            for index, side in told
+        )

@@ -148,18 +148,21 @@ def compare_topic(
     own = options.for_topic(pair.a.name)
     moved = {} if options.by == BY_STAMP else moved_messages(pair.keys_a, pair.keys_b, pair.gaps)
     came_from = {in_b: in_a for in_a, in_b in moved.items()}
-    ignored = _ignored(pair)
     counts = _counted(pair, len(moved))
+    counts.ignored = _ignored(pair, outside=own.tolerant and options.by != BY_STAMP)
     first = None
     if pair.gaps:
         rules = FieldRules(own)
         side_a, side_b = fetched.sides(pair)
         if own.tolerant:
-            counts = _Counts(equal=len(pair.keys_a))
+            counts = _Counts(equal=len(pair.keys_a), ignored=counts.ignored)
         gaps = pair.gaps if own.tolerant else pair.gaps[:1]
         by_stamp, tolerant = options.by == BY_STAMP, own.tolerant
         pairing = Pairing(side_a.get, side_b.get, rules, by_stamp=by_stamp, tolerant=tolerant)
         for one in pairing.of(gaps, pair.keys_a, pair.keys_b):
+            if min(one) >= 0 and pair.keys_a[one.a] == pair.keys_b[one.b]:
+                counts.ignored += bool(pair.full_a[one.a] != pair.full_b[one.b])
+                continue
             whole = MessagePair(
                 one.a if one.a >= 0 else came_from.get(one.b, -1),
                 one.b if one.b >= 0 else moved.get(one.a, -1),
@@ -177,12 +180,12 @@ def compare_topic(
         topic=pair.a.name,
         type_a=pair.a.type,
         type_b=pair.b.type,
-        equal=counts.equal - ignored,
+        equal=counts.equal - counts.ignored,
         tolerated=counts.tolerated,
         differing=counts.differing,
         only_a=counts.only_a,
         only_b=counts.only_b,
-        ignored=ignored,
+        ignored=counts.ignored,
         moved=counts.moved,
         first=first,
     )
@@ -196,6 +199,7 @@ class _Counts:
     only_a: int = 0
     only_b: int = 0
     moved: int = 0
+    ignored: int = 0
 
     def add(self, one: MessagePair, *, covered: bool, moved: bool) -> None:
         """Count what is not the same; ``equal`` begins as all of a."""
@@ -228,16 +232,22 @@ def _counted(pair: TopicPair, moved: int) -> _Counts:
     return counts
 
 
-def _ignored(pair: TopicPair) -> int:
-    """Return how many messages belong together and differ in nothing but what is ignored."""
+def _ignored(pair: TopicPair, *, outside: bool) -> int:
+    """Return how many messages belong together and differ in nothing but what is ignored.
+
+    ``outside``: before the first gap and after the last one only.
+    """
     if pair.full_a is pair.keys_a:
         return 0
+    gaps = pair.gaps
+    if outside and gaps:
+        gaps = [Gap(gaps[0].a_start, gaps[-1].a_end, gaps[0].b_start, gaps[-1].b_end)]
     count = i = j = 0
-    for gap in (*pair.gaps, Gap(len(pair.keys_a), 0, len(pair.keys_b), 0)):
+    for gap in (*gaps, Gap(len(pair.keys_a), 0, len(pair.keys_b), 0)):
         size = gap.a_start - i
         count += int((pair.full_a[i : i + size] != pair.full_b[j : j + size]).sum())
         size = min(gap.a_end - gap.a_start, gap.b_end - gap.b_start)
-        if size > 0:
+        if size > 0 and not outside:
             in_a, in_b = (
                 slice(gap.a_start, gap.a_start + size),
                 slice(gap.b_start, gap.b_start + size),

@@ -33,6 +33,19 @@ class Gap(NamedTuple):
         """How many more there are in a than in b."""
         return (self.a_end - self.a_start) - (self.b_end - self.b_start)
 
+    @property
+    def mirrored(self) -> Gap:
+        """The same gap with the sequences the other way round."""
+        return Gap(self.b_start, self.b_end, self.a_start, self.a_end)
+
+
+def is_turned(a: Keys, b: Keys) -> bool:
+    """Whether b is to be compared with a, and not a with b, so that both orders say the same."""
+    if len(a) != len(b):
+        return len(a) > len(b)
+    different = np.flatnonzero(a != b)
+    return len(different) > 0 and bool(a[different[0]] > b[different[0]])
+
 
 def gaps_by_order(a: Keys, b: Keys, within: list[Gap] | None = None) -> list[Gap]:
     """Return the gaps between two sequences in their order; no gap if they are equal.
@@ -42,6 +55,9 @@ def gaps_by_order(a: Keys, b: Keys, within: list[Gap] | None = None) -> list[Gap
     finer keys: what is between them is known to be equal, whatever its keys.
     """
     outer = [Gap(0, len(a), 0, len(b))] if within is None else within
+    if is_turned(a, b):
+        turned = [gap.mirrored for gap in outer]
+        return [inner.mirrored for gap in turned for inner in _gaps(b, a, gap)]
     return [inner for gap in outer for inner in _gaps(a, b, gap)]
 
 
@@ -70,7 +86,11 @@ def gaps_by_stamp(a: Keys, b: Keys, stamps_a: Keys, stamps_b: Keys) -> list[Gap]
                 if keys_a[at] != keys_b[other]:
                     gaps.append(Gap(at, at + 1, other, other + 1))
         else:
-            gaps += _gaps(a, b, Gap(i, end_a, j, end_b))
+            gap = Gap(i, end_a, j, end_b)
+            if is_turned(a[i:end_a], b[j:end_b]):
+                gaps += (inner.mirrored for inner in _gaps(b, a, gap.mirrored))
+            else:
+                gaps += _gaps(a, b, gap)
         i, j = end_a, end_b
     return gaps
 
@@ -88,6 +108,13 @@ def moved_messages(a: Keys, b: Keys, gaps: list[Gap]) -> dict[int, int]:
 
     In one place only a has it, in another only b.
     """
+    if is_turned(a, b):
+        turned = _moved(b, a, [gap.mirrored for gap in gaps])
+        return {in_a: in_b for in_b, in_a in turned.items()}
+    return _moved(a, b, gaps)
+
+
+def _moved(a: Keys, b: Keys, gaps: list[Gap]) -> dict[int, int]:
     there: dict[int, list[int]] = {}
     for gap in gaps:
         if gap.a_start == gap.a_end:
