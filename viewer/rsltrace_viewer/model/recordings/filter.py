@@ -38,7 +38,7 @@ FIELDS = {
     "topic": "messages on a topic",
     "type": "messages of a type",
     "time": "seconds since the start: 1.5..2, >3, 20ms",
-    "index": "number of the message on its topic: 100..200",
+    "index": "message number on its topic: 100..200",
     "text": "text in the message, decoded",
     "level": "log records of a level or worse",
 }

@@ -12,6 +12,7 @@ from textual.widget import Widget
 from rsltrace.model.printable import printable
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.inspector.lines import Line
+from rsltrace_viewer.model.recordings.filter import FIELDS
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Recording
 from rsltrace_viewer.model.recordings.session import RecordingSession
@@ -238,7 +239,7 @@ class RecordingApp(RecordingShell):
 
     def action_help(self) -> None:
         """Show all keys."""
-        self.push_screen(KeysScreen(recording_keys(two=self.session.two)))
+        self.push_screen(KeysScreen(recording_keys(two=self.session.two), FIELDS))
 
     async def action_quit(self) -> None:
         """Leave."""

@@ -14,7 +14,7 @@ RECORDING_KEYS: tuple[Key, ...] = (
     Key("t", "t", "ask('time')", "go to a time since the start", FIND, "time", 6),
     Key("slash", "/", "ask('search')", "search: a word, or as in a filter", FIND, "search", 4),
     Key("F", "F", "ask('filter')", "show only some messages: topic:/x …", FIND, "filter", 5),
-    Key("n", "n", "next_match(1)", "next match; of two, without a search, next difference", FIND),
+    Key("n", "n", "next_match(1)", "next match; without a search, difference", FIND),
     Key("N", "N", "next_match(-1)", "previous match or difference", FIND),
     Key("v", "v", "report", "how the recordings compare: the report", COMPARE, "why", 3, True),
     Key("p", "p", "plot", "plot fields and rates", LOOK, "plot", 4),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import zip_longest
 from typing import ClassVar
 
@@ -45,26 +45,27 @@ class HelpScreen(ModalScreen[None]):
         with VerticalScroll() as box:
             box.border_title = "rsltrace view: keys"
             box.border_subtitle = "Esc closes, ↓ scrolls"
-            yield Static(help_text(self.app.size.width, two=self._two, live=self._live))
+            yield Static(self.text())
+
+    def text(self) -> Content:
+        """Return the text."""
+        return help_text(self.app.size.width, two=self._two, live=self._live)
 
 
 class KeysScreen(HelpScreen):
-    """The keys of another screen, and no more."""
+    """The keys of another screen, and the ``fields`` of its filters with what they mean."""
 
-    def __init__(self, keys: Sequence[Key]) -> None:
+    def __init__(self, keys: Sequence[Key], fields: Mapping[str, str]) -> None:
         super().__init__(two=False)
         self._keys = keys
+        self._fields = fields
 
-    def compose(self) -> ComposeResult:
-        """Make the text."""
+    def text(self) -> Content:
+        """Return the text."""
         groups = dict.fromkeys(key.group for key in self._keys)
-        lines = [
-            line for group in groups for line in [*_keys_block(group, self._keys), Content("")]
-        ]
-        with VerticalScroll() as box:
-            box.border_title = "rsltrace view: keys"
-            box.border_subtitle = "Esc closes, ↓ scrolls"
-            yield Static(Content("\n").join(lines))
+        blocks = [_keys_block(group, self._keys) for group in groups]
+        blocks.append(_filter_block(self._fields, _EXAMPLE_OF_MESSAGES))
+        return _in_columns(blocks, self.app.size.width)
 
 
 def help_text(width: int, *, two: bool, live: bool = False) -> Content:
@@ -72,7 +73,11 @@ def help_text(width: int, *, two: bool, live: bool = False) -> Content:
     keys = keys_of(two=two, live=live)
     blocks = [_keys_block(group, keys) for group in dict.fromkeys(key.group for key in keys)]
     blocks.append(_signs_block(two))
-    blocks += [_lanes_block(), _filter_block()]
+    fields = {name: field.help for name, field in FIELDS.items()}
+    return _in_columns([*blocks, _lanes_block(), _filter_block(fields, _EXAMPLE)], width)
+
+
+def _in_columns(blocks: Sequence[Sequence[Content]], width: int) -> Content:
     count = max(1, min((width - _FRAME) // _COLUMN, _COLUMNS_MAX))
     if count == 1:
         return Content("\n").join([line for block in blocks for line in [*block, Content("")]])
@@ -135,14 +140,18 @@ def _lanes_block() -> list[Content]:
     return lines
 
 
-def _filter_block() -> list[Content]:
+_EXAMPLE = "node:/ekf -kind:timer (level:warn or is:raised)"
+_EXAMPLE_OF_MESSAGES = "topic:/scan time:>2 (text:nan or index:<5)"
+
+
+def _filter_block(fields: Mapping[str, str], example: str) -> list[Content]:
     lines = [Content.styled("Filters (F) and searches (/)", "bold underline")]
-    for name, field in FIELDS.items():
+    for name, text in fields.items():
         shown = fit(f"{name}:", _KEY_WIDTH)
-        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), field.help))
+        lines.append(Content.assemble("  ", (shown, "bold $text-primary"), text))
     lines += [
         Content("  a bare word looks in names, logs and exceptions"),
         Content("  all must hold; or  not  ( )  and - before a field"),
-        Content("  node:/ekf -kind:timer (level:warn or is:raised)"),
+        Content(f"  {example}"),
     ]
     return lines

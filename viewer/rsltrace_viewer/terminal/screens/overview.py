@@ -190,13 +190,14 @@ class OverviewScreen(Screen[Choice | None]):
             heads.append((f"{f'{what} {name}'.strip():>10}{'Hz':>9}", "muted"))
         heads += [(f"{words:>{_TIMES}}", "muted") for words, _ in columns]
         yield heads, None
+        largest = max((_some(row).share for row in rows), default=0) or 1
         most = len(rows)
         if field not in self._whole:
             shown = (self.app.size.height - _OTHER_LINES) // 3
             most = most if most <= shown + 1 else max(shown, _LINES_LEAST)
         for row in rows[:most]:
             some = _some(row)
-            bar = "█" * min(round(some.share * bars), bars) or "▏"
+            bar = "█" * round(some.share * bars / largest) or "▏"
             pieces = [(fit(_name(row, field), names) + " ", "plain"), (fit(bar, bars) + " ", "bar")]
             differ = len({part.count if part else 0 for part in row}) > 1
             pieces += [(_numbers(part), "error" if differ else "plain") for part in row]
