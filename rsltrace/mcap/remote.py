@@ -251,8 +251,10 @@ class _Clock:
         thread = threading.Thread(target=run, name="rsltrace-fetch", daemon=True)
         thread.start()
         thread.join(max(allowed_s, 0))
-        self._left_s -= time.monotonic() - begin
-        if not answer:
+        took_s = time.monotonic() - begin
+        self._left_s -= took_s
+        # the library's own time limit may be over before we have waited
+        if not answer or (isinstance(answer[0], Exception) and took_s >= allowed_s):
             which = "one request" if allowed_s == limits.REQUEST_SECONDS_MAX else "all requests"
             most = limits.REQUEST_SECONDS_MAX if which[0] == "o" else limits.REMOTE_SECONDS_MAX
             raise _FetchError(
