@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace._version import __version__
 
 if TYPE_CHECKING:
+    from rsltrace.checks.evaluate import CheckResult, evaluate_checks
     from rsltrace.debug.client import DebugSession
     from rsltrace.diff import diff_files as diff
     from rsltrace.diff.bags.comparison import diff_bags
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from rsltrace.errors import RsltraceError
     from rsltrace.job import (
         BagSpec,
+        CheckSpec,
         HooksSpec,
         Job,
         LaunchSpec,
@@ -45,6 +47,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagDiff": "rsltrace.diff.result.bags",
     "BagSpec": "rsltrace.job",
+    "CheckResult": "rsltrace.checks.evaluate",
+    "CheckSpec": "rsltrace.job",
     "DebugSession": "rsltrace.debug.client",
     "Diff": "rsltrace.diff.result.traces",
     "DiffOptions": "rsltrace.diff.options",
@@ -63,6 +67,7 @@ _HOMES = {
     "Trace": "rsltrace.trace.reader",
     "Verdict": "rsltrace.diff.result.traces",
     "diff_bags": "rsltrace.diff.bags.comparison",
+    "evaluate_checks": "rsltrace.checks.evaluate",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",
 }
@@ -70,6 +75,8 @@ _HOMES = {
 __all__ = [
     "BagDiff",
     "BagSpec",
+    "CheckResult",
+    "CheckSpec",
     "DebugSession",
     "Diff",
     "DiffOptions",
@@ -90,6 +97,7 @@ __all__ = [
     "__version__",
     "diff",
     "diff_bags",
+    "evaluate_checks",
     "load_job",
     "record",
     "replay",

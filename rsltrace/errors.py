@@ -108,6 +108,10 @@ class ConditionError(RsltraceError):
         super().__init__(f"{message}\n  {shown}\n  {' ' * self.start}{carets}")
 
 
+class CheckError(RsltraceError):
+    """A check of a job that cannot be held against a run."""
+
+
 class RunError(RsltraceError):
     """The run went wrong. What happened until then is in the trace."""
 

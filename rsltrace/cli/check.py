@@ -41,6 +41,13 @@ if TYPE_CHECKING:
     help="Draw the graph of nodes and topics.",
 )
 @click.option(
+    "--job",
+    "other",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="JOB",
+    help="Hold the checks of this job against the trace, instead of those of its own.",
+)
+@click.option(
     "--all", "everything", is_flag=True, help="With what every node has: /rosout, parameters, …"
 )
 def check(
@@ -50,6 +57,7 @@ def check(
     overrides: tuple[str, ...],
     form: str,
     graph: Path | None,
+    other: Path | None,
     everything: bool,
 ) -> int:
     """Check JOB (or a launch file) and print what it means: all of the job, and its nodes' graph.
@@ -57,16 +65,26 @@ def check(
     The nodes are constructed (so their constructors run), the loop never is: what a node creates
     later, in a callback, is not seen.
 
-    The exit status is 0 if all is well, 1 if something in the graph looks wrong (QoS that keeps a
-    publisher and a subscription apart, a subscription or a client without anybody at the other
-    end, a topic that a bag plays and a node publishes, a rule of the job that fits nothing), 2 if
-    the job cannot run.
+    With a trace instead of a job (rsltrace check run.mcap), the job's checks (checks:) are held
+    against it; functions among them are called only where --job names a file.
+
+    The exit status is 0 if all is well, 1 if a check is not kept, or something in the graph looks
+    wrong (QoS that keeps a publisher and a subscription apart, a subscription or a client without
+    anybody at the other end, a topic that a bag plays and a node publishes, a rule of the job that
+    fits nothing), 2 if the job cannot run.
     """
+    from rsltrace.checks.evaluate import check_texts
+    from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 
     if graph is not None and graph.suffix != ".svg":
         raise click.BadParameter(f"{graph} should end in .svg", param_hint="--graph")
+    if len(words) == 1 and is_trace(words[0]):
+        return _check_trace(Path(words[0]), other, form)
+    if other is not None:
+        raise click.UsageError("--job is for a trace: rsltrace check run.mcap --job job.yaml")
     loaded, _ = job_of(words, launch, skip, overrides)
+    check_texts(loaded)
     try:
         checked = check_job(loaded, everything=everything)
     except RunError as error:
@@ -85,6 +103,29 @@ def check(
         if not checked.problems and launch is None and not overrides:
             tell(f"next: rsltrace record {shlex.join(words)}")
     return 1 if checked.problems else 0
+
+
+def _check_trace(path: Path, other: Path | None, form: str) -> int:
+    """Hold checks against a trace; the code that its own job names is not run."""
+    from rsltrace.cli.output.checks import Checked
+    from rsltrace.job import job_from_text, load_job
+    from rsltrace.trace.reader import Trace
+
+    if other is not None:
+        job = load_job(other)
+    else:
+        with Trace.open(path) as trace:
+            job = job_from_text(trace.job_text, f"the job of {path}", Path.cwd())
+    if not job.checks:
+        named = other if other is not None else f"the job of {path}"
+        tell(f"rsltrace: error: {named} has no checks (checks:); --job names another job")
+        return EXIT_USAGE
+    checked = Checked(job, path, functions=other is not None)
+    if form == "json":
+        say(json.dumps(checked.values(), indent=2))
+    else:
+        say("\n".join(checked.lines()))
+    return 1 if checked.violated else 0
 
 
 def _draw(checked: Checked, path: Path) -> None:

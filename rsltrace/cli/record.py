@@ -17,7 +17,7 @@ import click
 
 from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
-from rsltrace.errors import NodeError, RsltraceError
+from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.model.finding import READ_BY, Source
 from rsltrace.model.printable import printable
@@ -26,6 +26,7 @@ from rsltrace.terminal import say, tell
 from rsltrace.words.silent_topics import silent_topics
 
 if TYPE_CHECKING:
+    from rsltrace.cli.output.checks import Checked
     from rsltrace.job import Job
     from rsltrace.loop.stop import Stop
     from rsltrace.run import RunResult
@@ -90,7 +91,8 @@ def record(
 
     The nodes' log records go to stderr. The last line on stdout is
     "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
-    The exit status is the job's (0 unless its stop condition says otherwise), 3 if a node raised,
+    The exit status is the job's (0 unless its stop condition says otherwise), 1 if one of its
+    checks (checks:) is not kept, 3 if a node raised,
     130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
     """
     from rsltrace.run import Observer, run
@@ -112,6 +114,10 @@ def record(
         from rsltrace.bag.export import check_bag_folder, export_bag
 
         check_bag_folder(bag, force=force)
+    if loaded.checks:
+        from rsltrace.checks.evaluate import check_texts
+
+        check_texts(loaded)
     told: list[str] = []
 
     def tell(note: str) -> None:
@@ -139,7 +145,9 @@ def record(
     status = result.exit_code
     reopen_standard_streams()
     try:
-        _report(result, told, as_json=as_json)
+        checked, checks_status = _checked(loaded, result)
+        status = status or checks_status
+        _report(result, told, checked, as_json=as_json)
         if bag is not None:
             count = export_bag(result.path or path, bag, force=force)
             tell(f"wrote {bag}: {count} messages")
@@ -203,7 +211,21 @@ def _silent_topics(result: RunResult) -> list[str]:
     return [f"{found}; rsltrace check tells who talks to whom"] if found else []
 
 
-def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
+def _checked(job: Job, result: RunResult) -> tuple[Checked | None, int]:
+    """Hold the job's checks against what was recorded; return what came of it, and a status."""
+    if not job.checks or result.path is None:
+        return None, 0
+    from rsltrace.cli.output.checks import Checked
+
+    try:
+        checked = Checked(job, result.path)
+    except RsltraceError as error:  # the trace is there all the same
+        tell(f"rsltrace: error: {error}")
+        return None, EXIT_USAGE
+    return checked, 1 if checked.violated else 0
+
+
+def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_json: bool) -> None:
     error = result.error
     silent = _silent_topics(result)
     for note in (*result.notes, *silent):
@@ -214,6 +236,8 @@ def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
             tell(error.traceback_text.rstrip())
         tell(f"rsltrace: error: {error}")
     _warn(result)
+    for line in [] if checked is None else checked.lines():
+        tell(line)
     if as_json:
         say(
             json.dumps(
@@ -227,6 +251,7 @@ def _report(result: RunResult, told: list[str], *, as_json: bool) -> None:
                     "stop_reason": result.stop_reason,
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
+                    **({} if checked is None else {"checks": checked.values()}),
                     "notes": [*result.notes, *silent, *([result.kept] if result.kept else [])],
                 }
             )

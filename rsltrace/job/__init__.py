@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from rsltrace.job.job import Job
     from rsltrace.job.parts.bag import BagSpec, QosSpec
+    from rsltrace.job.parts.check import CheckSpec
     from rsltrace.job.parts.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.parts.hooks import HooksSpec
     from rsltrace.job.parts.launch import LaunchSpec
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "BagSpec": "parts.bag",
+    "CheckSpec": "parts.check",
     "GuardSpec": "parts.guard",
     "HooksSpec": "parts.hooks",
     "Job": "job",
@@ -39,6 +41,7 @@ _HOMES = {
 
 __all__ = [
     "BagSpec",
+    "CheckSpec",
     "GuardSpec",
     "HooksSpec",
     "Job",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from rsltrace.job.parts.bag import BagSpec
+from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.parts.clocks import ClockSpec, clocks_part
 from rsltrace.job.parts.delay import DelaysSpec
 from rsltrace.job.parts.distribution import files_of
@@ -190,6 +191,18 @@ class JobFields(Part):
             {"advances": True},
         ],
     )
+    checks: Annotated[tuple[CheckSpec, ...], parts()] = Field(
+        default=(),
+        description="What has to be true of a run: `rsltrace record` says what was not, and ends "
+        "with status 1 then; `rsltrace check run.mcap` holds it against a trace.",
+        examples=[
+            [
+                {"always": "/odom.pose.pose.position.x < 10"},
+                {"eventually": "/stop", "after": "/scan: min(ranges) < 0.3", "within": "200ms"},
+                {"never": "log error"},
+            ]
+        ],
+    )
 
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(
@@ -230,6 +243,7 @@ class JobFields(Part):
             executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,
             execution: ExecutionSpec | dict[str, Any] | None = None,
             clocks: Sequence[ClockSpec | dict[str, Any]] | dict[str, Any] = (),
+            checks: Sequence[CheckSpec | dict[str, Any]] = (),
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,

@@ -1,0 +1,194 @@
+"""All checks of a job, held against a trace in one pass."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from rsltrace.checks.conditions import compared, condition, opposite, plain, topic_of
+from rsltrace.checks.functions import violations
+from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
+from rsltrace.checks.trace_events import TraceEvent, events_of
+from rsltrace.debug.conditions.condition import Armed, Condition
+from rsltrace.debug.conditions.names import Names, names_of
+from rsltrace.errors import CheckError, ConditionError, JobError
+from rsltrace.job import Job, locate
+from rsltrace.job.parts.check import CheckSpec
+from rsltrace.job.values.target import Target, target_text
+from rsltrace.model.stamp import NS_PER_S, format_duration
+from rsltrace.trace.reader import Trace
+
+KEPT, VIOLATED, OPEN, SKIPPED = "kept", "violated", "open", "skipped"
+_NO_NAMES = Names()
+
+LoadFunction = Callable[[Target], Callable[[Trace], object]]
+"""Returns the function that a check names."""
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """What came of a check.
+
+    ``verdict``: ``kept``, ``violated``, ``open`` (the run ended before it could be said) or
+    ``skipped`` (a function, where none are called). ``count`` is the number of violations, of
+    which ``violations`` has the first ones, in order. ``note`` says what is odd.
+    """
+
+    name: str
+    verdict: str
+    count: int = 0
+    violations: tuple[Violation, ...] = ()
+    note: str = ""
+
+
+def title(spec: CheckSpec) -> str:
+    """Return what a check is called: its name, or what it says."""
+    if spec.name is not None:
+        return spec.name
+    if spec.function is not None:
+        return f"function {target_text(spec.function)}"
+    words = f"{spec.kind} {getattr(spec, spec.kind)}"
+    for key, bound in (("at least", spec.at_least), ("at most", spec.at_most)):
+        words += f" {key} {bound:g} Hz" if bound is not None else ""
+    words += f" within {format_duration(spec.within_ns)}" if spec.within_ns is not None else ""
+    return words + (f" after {spec.after}" if spec.after is not None else "")
+
+
+def check_texts(job: Job) -> None:
+    """Raise JobError, with its line, at a check that cannot be understood."""
+    for index, spec in enumerate(job.checks):
+        _conditions(job, index, spec, _NO_NAMES)
+
+
+def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) -> list[CheckResult]:
+    """Hold the checks of ``job`` against a trace, in their order.
+
+    ``load`` gives the functions they name; without it, these are skipped.
+
+    :raises JobError: a check names what is not in the run, or cannot be understood.
+    :raises CheckError: a check cannot be held against this run.
+    :raises TraceError: the trace is damaged, or lacks the messages that a check reads.
+    """
+    names = names_of(trace.entities.values(), are_all=trace.complete)
+    held = [_property(trace, job, index, names) for index in range(len(job.checks))]
+    properties = [one for one in held if one is not None]
+    if properties:
+        topics: set[str] | None = set()
+        for spec in job.checks:
+            topics = _with_topics(topics, spec)
+        last = trace.ended_after
+        for event in events_of(trace, topics):
+            if last is not None and event.index >= last:
+                break  # what follows the end
+            for one in properties:
+                _see(one, event)
+        for one in properties:
+            one.end(trace.end_ns, complete=trace.complete)
+    return [
+        _result(spec, one) if one is not None else _of_function(trace, spec, load)
+        for spec, one in zip(job.checks, held, strict=True)
+    ]
+
+
+def _see(one: Property, event: TraceEvent) -> None:
+    try:
+        one.see(event)
+    except ConditionError as error:
+        raise CheckError(f"a check cannot be evaluated: {error.message}\n  {error.text}") from None
+
+
+def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:
+    """Add the topics that a check looks at; None: it looks at more."""
+    if topics is None or spec.function is not None:
+        return topics
+    if spec.rate is not None:
+        return topics | {spec.rate}
+    for text in (spec.always, spec.never, spec.eventually, spec.after):
+        if text is not None:
+            topic = topic_of(plain(text))
+            if topic is None:
+                return None
+            topics = topics | {topic}
+    return topics
+
+
+def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | None:
+    """Return what a check of a job says, ready to be told of events; None for a function."""
+    spec = job.checks[index]
+    if spec.function is not None:
+        return None
+    if spec.rate is not None:
+        wrong = names.unknown(spec.rate, names.topics, "topic")
+        if wrong:
+            raise JobError(wrong, where=locate(job, ("checks", index, "rate")))
+        return Rate(spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S)
+    what, after = _conditions(job, index, spec, names)
+    assert what is not None
+    start = _Start(trace.start_ns)
+    armed = what.arm(start)
+    armed_after: Armed | None = after.arm(start) if after is not None else None
+    if spec.eventually is not None:
+        return Eventually(armed, armed_after, spec.within_ns, trace.start_ns)
+    text = spec.always or spec.never or ""
+    topic = topic_of(plain(text))
+    says = f"not {text}" if spec.always is not None else text if topic is not None else ""
+    return Never(
+        armed,
+        armed_after,
+        spec.within_ns,
+        trace.start_ns,
+        says=says,
+        topic=topic,
+        value=compared(text),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Start:
+    """The moment at which a run begins: there are no nodes."""
+
+    stamp_ns: int
+
+    def nodes(self) -> dict[str, object]:
+        """Return none."""
+        return {}
+
+
+def _conditions(
+    job: Job, index: int, spec: CheckSpec, names: Names
+) -> tuple[Condition | None, Condition | None]:
+    """Return the conditions of a check: what it is about, and after what."""
+    what = after = None
+    for key in ("always", "never", "eventually"):
+        if (text := getattr(spec, key)) is not None:
+            with _located(job, index, key):
+                what = (opposite if key == "always" else condition)(text, names)
+    if spec.after is not None:
+        with _located(job, index, "after"):
+            after = condition(spec.after, names)
+    return what, after
+
+
+@contextmanager
+def _located(job: Job, index: int, key: str) -> Iterator[None]:
+    try:
+        yield
+    except ConditionError as error:
+        where = locate(job, ("checks", index, key))
+        raise JobError(f"{key}: {error.message}", where=where) from None
+
+
+def _result(spec: CheckSpec, one: Property) -> CheckResult:
+    verdict = VIOLATED if one.count else OPEN if one.open else KEPT
+    return CheckResult(title(spec), verdict, one.count, tuple(one.found), one.note)
+
+
+def _of_function(trace: Trace, spec: CheckSpec, load: LoadFunction | None) -> CheckResult:
+    assert spec.function is not None
+    if load is None:
+        return CheckResult(
+            title(spec), SKIPPED, note="functions are called for a job's file, not for a trace's"
+        )
+    found = violations(load(spec.function), target_text(spec.function), trace)
+    return CheckResult(title(spec), VIOLATED if found else KEPT, len(found), tuple(found))

@@ -1,0 +1,200 @@
+"""What is held against one event after the other: always, never, eventually, and rates."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from rsltrace.checks.trace_events import TraceEvent
+from rsltrace.debug.conditions.condition import Armed, shown
+from rsltrace.debug.conditions.expressions import Expression
+from rsltrace.model.event import OutputKind
+from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
+
+_SHOWN_MAX = 3
+_KEPT_MAX = 1000
+"""So many violations of one check are kept; of the rest only the number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Violation:
+    """Where a check is not kept: an event (None: at the end of the run), its time in ns, and what
+    is wrong there."""
+
+    event: int | None
+    stamp_ns: int
+    text: str
+
+
+@dataclass
+class Property:
+    """A property of a run, told of its events in order. ``count`` is how often it is not kept,
+    ``open`` how often the end of the run came before it could be said."""
+
+    found: list[Violation] = field(default_factory=list, init=False)
+    count: int = field(default=0, init=False)
+    open: int = field(default=0, init=False)
+    note: str = field(default="", init=False)
+
+    def see(self, event: TraceEvent) -> None:
+        """Take note of an event that has ended."""
+        raise NotImplementedError
+
+    def end(self, stamp_ns: int, *, complete: bool) -> None:
+        """Take note of the end of the run; not ``complete``: of what there is of it."""
+
+    def _violated(self, event: int | None, stamp_ns: int, text: str) -> None:
+        self.count += 1
+        if len(self.found) < _KEPT_MAX:
+            self.found.append(Violation(event, stamp_ns, text))
+
+
+@dataclass
+class Never(Property):
+    """Something that must not happen; with ``after``, not from then on (for ``within_ns``)."""
+
+    what: Armed
+    after: Armed | None = None
+    within_ns: int | None = None
+    start_ns: int = 0
+    says: str = ""
+    """What is wrong, where the condition's own words do not say it."""
+    topic: str | None = None
+    value: Expression | None = None
+    """What is compared, of messages on ``topic``: its value is shown."""
+
+    def __post_init__(self) -> None:
+        self._since: tuple[int, int] | None = None
+        if self.after is None:
+            self._since = (-1, self.start_ns)
+
+    def see(self, event: TraceEvent) -> None:
+        """See whether it happens, while it counts."""
+        if self._counts(event) and (why := self.what.after(event)):
+            since = ""
+            if self.after is not None and self._since is not None:
+                since = f", after event {self._since[0]}"
+            said = f"{self.says or why}{self._values(event)}{since}"
+            self._violated(event.index, event.stamp_ns, said)
+        self.note = self.what.note or self.note
+        if self.after is not None and self.after.after(event):
+            self._since = (event.index, event.stamp_ns)
+
+    def _values(self, event: TraceEvent) -> str:
+        """Return what was compared, of the messages that the event has sent: `` (x = 0.31)``."""
+        if self.value is None or self.count >= _KEPT_MAX:
+            return ""
+        values = []
+        for sent in event.sent():
+            if sent.name == self.topic and sent.message is not None:
+                try:
+                    values.append(shown(self.value.value(event, message=sent.message())))
+                except Exception:  # of another message than the one that counts
+                    continue
+        named = self.value.text.removeprefix("msg.")
+        return f" ({named} = {', '.join(values[:_SHOWN_MAX])})" if values else ""
+
+    def _counts(self, event: TraceEvent) -> bool:
+        if self._since is None:
+            return False
+        return self.within_ns is None or event.stamp_ns <= self._since[1] + self.within_ns
+
+
+@dataclass
+class Eventually(Property):
+    """Something that has to happen: once, or each time that ``after`` has."""
+
+    what: Armed
+    after: Armed | None = None
+    within_ns: int | None = None
+    start_ns: int = 0
+
+    def __post_init__(self) -> None:
+        self._waiting: deque[tuple[int | None, int]] = deque()
+        if self.after is None:
+            self._waiting.append((None, self.start_ns))
+
+    def see(self, event: TraceEvent) -> None:
+        """See what is too late, what happens, and what has to happen from now on."""
+        self._pass(event.stamp_ns - 1)
+        if self.after is not None and self.after.after(event):
+            self._waiting.append((event.index, event.stamp_ns))
+        if self._waiting and self.what.after(event):
+            self._waiting.clear()
+        self.note = self.what.note or self.note
+
+    def end(self, stamp_ns: int, *, complete: bool) -> None:
+        """See what is too late, and what had no time left."""
+        self._pass(stamp_ns if complete else stamp_ns - 1)
+        for index, begin_ns in self._waiting:
+            if complete and self.within_ns is None:
+                self._missed(index, begin_ns, "before the end of the run")
+            else:
+                self.open += 1
+
+    def _pass(self, now_ns: int) -> None:
+        """Give up what should have happened by ``now_ns``."""
+        if self.within_ns is None:
+            return
+        while self._waiting and self._waiting[0][1] + self.within_ns <= now_ns:
+            index, begin_ns = self._waiting.popleft()
+            self._missed(index, begin_ns, f"within {format_duration(self.within_ns)}")
+
+    def _missed(self, index: int | None, begin_ns: int, when: str) -> None:
+        since = "" if index is None else f" of event {index}"
+        self._violated(index, begin_ns, f"it does not happen {when}{since}")
+
+
+@dataclass
+class Rate(Property):
+    """A topic whose messages come at least, or at most, so often in every stretch of time."""
+
+    topic: str
+    at_least: float | None
+    at_most: float | None
+    over_ns: int = NS_PER_S
+
+    def __post_init__(self) -> None:
+        self._sent: list[tuple[int, int]] = []
+
+    def see(self, event: TraceEvent) -> None:
+        """Take note of messages on the topic."""
+        for sent in event.sent():
+            if sent.kind == OutputKind.MESSAGE and sent.name == self.topic:
+                self._sent.append((event.stamp_ns, event.index))
+
+    def end(self, stamp_ns: int, *, complete: bool) -> None:
+        """Count, in the stretches that begin with, or right after, each message."""
+        for begin_ns, index, count in self._stretches(stamp_ns):
+            hz = count * NS_PER_S / self.over_ns
+            until = format_seconds(begin_ns + self.over_ns)
+            said = f"{count} messages from here to {until} s: {hz:g} Hz"
+            if self.at_least is not None and count < self._least:
+                self._violated(index, begin_ns, f"{said}, at least {self.at_least:g} Hz")
+            elif self.at_most is not None and count > self._most:
+                self._violated(index, begin_ns, f"{said}, at most {self.at_most:g} Hz")
+        if not self._sent:
+            self.open += 1
+            self.note = "there is no message"
+
+    @property
+    def _least(self) -> float:
+        return math.ceil((self.at_least or 0) * self.over_ns / NS_PER_S - 1e-9)
+
+    @property
+    def _most(self) -> float:
+        return math.floor((self.at_most or 0) * self.over_ns / NS_PER_S + 1e-9)
+
+    def _stretches(self, end_ns: int) -> Iterator[tuple[int, int, int]]:
+        """Yield begin, first event and number of messages of each whole stretch: those after its
+        begin, up to and with its end."""
+        last = 0
+        for at, (begin_ns, index) in enumerate(self._sent):
+            if begin_ns + self.over_ns > end_ns:
+                return
+            last = max(last, at)
+            while last + 1 < len(self._sent) and self._sent[last + 1][0] <= begin_ns + self.over_ns:
+                last += 1
+            yield begin_ns, index, last - at

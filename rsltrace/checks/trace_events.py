@@ -1,0 +1,115 @@
+"""An event of a trace as a condition sees it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from functools import partial
+
+import numpy as np
+
+from rsltrace.debug.conditions.view import Sent
+from rsltrace.errors import TraceError
+from rsltrace.model.event import NO_EVENT, Event, Output, OutputKind
+from rsltrace.trace.reader import Trace
+from rsltrace.trace.segments import event_of, output_of
+from rsltrace.words.logs import log_record
+
+_MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
+
+
+class TraceEvent:
+    """An ``EventView`` of an event that has ended, long ago: nodes are not there any more."""
+
+    def __init__(self, trace: Trace, event: Event, outputs: Sequence[Output]) -> None:
+        self._trace = trace
+        self.event = event
+        self.outputs = outputs
+        self.index = event.index
+        self.kind = int(event.kind)
+        self.entity = event.entity
+        self.stamp_ns = event.stamp_ns
+        self.output_hash = event.output_hash
+
+    @property
+    def entity_name(self) -> str:
+        """The name of what ran: a topic, a service, a timer's callback."""
+        found = self._trace.entities.get(self.entity)
+        return "" if found is None else found.name
+
+    @property
+    def node(self) -> str:
+        """The full name of its node, empty for the run itself."""
+        found = self._trace.entities.get(self.entity)
+        return "" if found is None or not found.node else self._trace.node_of(found).name
+
+    def nodes(self) -> Mapping[str, object]:
+        """Return none: a trace holds what nodes sent, not what they were."""
+        return {}
+
+    def received(self) -> tuple[str, object] | None:
+        """Return topic and message of the output that caused it, None if that was no message."""
+        cause = self.event.cause_event
+        if cause == NO_EVENT:
+            return None
+        outputs = self._trace.outputs_of(cause)
+        at = self.event.cause_output
+        if not at < len(outputs) or outputs[at].kind not in _MESSAGES:
+            return None
+        return self._name(outputs[at]), self._message(outputs[at])
+
+    def sent(self) -> Sequence[Sent]:
+        """Return its outputs, in order."""
+        return [self._sent(output) for output in self.outputs]
+
+    def findings(self) -> Sequence[str]:
+        """Return what the guard found in it."""
+        return [one.source.value for one in self._trace.findings.get(self.index, ())]
+
+    def _sent(self, output: Output) -> Sent:
+        name, kind = self._name(output), int(output.kind)
+        if output.kind in _MESSAGES:
+            return Sent(kind, name, output.hash, message=partial(self._message, output))
+        if output.kind is OutputKind.LOG:
+            record = log_record(self._trace, output)
+            if record is not None:
+                return Sent(kind, name, output.hash, record.text, record.level)
+        lines = (self._trace.detail(output) or "").strip().splitlines()
+        return Sent(kind, name, output.hash, lines[-1] if lines else "")
+
+    def _name(self, output: Output) -> str:
+        return self._trace.entity(output.entity).name
+
+    def _message(self, output: Output) -> object:
+        """Decode what was sent. Raises TraceError if that was not kept, or does not fit."""
+        found = self._trace.payload(output)
+        channel = self._trace.channel_of(output)
+        if found is None or channel is None:
+            raise TraceError(
+                f"{self._trace.name} holds no messages of {self._name(output)}, which a check "
+                "reads: record them (record: payloads, topics, exclude)"
+            )
+        return self._trace.decode(channel, found[2])
+
+
+def events_of(trace: Trace, topics: Collection[str] | None) -> Iterator[TraceEvent]:
+    """Yield the events that have sent something on one of ``topics``; None: all that others can
+    see something of."""
+    entities = None
+    if topics is not None:
+        senders = [one.id for one in trace.entities.values() if one.name in topics]
+        entities = np.array(senders, dtype=np.uint64)
+    findings = np.array(sorted(trace.findings) if entities is None else (), dtype=np.uint64)
+    for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
+        if not len(events):
+            continue
+        if entities is not None:
+            outputs = outputs[np.isin(outputs["entity"], entities)]
+        first, last = events["index"][0], events["index"][-1]
+        found = findings[(findings >= first) & (findings <= last)]
+        indexes = np.union1d(outputs["event"], found)
+        begins = np.searchsorted(outputs["event"], indexes)
+        ends = np.searchsorted(outputs["event"], indexes, side="right")
+        for index, begin, end in zip(indexes.tolist(), begins.tolist(), ends.tolist(), strict=True):
+            event = event_of(events[index - int(first)], trace.name)
+            rows = [output_of(row, trace.name) for row in outputs[begin:end]]
+            yield TraceEvent(trace, event, rows)

@@ -1,0 +1,101 @@
+"""What came of the checks of a job, for people and for programs."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from rsltrace.checks.evaluate import OPEN, VIOLATED, CheckResult, evaluate_checks
+from rsltrace.checks.properties import Violation
+from rsltrace.job import Job
+from rsltrace.job.values.target import Target
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_seconds
+from rsltrace.run.plans.target import load_target
+from rsltrace.run.process import search_path
+from rsltrace.trace.reader import Trace
+from rsltrace.words.code import code_place
+from rsltrace.words.events import EventWords
+
+_SHOWN_MAX = 3
+_WORDS = {OPEN: "not decided before the end of the run"}
+
+
+class Checked:
+    """The checks of a job, held against the trace at ``path``, whose functions are called unless
+    ``functions`` is False."""
+
+    def __init__(self, job: Job, path: Path, *, functions: bool = True) -> None:
+        self._path = path
+        with Trace.open(path) as trace, search_path(job):
+            self.results = evaluate_checks(trace, job, _load if functions else None)
+            self._places = {
+                one.event: _place(trace, one.event)
+                for result in self.results
+                for one in result.violations[:_SHOWN_MAX]
+                if one.event is not None
+            }
+
+    @property
+    def violated(self) -> list[CheckResult]:
+        """Those that are not kept."""
+        return [one for one in self.results if one.verdict == VIOLATED]
+
+    def lines(self) -> list[str]:
+        """Return a line for each check, and under those that are not kept where they are not."""
+        lines = []
+        for one in self.results:
+            note = f" ({one.note})" if one.note else ""
+            lines.append(
+                printable(f"check {_WORDS.get(one.verdict, one.verdict)}: {one.name}{note}")
+            )
+            lines += [f"  {self._where(found)}" for found in one.violations[:_SHOWN_MAX]]
+            if one.count > _SHOWN_MAX:
+                lines.append(f"  and {one.count - _SHOWN_MAX} more")
+        first = [
+            found.event
+            for one in self.violated
+            for found in one.violations[:1]
+            if found.event is not None
+        ]
+        if first:
+            path = shlex.quote(str(self._path))
+            lines.append(f"next: rsltrace view {path} --at {min(first)}")
+        return lines
+
+    def values(self) -> list[dict[str, Any]]:
+        """Return what a program wants to know."""
+        return [
+            {
+                "name": one.name,
+                "verdict": one.verdict,
+                "count": one.count,
+                "note": one.note,
+                "violations": [
+                    {"event": found.event, "stamp_ns": found.stamp_ns, "text": found.text}
+                    for found in one.violations
+                ],
+            }
+            for one in self.results
+        ]
+
+    def _where(self, found: Violation) -> str:
+        at = "at the end" if found.event is None else f"event {found.event}"
+        place = "" if found.event is None else self._places.get(found.event, "")
+        return printable(f"{at}, {format_seconds(found.stamp_ns)} s{place}: {found.text}")
+
+
+def _load(target: Target) -> Callable[[Trace], object]:
+    if not isinstance(target, str):
+        return target
+    loaded: Callable[[Trace], object] = load_target(target, where=f"checks: function {target}")
+    return loaded
+
+
+def _place(trace: Trace, index: int) -> str:
+    event = trace.event(index)
+    node = EventWords(trace).node(event, trace.outputs_of(index))
+    code = code_place(trace, event)
+    return (f", {node}" if node else "") + (f" ({code})" if code else "")

@@ -1,0 +1,155 @@
+"""``checks:`` of a job: what has to be true of a run, found out from its trace."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import attach, check, number, positive_time, text
+from rsltrace.job.values.names import check_topic
+from rsltrace.job.values.problem import Problem, describe
+from rsltrace.job.values.target import Target, check_callable_target
+from rsltrace.job.values.times import TimeLike
+
+_RATE = re.compile(r"\s*(\S+?)\s*[Hh][Zz]\s*")
+_positive = number(0, open_below=True)
+
+
+def _rate(value: object) -> float:
+    found = _RATE.fullmatch(value) if isinstance(value, str) else None
+    if found is None:
+        if isinstance(value, str):
+            raise Problem(f"expected a rate (9 Hz), got {describe(value)}")
+        return float(_positive(value))
+    try:
+        return float(_positive(float(found[1])))
+    except ValueError:
+        raise Problem(f"expected a rate above 0 (9 Hz), got {describe(value)}") from None
+
+
+attach(
+    _rate,
+    schema={
+        "anyOf": [
+            {"type": "number", "exclusiveMinimum": 0},
+            {"type": "string", "pattern": r"^\s*[0-9.eE+-]+\s*[Hh][Zz]\s*$"},
+        ]
+    },
+)
+
+Condition = Annotated[str | None, check(text(), optional=True)]
+
+
+class CheckSpec(Part):
+    """One thing that has to be true of a run. Exactly one of ``always``, ``never``,
+    ``eventually``, ``rate`` and ``function``."""
+
+    TIMES: ClassVar[dict[str, str]] = {"within": "within_ns", "over": "over_ns"}
+    KINDS: ClassVar[tuple[str, ...]] = ("always", "never", "eventually", "rate", "function")
+
+    name: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="What the check is called in reports. Without it, what it says.",
+        examples=["stays on the map"],
+    )
+    always: Condition = Field(
+        default=None,
+        description="Must be true of every message: `/topic: EXPRESSION` over its fields, or "
+        "`/topic.field < 10`. What a debugger's breakpoint can say of messages, a check can.",
+        examples=["/odom.pose.pose.position.x < 10", "/scan: min(ranges) > 0.1"],
+    )
+    never: Condition = Field(
+        default=None,
+        description="Must not happen: a message, a message of which an expression is true, a log "
+        "record (`log error`, `log warn too far`), an exception, a finding of the guard.",
+        examples=["/cmd_vel.linear.x > 1.5", "log error"],
+    )
+    eventually: Condition = Field(
+        default=None,
+        description="Has to happen: `within` a time from the start (or before the end), or, with "
+        "`after`, each time that has happened.",
+        examples=["/goal_reached.data"],
+    )
+    rate: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
+        default=None,
+        description="Topic whose messages come `at_least` or `at_most` so often, counted over "
+        "every stretch `over` between its first message and the end of the run.",
+        examples=["/scan"],
+    )
+    function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
+        default=None,
+        description="Function that gets the finished trace (`rsltrace.Trace`). It returns nothing "
+        "or `True` if all is well, `False` or a text if not, or a list of `(event, text)`; an "
+        "`AssertionError` is what is wrong.",
+        examples=["my_robot.checks:no_collision"],
+    )
+    after: Condition = Field(
+        default=None,
+        description="The check counts from each time that this has happened on.",
+        examples=["/stop", "/scan: min(ranges) < 0.3"],
+    )
+    within_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None,
+        alias="within",
+        description="For how long it counts: from `after`, or from the start of the run.",
+        examples=["200ms"],
+    )
+    at_least: Annotated[float | None, check(_rate, optional=True)] = Field(
+        default=None, description="The lowest rate, in Hz.", examples=["9 Hz", 9]
+    )
+    at_most: Annotated[float | None, check(_rate, optional=True)] = Field(
+        default=None, description="The highest rate, in Hz.", examples=["11 Hz"]
+    )
+    over_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
+        default=None,
+        alias="over",
+        description="The stretch over which a rate is counted; without it, one second.",
+        examples=["500ms"],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            name: str | None = None,
+            always: str | None = None,
+            never: str | None = None,
+            eventually: str | None = None,
+            rate: str | None = None,
+            function: Target | None = None,
+            after: str | None = None,
+            within: TimeLike | None = None,
+            within_ns: int | None = None,
+            at_least: float | str | None = None,
+            at_most: float | str | None = None,
+            over: TimeLike | None = None,
+            over_ns: int | None = None,
+        ) -> None: ...
+
+    @property
+    def kind(self) -> str:
+        """The one of ``KINDS`` that is given."""
+        return next(kind for kind in self.KINDS if getattr(self, kind) is not None)
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> CheckSpec:
+        given = [kind for kind in self.KINDS if getattr(self, kind) is not None]
+        if len(given) != 1:
+            what = f"{' and '.join(given)} are given" if given else "none is given"
+            raise Problem(f"give one of {', '.join(self.KINDS)}: {what}")
+        (kind,) = given
+        if kind == "rate" and self.at_least is None and self.at_most is None:
+            raise Problem("how often? Give at_least or at_most (9 Hz)", ("rate",))
+        for keys, kinds in (
+            (("after", "within_ns"), ("always", "never", "eventually")),
+            (("at_least", "at_most", "over_ns"), ("rate",)),
+        ):
+            for key in keys:
+                if getattr(self, key) is not None and kind not in kinds:
+                    named = key.removesuffix("_ns")
+                    raise Problem(f"{named} is for {', '.join(kinds)}, not for {kind}", (named,))
+        return self

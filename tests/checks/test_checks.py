@@ -1,0 +1,292 @@
+"""Checks of a job against traces: what they say, and that the right runs are told apart."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from rsltrace import CheckResult, Job, NodeSpec, Trace, evaluate_checks, load_job
+from rsltrace.checks.properties import Eventually, Never, Property, Rate
+from rsltrace.cli.main import cli
+from rsltrace.debug.conditions.condition import Armed
+from rsltrace.errors import CheckError, JobError
+
+SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"
+A = SAMPLE / "a.mcap"
+S = 1_000_000_000
+
+
+def checked(*checks: dict[str, Any], load: Any = None) -> list[CheckResult]:
+    with Trace.open(A) as trace:
+        return evaluate_checks(trace, Job(nodes=[NodeSpec(node="m:N")], checks=checks), load)
+
+
+def messages(topic: str) -> list[tuple[int, Any]]:
+    with Trace.open(A) as trace:
+        return [(stamp, trace.decode(topic, data)) for stamp, _, data in trace.messages(topic)]
+
+
+@pytest.mark.parametrize("limit", [-1.0, 0.0, 0.21, 0.23, 1.0])
+@pytest.mark.parametrize("text", ["/cmd_vel.linear.x < {}", "/cmd_vel: linear.x < {}"])
+def test_always_and_never_agree_with_the_messages(limit: float, text: str) -> None:
+    wrong = [stamp for stamp, m in messages("/cmd_vel") if not m.linear.x < limit]
+    always, never = checked(
+        {"always": text.format(limit)}, {"never": text.format(limit).replace("<", ">=")}
+    )
+    for found in (always, never):
+        assert found.count == len(wrong)
+        assert [one.stamp_ns for one in found.violations] == wrong
+        assert found.verdict == ("violated" if wrong else "kept")
+    if wrong:
+        assert "linear.x = 0." in always.violations[0].text
+        assert always.violations[0].text.startswith(f"not {text.format(limit)}")
+
+
+def test_what_has_to_follow_in_time() -> None:
+    kept, late, rare = checked(
+        {"eventually": "/cmd_vel", "after": "/scan: min(ranges) < 2", "within": "1ns"},
+        {"eventually": "/scan", "after": "/cmd_vel", "within": "90ms"},
+        {"eventually": "exception"},
+    )
+    assert kept.verdict == "kept"
+    assert late.verdict == "violated"
+    assert late.violations[0].event is not None
+    assert "within 90 ms of event" in late.violations[0].text
+    assert (rare.verdict, rare.violations[0].event) == ("violated", None)
+
+
+def test_rates() -> None:
+    at_least, too_fast, silent = checked(
+        {"rate": "/scan", "at_least": "10 Hz"},
+        {"rate": "/scan", "at_most": 9},
+        {"rate": "/diagnostics", "at_least": 1}
+        if "/diagnostics" in _topics()
+        else {"rate": "/scan", "at_least": 1, "over": "1h"},
+    )
+    assert at_least.verdict == "kept"
+    assert "10 messages" in too_fast.violations[0].text
+    assert silent.count == 0
+
+
+def _topics() -> set[str]:
+    with Trace.open(A) as trace:
+        return {one.name for one in trace.entities.values()}
+
+
+@pytest.mark.parametrize(
+    ("check", "said"),
+    [
+        ({"always": "/scna: min(ranges) < 2"}, "did you mean '/scan'"),
+        ({"always": "/scan.ranges[0] <"}, "not a Python expression"),
+        ({"always": "/scan"}, "for what must not happen, never"),
+        ({"never": "node /driver"}, "takes a function"),
+        ({"never": "when driver.x > 1"}, "takes a function"),
+        ({"never": "/scan.ranges[0] > /cmd_vel.linear.x"}, "messages of one topic"),
+        ({"rate": "/scna", "at_least": 1}, "did you mean '/scan'"),
+    ],
+)
+def test_what_cannot_be_understood(check: dict[str, Any], said: str) -> None:
+    with pytest.raises(JobError, match=r"checks\[0\]") as caught:
+        checked(check)
+    assert said in str(caught.value)
+
+
+def test_what_cannot_be_evaluated() -> None:
+    with pytest.raises(CheckError, match="did you mean 'ranges'"):
+        checked({"always": "/scan: rangs[0] > 0"})
+    (found,) = checked({"never": "/scan: ranges[100000] > 0"})
+    assert found.verdict == "kept"
+    assert "IndexError" in found.note
+
+
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {},
+        {"always": "/a", "never": "/b"},
+        {"rate": "/a"},
+        {"rate": "/a", "at_least": "fast"},
+        {"rate": "/a", "at_least": "0 Hz"},
+        {"never": "/a", "at_least": 1},
+        {"rate": "/a", "at_least": 1, "within": "1s"},
+        {"eventually": "/a", "within": 0},
+        {"eventually": "/a", "wihin": "1s"},
+    ],
+)
+def test_checks_that_make_no_sense(keys: dict[str, Any]) -> None:
+    with pytest.raises(JobError):
+        Job(nodes=[NodeSpec(node="m:N")], checks=[keys])
+
+
+@pytest.mark.parametrize(
+    ("said", "texts"),
+    [
+        (None, []),
+        (True, []),
+        (False, ["it returned False"]),
+        ("too near", ["too near"]),
+        ([(3, "odd"), "at the end"], ["odd", "at the end"]),
+    ],
+)
+def test_functions(said: Any, texts: list[str]) -> None:
+    (found,) = checked({"function": "m:f"}, load=lambda target: lambda trace: said)
+    assert [one.text for one in found.violations] == texts
+
+
+def test_functions_that_raise() -> None:
+    def asserts(trace: Trace) -> None:
+        raise AssertionError("hit the wall")
+
+    (found,) = checked({"function": asserts}, load=lambda target: target)
+    assert found.violations[0].text == "hit the wall"
+    for wrong in (lambda trace: 1 / 0, lambda trace: 3, lambda trace: [(10**9, "where?")]):
+        with pytest.raises(CheckError):
+            checked({"function": wrong}, load=lambda target: target)
+    assert checked({"function": "m:f"})[0].verdict == "skipped"
+
+
+# -- against the definition ------------------------------------------------------------------------
+
+
+class _Is(Armed):
+    def __init__(self, letter: str) -> None:
+        self._letter = letter
+
+    def after(self, view: Any) -> str:
+        return self._letter if self._letter in view.letters else ""
+
+
+class _Event:
+    def __init__(self, index: int, stamp_ns: int, letters: str) -> None:
+        self.index, self.stamp_ns, self.letters = index, stamp_ns, letters
+
+    def sent(self) -> Sequence[Any]:
+        from rsltrace.debug.conditions.view import Sent
+
+        return [Sent(1, letter, 0) for letter in self.letters]
+
+
+RUNS = st.lists(
+    st.tuples(st.integers(0, 3), st.sampled_from(["", "x", "t", "xt", "o"])), max_size=12
+)
+
+
+def _held(one: Property, run: list[tuple[int, str]], end: int) -> list[int | None]:
+    for index, (stamp, letters) in enumerate(run):
+        one.see(_Event(index, stamp, letters))  # type: ignore[arg-type]
+    one.end(end, complete=True)
+    return [found.event for found in one.found]
+
+
+def _run(steps: list[tuple[int, str]]) -> tuple[list[tuple[int, str]], int]:
+    stamp, run = 0, []
+    for step, letters in steps:
+        stamp += step
+        run.append((stamp, letters))
+    return run, stamp + 2
+
+
+@given(RUNS, st.one_of(st.none(), st.integers(1, 4)))
+def test_eventually_is_what_it_says(steps: list[tuple[int, str]], within: int | None) -> None:
+    run, end = _run(steps)
+    wanted = []
+    for at, (begin, letters) in enumerate(run):
+        last = end if within is None else begin + within
+        follows = any("x" in later and stamp <= last for stamp, later in run[at:])
+        if "t" in letters and not follows and last <= end:
+            wanted.append(at)
+    assert _held(Eventually(_Is("x"), _Is("t"), within), run, end) == wanted
+
+
+@given(RUNS, st.one_of(st.none(), st.integers(1, 4)))
+def test_never_is_what_it_says(steps: list[tuple[int, str]], within: int | None) -> None:
+    run, end = _run(steps)
+    wanted = [
+        at
+        for at, (stamp, letters) in enumerate(run)
+        if "x" in letters
+        and any(
+            "t" in before and (within is None or stamp <= begin + within)
+            for begin, before in run[:at]
+        )
+    ]
+    assert _held(Never(_Is("x"), _Is("t"), within), run, end) == wanted
+
+
+@given(RUNS, st.integers(1, 4), st.integers(1, 5))
+def test_rates_are_what_they_say(steps: list[tuple[int, str]], over: int, count: int) -> None:
+    run, end = _run(steps)
+    sent = [(at, stamp) for at, (stamp, letters) in enumerate(run) if "x" in letters]
+    wanted = []
+    for number, (at, begin) in enumerate(sent):
+        inside = [one for one, stamp in sent[number + 1 :] if stamp <= begin + over]
+        if begin + over <= end and len(inside) < count:
+            wanted.append(at)
+    hz = count * S / over
+    assert math.isclose(hz * over / S, count)
+    assert _held(Rate("x", hz, None, over), run, end) == wanted
+
+
+# -- as a user runs it -----------------------------------------------------------------------------
+
+NODES = """
+from rclpy.node import Node
+from std_msgs.msg import Float64
+
+class Talker(Node):
+    def __init__(self):
+        super().__init__("talker")
+        self.sent = self.create_publisher(Float64, "/x", 10)
+        self.count = 0
+        self.create_timer(0.1, self.tick)
+
+    def tick(self):
+        self.count += 1
+        self.sent.publish(Float64(data=float(self.count)))
+
+def few(trace):
+    assert trace.event_count < 5, f"{trace.event_count} events"
+"""
+
+
+@pytest.mark.ros
+def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "talkers.py").write_text(NODES)
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        "nodes: [{node: talkers:Talker}]\nstop: {duration: 1s}\n"
+        "checks:\n  - always: /x.data < 8\n  - {name: few, function: talkers:few}\n"
+    )
+    done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "run.mcap", "--no-pin"])
+    assert done.exit_code == 1, done.output
+    assert done.stdout.startswith("digest ")
+    assert "check violated: always /x.data < 8" in done.stderr
+    assert "not /x.data < 8 (data = 8.0)" in done.stderr
+    assert "check violated: few" in done.stderr
+    with Trace.open("run.mcap") as trace:
+        (first, _) = evaluate_checks(trace, load_job(job))
+        assert f"view run.mcap --at {first.violations[0].event}" in done.stderr
+        assert trace.event(first.violations[0].event or 0).stamp_ns == 8 * S // 10
+
+    done = CliRunner().invoke(cli, ["check", "run.mcap", "--format", "json"])
+    assert done.exit_code == 1
+    found = json.loads(done.stdout)
+    assert [one["verdict"] for one in found] == ["violated", "skipped"]
+    job.write_text(job.read_text().replace("< 8", "< 80").replace("talkers:few", "talkers:Talker"))
+    job.write_text(job.read_text().split("  - {name")[0])
+    assert CliRunner().invoke(cli, ["check", "run.mcap", "--job", "job.yaml"]).exit_code == 0
+
+    job.write_text(job.read_text().replace("/x.data < 80", "/x.data <"))
+    done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "other.mcap", "--no-pin"])
+    assert done.exit_code == 2
+    assert "job.yaml:4" in done.stderr
+    assert not (tmp_path / "other.mcap").exists(), "it is said before anything runs"
