@@ -31,6 +31,9 @@ _SAMPLE_BYTES = 16 << 10
 _PAYS = 0.8
 """Of each large message so many pieces are compressed to see what it gives."""
 
+_TRUSTED = 15
+"""So many large messages of a topic are not looked at after one that did not get smaller."""
+
 _ROWS = zstandard.ZstdCompressionParameters.from_level(
     _ZSTD_LEVEL, window_log=19, hash_log=10, min_match=7, target_length=1
 )
@@ -60,6 +63,7 @@ class McapWriter:
         self._compression = compression
         self._compressor = zstandard.ZstdCompressor(level=_ZSTD_LEVEL)
         self._row_compressor = zstandard.ZstdCompressor(compression_params=_ROWS)
+        self._trusted: dict[tuple[int, ...], int] = {}
         self._progress = progress
         self._summary = SummaryBuilder()
         self._schema_ids: dict[tuple[str, str], int] = {}
@@ -184,12 +188,17 @@ class McapWriter:
         """Return the compression of a chunk, and its data in parts.
 
         Compressing what does not get smaller takes as long as writing it; of large messages a
-        sample tells. It is a function of their bytes, so equal runs give equal files.
+        sample tells, and of its topic's next ones too. It is a function of their bytes, so equal
+        runs give equal files.
         """
         if not self._compression:
             return "", body.parts
-        if len(body.parts) > 1 and not self._pays(body.parts):
-            return "", body.parts
+        if len(body.parts) > 1:
+            channels = tuple(channel for channel, _, _ in body.indexes)
+            trusted = self._trusted.get(channels, 0)
+            if trusted or not self._pays(body.parts):
+                self._trusted[channels] = trusted - 1 if trusted else _TRUSTED
+                return "", body.parts
         packer = self._row_compressor if body.rows else self._compressor
         return self._compression, (packer.compress(body.records),)
 

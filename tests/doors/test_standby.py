@@ -164,7 +164,7 @@ class Steady(Node):
 
     def hear(self, message: UInt64) -> None:
         name = threading.current_thread().name
-        self.log.append(("steady", message.data, name, decimal.getcontext().prec, len(sys.argv)))
+        self.log.append(("steady", message.data, name, decimal.getcontext().prec, sys.argv[:1]))
 
 
 def run(simulate: Any, seed: int, *, tame: bool) -> tuple[Any, ...]:

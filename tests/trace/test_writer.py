@@ -530,6 +530,22 @@ def test_large_messages_are_kept_and_packed_only_if_that_pays(
         trace.check()
 
 
+def test_what_did_not_get_smaller_is_trusted_not_to_for_some_messages(tmp_path: Path) -> None:
+    noise, zeros = np.random.default_rng(7).bytes(1 << 20), bytes(1 << 20)
+    with Opened(tmp_path / "a.mcap") as feeder:
+        one = feeder.writer.add_channel("/one", "std_msgs/msg/String", "string data\n")
+        other = feeder.writer.add_channel("/other", "std_msgs/msg/String", "string data\n")
+        for n, (channel, data) in enumerate([(one, noise), (other, zeros), *[(one, zeros)] * 17]):
+            feeder.writer.add_payload(channel, START_NS + n, b"\0\1\0\0" + data)
+        feeder.writer.close(result={})
+    with (tmp_path / "a.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    large = [index for index in summary.chunk_indexes if index.uncompressed_size > 1 << 20]
+    packed = [bool(index.compression) for index in large]
+    assert packed == [False, True, *[False] * 15, True, True]
+
+
 def test_a_checksum_of_pieces_is_that_of_the_whole() -> None:
     rng = np.random.default_rng(11)
     for first in (0, 1, 4096, 70_001):

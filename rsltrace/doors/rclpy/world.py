@@ -264,6 +264,7 @@ class World:
         stacks, outcome = self.stacks, self.domain.outcome
         runners, ending = stacks.runners, stacks.ending
         runners.next().switch()
+        stacks.programs.leave()  # it may have ended between two programs
         if stacks.loop.stopped is None and runners.error is None:
             return  # paused
         outcome.note_end(stacks.loop.events)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 from greenlet import getcurrent
 
+from rsltrace.doors.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import is_busy, is_custom
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
 from rsltrace.doors.rclpy.stacks.runners import Wait
@@ -82,6 +83,7 @@ class Standby:
             or (self._future is not None and self._future.done())
             or not _is_free(item)
         ):
+            self._programs.leave()  # see ``_hands_on``
             return False
         self._waiting.append(getcurrent())
         blocked.stack.switch(mailbox, item)
@@ -128,9 +130,9 @@ class Standby:
             event.handle, event.entity, event.node = blocked.event
             if dispatcher.on_node is not None:
                 dispatcher.on_node(event.node)
-            if programs.present is not host:
-                host.enter()
             pump.standby = self
+            if programs.present is not host and not self._hands_on():
+                host.enter()
             all_blocked[blocked] = None
             given = (waiting.pop() if waiting else self._runners.next()).switch()
             if not given:
@@ -140,6 +142,18 @@ class Standby:
         self.failure = failure
         self.is_over = True
         return True
+
+    def _hands_on(self) -> bool:
+        """Return whether the loop's next event is for a stack that stands by, too: whose program
+        that is takes over from this one, without the host between them."""
+        loop = self._loop
+        if loop.tasks or not loop.ready:
+            return False
+        item = loop.ready[0]
+        if not isinstance(item, ReceiverHandle) or item.node is None or item.node.mailbox is None:
+            return False
+        pump = item.node.mailbox.pump
+        return pump is not None and pump.standby is not None
 
 
 def _is_free(item: Any) -> bool:
