@@ -15,6 +15,7 @@ class Role(Enum):
 
     SECTION = "section"
     FIELD = "field"
+    BYTES = "bytes"
     NOTE = "note"
     LINK = "link"
     ERROR = "error"

@@ -158,7 +158,7 @@ def bytes_lines(data: bytes, path: str, depth: int) -> Iterator[Line]:
         row = data[offset : offset + 16]
         text = "".join(chr(b) if 32 <= b < 127 else "." for b in row)
         yield Line(
-            depth, f"{offset:06x}", f"{row.hex(' ')}  {text}", Role.FIELD, f"{path}.{offset}"
+            depth, f"{offset:06x}", f"{row.hex(' ')}  {text}", Role.BYTES, f"{path}.{offset}"
         )
     if len(data) > shown:
         more = f"… and {len(data) - shown} more bytes"

@@ -34,6 +34,7 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
     Inspector > .inspector--section { color: $text; text-style: bold; }
     Inspector > .inspector--label { color: $text-muted; }
     Inspector > .inspector--field { color: $text; }
+    Inspector > .inspector--bytes { color: $text; }
     Inspector > .inspector--note { color: $text-muted; text-style: italic; }
     Inspector > .inspector--link { color: $text-primary; text-style: underline; }
     Inspector > .inspector--error { color: $text-error; }
@@ -124,11 +125,11 @@ class Inspector(ScrollView, can_focus=True, inherit_bindings=False):
             self.post_message(self.Chosen(self._drawn[row][0]))
 
     def _lay_out(self) -> None:
-        """Make screen lines of lines. Sections have one; what is long goes on over several."""
+        """Make screen lines of lines. Sections and bytes have one; other long ones go on."""
         width = max(self.scrollable_content_region.width, 10)
         drawn: list[tuple[Line, str]] = []
         for line in self._lines:
-            if line.role is Role.SECTION:
+            if line.role in (Role.SECTION, Role.BYTES):
                 drawn.append((line, line.value))
                 continue
             label = min(cells(line.label), _LABEL_MAX)
