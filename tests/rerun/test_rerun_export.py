@@ -450,3 +450,15 @@ def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:
     with pytest.raises(TraceError, match=r"run\.mcap"):
         export([tmp_path / "run.mcap"], tmp_path / "run.rrd")
     assert not (tmp_path / "run.rrd").exists()
+
+
+def test_two_exports_of_a_run_hold_the_same(tmp_path: Path) -> None:
+    from rsltrace_viewer.rerun_export.picture import fingerprint
+
+    gallery.write_gallery(tmp_path / "a.mcap", 3)
+    gallery.write_gallery(tmp_path / "b.mcap", 3, differs_from=1)
+    prints = []
+    for other in "aab":
+        export([tmp_path / "a.mcap", tmp_path / f"{other}.mcap"], tmp_path / "x.rrd", force=True)
+        prints.append(fingerprint(tmp_path / "x.rrd"))
+    assert prints[0] == prints[1] != prints[2]

@@ -27,7 +27,7 @@ _GREETING_S = 6.0
 _COLOURS = 256
 _MENU_HEIGHT = 36
 _MADE_FROM = "rsltrace recording"
-_MADE_UP = "rerun.controls."
+_MADE_UP = ("rerun.controls.", "log_time", "ViewportBlueprint:root_container")
 _UUID = re.compile(r"[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
@@ -86,7 +86,8 @@ def made_from(picture: Path) -> str | None:
 def fingerprint(recording: Path) -> str:
     """Return a hash of all that a recording and its layout hold.
 
-    Left out is what Rerun makes up for each export: the ids of rows, views and containers.
+    Left out is what Rerun makes up for each export: the ids of rows, views and containers, and
+    when it was made.
     """
     from rerun.chunk import RrdReader
 
