@@ -40,7 +40,7 @@ def chain(rng: random.Random, world: World) -> list[NodePlan]:
         topic = f"/link{number}"
         lines = [f"value = message.data + {number}.5", *SENDS]
         callback = Callback("heard", "subscription", heard, lines, topic)
-        setup = [publisher(topic), hears(heard)]
+        setup = [publisher(topic), hears(heard, qos=BEST_EFFORT if heard == "/radio" else "10")]
         links.append(NodePlan(f"link{number}", "relay", setup, [callback], hears=(heard,)))
         heard = topic
     world.add(*links)

@@ -61,7 +61,10 @@ def _mixed(
             values=callback.publishes if values else "",
             independent=independent,
         )
-        return Change(node, lines, truth, mark, rng.randint(1, 3))
+        at: int | str = rng.randint(1, 3)
+        if callback.kind == "plain":  # what calls it counts, too
+            at = f"self.n >= {at}"
+        return Change(node, lines, truth, mark, at)
 
     behaviour(f"mixed: {name}", bag=True)(make)
 

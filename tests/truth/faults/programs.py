@@ -137,6 +137,7 @@ def _ruled(name: str, key: str, one: Any, other: Any, *says: str) -> None:
         a = random_world(rng)
         features.choir(rng, a)
         a.job["execution"] = {"default": "200us"}
+        a.job["start"] = "10ms"
         a.job[key] = one
         b = changed(a, key, other)
         return Planted(a, b, Truth((), says=says, never=NEVER, independent=None))
