@@ -134,7 +134,7 @@ def test_no_success_is_reported_of_a_trace_that_a_node(
     ("evil", "status"),
     [
         ("ctypes.CDLL(None).raise(signal.SIGSEGV)", -signal.SIGSEGV),
-        ("ctypes.CDLL(None).kill(os.getpid(), signal.SIGKILL)", -signal.SIGKILL),
+        ("ctypes.CDLL(None).raise(signal.SIGKILL)", -signal.SIGKILL),
         ("ctypes.CDLL(None)._exit(0)", 0),
         ("os.kill(os.getpid(), signal.SIGUSR1)", -signal.SIGUSR1),
     ],
@@ -172,7 +172,7 @@ def test_a_node_may_close_what_the_command_prints_to(
     [
         (NODE.replace("super()", "raise ValueError\n        super()", 1) % "pass", 3, True),
         (NODE % HARMFUL["fills the disk"][0], 2, False),
-        (NODE % "ctypes.CDLL(None).kill(os.getpid(), signal.SIGKILL)", -9, False),
+        (NODE % "ctypes.CDLL(None)['raise'](signal.SIGKILL)", -9, False),
         (NODE.replace("Evil(Node)", "Evil2(Node)") % "pass", 2, None),
     ],
     ids=["a constructor raises", "the disk is full", "it is killed", "the job is wrong"],
