@@ -139,6 +139,12 @@ class Guard:
         self._passes = 0
         self._shown: dict[str, tuple[int, int]] = {}
 
+    def goes_on_in(self, process: int) -> None:
+        """Take note that the present process is a copy, made by the kernel's own ``fork``, which
+        is in charge from now on."""
+        global _here
+        _here = self.process = process
+
     @property
     def counts(self) -> dict[tuple[Source, Mode, str, str], int]:
         """How often each call was met: by source, mode, node and call."""

@@ -179,7 +179,7 @@ class Session:
         self.world.stacks.runners.process = pid
         guard = self._guarded.guard
         if guard is not None:
-            guard.process = pid
+            guard.goes_on_in(pid)
             for one, other in pairs:
                 guard.descriptors.join(one, other)
 
