@@ -155,8 +155,9 @@ def _relocate(
     elif part.opcode == Opcode.METADATA:
         record = part.record
         assert isinstance(record, records.Metadata)
-        if record.metadata.pop("checksum", None) is not None:
-            texts = [record.name, *chain.from_iterable(sorted(record.metadata.items()))]
+        if "checksum" in record.metadata:
+            checked = [item for item in record.metadata.items() if item[0] != "checksum"]
+            texts = [record.name, *chain.from_iterable(sorted(checked))]
             record.metadata["checksum"] = xxhash.xxh3_64_hexdigest("\0".join(texts).encode())
             part.record = record
     elif part.opcode == Opcode.ATTACHMENT and segments_in(part) is not None:

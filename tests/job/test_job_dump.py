@@ -264,6 +264,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "executors": None,
         "execution": None,
         "clocks": [],
+        "checks": [],
         "hooks": {"before": None, "after": None},
         "progress": None,
         "guard": {
@@ -272,7 +273,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
             "state": "false",
             **{
                 name: {"mode": "virtual", "allow": []}
-                for name in ("clock", "random", "directory", "order")
+                for name in ("clock", "random", "directory", "order", "pid")
             },
             **{
                 name: {"mode": "warn", "allow": []}

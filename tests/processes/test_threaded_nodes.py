@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -13,15 +14,16 @@ from rsltrace.trace.reader import Trace
 pytestmark = pytest.mark.ros
 
 JOB = """
-nodes: [{script: %s, isolated: true}]
-stop: {duration: 500ms}
+nodes: [{script: threaded.py, isolated: true}]
+stop: {duration: 1s}
 """
 
 
 def test_threads_executors_sleeps_and_chance_are_the_same_in_every_run(
     compiled: object, tmp_path: Path
 ) -> None:
-    (tmp_path / "job.yaml").write_text(JOB % (Path(__file__).parent / "threaded.py"))
+    shutil.copy(Path(__file__).parent / "threaded.py", tmp_path)  # its path decides what it draws
+    (tmp_path / "job.yaml").write_text(JOB)
     job = load_job(tmp_path / "job.yaml")
     results = [run(job, tmp_path / f"{n}.mcap") for n in range(2)]
     assert [result.error for result in results] == [None, None]

@@ -12,6 +12,7 @@ from textual.binding import Binding, BindingType
 from textual.screen import Screen
 from textual.widgets import Static
 
+from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
 from rsltrace_viewer.model.cells import cells, fit, wrap
@@ -123,8 +124,17 @@ class OverviewScreen(Screen[Choice | None]):
             lines=0,
             width=self.app.size.width,
         )
-        self._lines = [*self._verdict(), *self._troubles(runs), ((), None), *self._tables(runs)]
+        parts = (self._verdict(), self._troubles(runs), iter([((), None)]), self._tables(runs))
+        self._lines = [line for part in parts for line in self._readable(part)]
         self.query_one(ListView).show(lambda line: self._lines[line][0], len(self._lines))
+
+    def _readable(self, lines: Iterator[_Line]) -> Iterator[_Line]:
+        """Yield lines, up to what a damaged trace does not have: then say so."""
+        try:
+            yield from lines
+        except TraceError as error:
+            for line in wrap(printable(str(error)), max(self.app.size.width - 4, 20)):
+                yield ((line, "error"),), None
 
     def _verdict(self) -> Iterator[_Line]:
         comparison = self._session.comparison
