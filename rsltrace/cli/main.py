@@ -103,13 +103,17 @@ def cli() -> None:
     """
 
 
+OWN_PROCESS = "own process"
+"""The object of click's context where the process is there for the command alone."""
+
+
 def main(words: Sequence[str] | None = None, *, prog_name: str = "rsltrace") -> NoReturn:
     """Run the command line (``words``: what follows the program's name) and exit."""
     words = sys.argv[1:] if words is None else words
     open_standard_streams()
     pin_recording(words)
     try:
-        cli.main(args=list(words), prog_name=prog_name)
+        cli.main(args=list(words), prog_name=prog_name, obj=OWN_PROCESS)
     finally:
         if "rsltrace.run.session" not in sys.modules:  # else there may be users' finalizers to run
             gc.freeze()  # at its end Python would look at all modules for garbage, several times

@@ -98,7 +98,8 @@ def record(
     from rsltrace.run import Observer, run
     from rsltrace.run.process import end_with_run
 
-    end_with_run()
+    if click.get_current_context().obj is not None:  # a process that is there for this alone
+        end_with_run()
     changes = _all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:

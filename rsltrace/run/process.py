@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from rsltrace.doors.rclpy.wire.interface_classes import forget_interfaces
@@ -190,8 +191,26 @@ def search_path(job: Job) -> Iterator[None]:
                     forget_interfaces()
     finally:
         sys.path[:] = old_path
-        for name in set(user_modules(folders)) - old_modules:
+        for name in {*user_modules(folders), *_namespaces(folders)} - old_modules:
             del sys.modules[name]
+
+
+def _namespaces(folders: list[str]) -> list[str]:
+    """Return the loaded packages that are nothing but a folder in ``folders``."""
+    below = _below(folders)
+    return [
+        name
+        for name, module in sys.modules.items()
+        if getattr(module, "__file__", None) is None
+        and any(_is_below(os.path.join(path, ""), below) for path in _path_of(module))
+    ]
+
+
+def _path_of(module: object) -> list[str]:
+    path = vars(module).get("__path__") if isinstance(module, ModuleType) else None
+    with suppress(KeyError):  # its parent is gone
+        return [one for one in path or () if isinstance(one, str)]
+    return []
 
 
 def user_modules(folders: list[str]) -> dict[str, Path]:

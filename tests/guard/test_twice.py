@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import subprocess
@@ -12,6 +13,8 @@ from typing import Any
 import pytest
 
 from rsltrace.guard.watched.functions import watched_calls
+from rsltrace.job import Job, NodeSpec
+from rsltrace.run.process import search_path
 
 pytestmark = pytest.mark.ros
 
@@ -242,3 +245,13 @@ def test_rsltrace_is_not_user_code_even_if_it_lies_in_the_search_path(tmp_path: 
         timeout=900,
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_folders_that_were_packages_are_forgotten(tmp_path: Path) -> None:
+    """A package without ``__init__.py`` has no file by which it is known."""
+    (tmp_path / "only_a_folder" / "inner").mkdir(parents=True)
+    job = Job(nodes=[NodeSpec(node="m:N")], search_path=[str(tmp_path)])
+    with search_path(job):
+        importlib.import_module("only_a_folder.inner")
+        assert "only_a_folder.inner" in sys.modules
+    assert not {"only_a_folder", "only_a_folder.inner"} & sys.modules.keys()

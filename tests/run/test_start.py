@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.metadata
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 
+from rsltrace.cli.main import cli
 from rsltrace.run.provenance import _PACKAGES, _versions
 
 _RECORDED = """
@@ -73,3 +76,15 @@ def test_versions_are_found_in_either_kind_of_metadata(
         assert {k: v for k, v in found.items() if k} == dict(_versions())
     finally:
         _versions.cache_clear()
+
+
+@pytest.mark.ros
+def test_garbage_is_collected_after_a_command_that_was_called(tmp_path: Path) -> None:
+    """The process of a command stops looking for garbage; one that calls it goes on."""
+    (tmp_path / "talker.py").write_text(
+        "from rclpy.node import Node\n\ndef make():\n    return Node('talker')\n"
+    )
+    (tmp_path / "job.yaml").write_text("nodes: [{node: talker:make}]\nstop: {duration: 1ms}\n")
+    words = ["record", str(tmp_path / "job.yaml"), "-o", str(tmp_path / "run.mcap"), "--no-pin"]
+    assert CliRunner().invoke(cli, words).exit_code == 0
+    assert gc.get_freeze_count() < 1000, "what was there before is not left out for ever"
