@@ -233,6 +233,14 @@ class Terminal:
         self.type(f"{line}\n")
         return self.until(prompt).partition("\n")[2]
 
+    def interrupt(self) -> None:
+        """Press Ctrl-C, again where that came before anybody was asked, up to a new prompt."""
+        for _ in range(10):
+            self.type("\x03")
+            if select.select([self._end], [], [], LIMIT_S / 10)[0]:
+                break
+        self.until("(rsltrace) ")
+
     def end(self) -> int:
         """Return the exit status."""
         while True:
@@ -264,8 +272,7 @@ def test_a_session_on_a_terminal(folder: Path) -> None:
     assert "-> self.last = message.data" in terminal.ask("pdb", "(Pdb) ")
     assert terminal.ask("p self.last < message.data", "(Pdb) ").strip() == "True"
     assert terminal.ask("q") == third.splitlines(keepends=True)[-1]
-    terminal.type("\x03")
-    terminal.until("(rsltrace) ")
+    terminal.interrupt()
     assert "event " in terminal.ask("step")
     terminal.type("\x04")
     assert terminal.end() == 0
