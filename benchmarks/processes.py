@@ -23,7 +23,7 @@ from rsltrace.doors.processes.build import find_compiler, find_ros, library
 ROOT = Path(__file__).parents[1]
 SOURCE = ROOT / "tests" / "processes" / "counter.c"
 _LIBRARIES = (
-    "rcl", "rcutils", "rcl_yaml_param_parser", "rosidl_runtime_c",
+    "rcl", "rcutils", "rcl_yaml_param_parser", "rosidl_runtime_c", "tracetools",
     "std_msgs__rosidl_typesupport_c", "std_msgs__rosidl_generator_c",
 )  # fmt: skip
 _MAX_US = 45.0
