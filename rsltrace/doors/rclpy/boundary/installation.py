@@ -18,6 +18,7 @@ from rsltrace.doors.rclpy.actions.server import ActionServerHandle
 from rsltrace.doors.rclpy.boundary.boundary import Boundary
 from rsltrace.doors.rclpy.boundary.log_callers import quick_log_callers
 from rsltrace.doors.rclpy.boundary.quick_id_texts import quick_id_texts
+from rsltrace.doors.rclpy.boundary.quick_publish import quick_publish
 from rsltrace.doors.rclpy.boundary.release import check_release
 from rsltrace.doors.rclpy.boundary.type_support import load_type_support
 from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
@@ -101,7 +102,7 @@ def installed() -> Iterator[Boundary]:
     ours = boundary()
     _exchange(ours.real, ours)
     try:
-        with quick_log_callers(), quick_id_texts():
+        with quick_log_callers(), quick_id_texts(), quick_publish():
             yield ours
     finally:
         _exchange(ours, ours.real)
