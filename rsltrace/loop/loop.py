@@ -62,7 +62,9 @@ class EventLoop:
     """The state of a simulation in time: clock, ready queue, timers, scheduled releases.
 
     Attributes read by the middleware on every event: ``now_ns``, ``ready``, ``tasks``, ``events``
-    (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases.
+    (how many have run), ``activity_ns``. ``scheduled`` is a heap of releases. As long as there are
+    fewer events than ``looks_at``, the loop would do nothing now but dispatch the next task or the
+    first of ``ready``: whoever it has given the stack to may do so in its place.
 
     ``between_steps`` is called between time steps and returns how many events there must have been
     before it is called again. ``gate``, if set, is called between time steps with the time of the
@@ -92,6 +94,7 @@ class EventLoop:
         self.stop_conditions = stop_conditions
         self.gate: Callable[[int | None], bool] | None = None
         self.stopped: Stop | None = None
+        self.looks_at = -1
         self._interrupt = False
         self._livelock_limit = livelock_limit
         self._between_steps = between_steps
@@ -122,7 +125,7 @@ class EventLoop:
     def halt(self) -> None:
         """Dispatch nothing more: the run is over, stacks that are left only unwind."""
         self._interrupt = True
-        self._until_events = -1
+        self._until_events = self.looks_at = -1
 
     def stop_after_step(self, stop: Stop) -> None:
         """End the run once the present time step has run fully. The first call wins."""
@@ -208,7 +211,7 @@ class EventLoop:
         timers = self.timers
         idle = self.idle
         quiet_ns = -1 if self.gate is not None or self.min_step_ns else self._quiet_ns
-        timer_ns = horizon_ns = -1
+        timer_ns = horizon_ns = self.looks_at = -1
         while True:
             # Time steps in which one thing arrives and nothing else is due. To compare two times
             # takes Python longer than to see that they are the same object, and here it shows.
@@ -238,7 +241,10 @@ class EventLoop:
                 if receiver is not None:
                     ready.append(receiver)
             limit = self.events + self._livelock_limit
-            while not self._interrupt:
+            while True:
+                self.looks_at = limit  # first: a signal that comes after this takes it back
+                if self._interrupt:
+                    break
                 if tasks:
                     tasks.popleft().dispatch()
                 elif ready:
@@ -255,6 +261,7 @@ class EventLoop:
                         self._livelock(now_ns)
                     now_ns = self.now_ns  # a callback has waited, and time has passed meanwhile
                     limit = self.events + self._livelock_limit
+            self.looks_at = -1
             if self.events >= self._until_events:
                 return
             if self.now_ns != now_ns:  # a callback has waited, and others have gone on meanwhile

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from rsltrace import NodeSpec
 from rsltrace.doors.rclpy.executors import pump
 from rsltrace.doors.rclpy.executors.standby import Standby
+from rsltrace.errors import LivelockError
 
 pytestmark = pytest.mark.ros
 
@@ -185,14 +186,20 @@ def run(simulate: Any, seed: int, *, tame: bool) -> tuple[Any, ...]:
 def served(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Count what ran at once."""
     count = [0]
-    runs = Standby.runs
+    runs, following = Standby.runs, Standby._following
 
     def counted(self: Standby, *what: Any) -> bool:
         ran = runs(self, *what)
         count[0] += ran
         return ran
 
+    def counted_following(self: Standby) -> Any:
+        found = following(self)
+        count[0] += found is not None
+        return found
+
     monkeypatch.setattr(Standby, "runs", counted)
+    monkeypatch.setattr(Standby, "_following", counted_following)
     return count
 
 
@@ -218,6 +225,41 @@ def test_whatever_callbacks_do_the_run_is_the_same(
     simulate: Any, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
     assert compare(simulate, monkeypatch, seed, tame=False) > 100
+
+
+def test_mains_that_keep_each_other_going_are_stopped_where_they_ever_were(
+    simulate: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However one hands over to the other, the loop counts what happens at one instant."""
+    limit, heard = 500, [0]
+
+    def main(own: str, other: str) -> Callable[[], None]:
+        def program() -> None:
+            rclpy.init()
+            node = Node(f"to_{other}")
+            out = node.create_publisher(UInt64, other, 10)
+
+            def hear(message: UInt64) -> None:
+                heard[0] += 1
+                assert heard[0] < 20 * limit, "nobody counts"
+                out.publish(message)
+
+            node.create_subscription(UInt64, own, hear, 10)
+            first = node.create_timer(0.1, lambda: (first.cancel(), out.publish(UInt64())))
+            rclpy.spin(node)
+
+        return program
+
+    def stopped() -> tuple[str, int]:
+        heard[0] = 0
+        mains = (NodeSpec(main=main("a", "b"), name="m0"), NodeSpec(main=main("b", "a"), name="m1"))
+        with pytest.raises(LivelockError) as caught:
+            simulate(*mains, duration=1, job={"livelock_limit": limit})
+        return str(caught.value), heard[0]
+
+    at_once = stopped()
+    monkeypatch.setattr(Standby, "_following", lambda self: None)
+    assert stopped() == at_once
 
 
 @pytest.mark.long

@@ -17,7 +17,7 @@ from functools import lru_cache
 from types import CodeType, FrameType
 from typing import Any, NamedTuple, Protocol
 
-from greenlet import getcurrent
+from greenlet import getcurrent, greenlet
 
 from rsltrace.doors.rclpy.handles.entity_handle import ReceiverHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import is_busy, is_custom
@@ -72,22 +72,16 @@ class Standby:
 
         Called on the stack that runs the loop.
         """
-        blocked = self.blocked
-        dispatcher = self._dispatcher
-        recorder = dispatcher.recorder
-        if (
-            self._loop.tasks
-            or blocked.woken
-            or dispatcher.entities.pending
-            or (dispatcher.unrecorded if recorder is None else recorder.outputs)
-            or (self._future is not None and self._future.done())
-            or not _is_free(item)
-        ):
-            self._programs.leave()  # see ``_hands_on``
+        if self._loop.tasks or self._dispatcher.has_outputs() or not self._takes(item):
             return False
         self._waiting.append(getcurrent())
-        blocked.stack.switch(mailbox, item)
+        self.blocked.stack.switch(mailbox, item)
         return True
+
+    def _takes(self, item: Dispatchable) -> bool:
+        """Return whether the spin would take what is ready, and could run it now."""
+        future = self._future
+        return not self.blocked.woken and (future is None or not future.done()) and _is_free(item)
 
     def serve(self, mailbox: Mailbox, item: Dispatchable) -> bool:
         """Run what is given to the stack, one callback after the other, and wait in between.
@@ -131,10 +125,16 @@ class Standby:
             if dispatcher.on_node is not None:
                 dispatcher.on_node(event.node)
             pump.standby = self
-            if programs.present is not host and not self._hands_on():
-                host.enter()
             all_blocked[blocked] = None
-            given = (waiting.pop() if waiting else self._runners.next()).switch()
+            following = self._following()
+            if following is None:
+                if programs.present is not host:
+                    host.enter()
+                given = (waiting.pop() if waiting else self._runners.next()).switch()
+            else:
+                stack, *given = following
+                if stack is not blocked.stack:
+                    given = stack.switch(*given)
             if not given:
                 return False
             mailbox, item = given
@@ -143,17 +143,23 @@ class Standby:
         self.is_over = True
         return True
 
-    def _hands_on(self) -> bool:
-        """Return whether the loop's next event is for a stack that stands by, too: whose program
-        that is takes over from this one, without the host between them."""
+    def _following(self) -> tuple[greenlet, Mailbox, Dispatchable] | None:
+        """Take what the loop would dispatch next, if a stack that stands by would run it: that goes
+        on at once, without the loop and the host between them."""
         loop = self._loop
-        if loop.tasks or not loop.ready:
-            return False
+        if loop.tasks or not loop.ready or loop.events >= loop.looks_at:
+            return None
         item = loop.ready[0]
-        if not isinstance(item, ReceiverHandle) or item.node is None or item.node.mailbox is None:
-            return False
-        pump = item.node.mailbox.pump
-        return pump is not None and pump.standby is not None
+        if not isinstance(item, ReceiverHandle) or item.node is None:
+            return None
+        mailbox: Mailbox | None = item.node.mailbox
+        if mailbox is None or mailbox.pump is None:
+            return None
+        standby: Any = mailbox.pump.standby
+        if standby is None or not standby._takes(item):
+            return None
+        loop.ready.popleft()
+        return standby.blocked.stack, mailbox, item
 
 
 def _is_free(item: Any) -> bool:
