@@ -61,6 +61,16 @@ def check_texts(job: Job) -> None:
         _conditions(job, index, spec, _NO_NAMES)
 
 
+def wrong_checks(job: Job, names: Names) -> Iterator[str]:
+    """Yield, with its line, what is wrong with each check that speaks of what is not there."""
+    for index, spec in enumerate(job.checks):
+        try:
+            _rate_topic(job, index, spec, names)
+            _conditions(job, index, spec, names)
+        except JobError as error:
+            yield str(error)
+
+
 def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) -> list[CheckResult]:
     """Hold the checks of ``job`` against a trace, in their order.
 
@@ -70,7 +80,7 @@ def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) ->
     :raises CheckError: a check cannot be held against this run.
     :raises TraceError: the trace is damaged, or lacks the messages that a check reads.
     """
-    names = names_of(trace.entities.values(), are_all=trace.complete)
+    names = names_of(trace.entities.values(), are_all=trace.complete, fields=trace.fields_of)
     held = [_property(trace, job, index, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
     if properties:
@@ -119,9 +129,7 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
     if spec.function is not None:
         return None
     if spec.rate is not None:
-        wrong = names.unknown(spec.rate, names.topics, "topic")
-        if wrong:
-            raise JobError(wrong, where=locate(job, ("checks", index, "rate")))
+        _rate_topic(job, index, spec, names)
         return Rate(spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S)
     what, after = _conditions(job, index, spec, names)
     assert what is not None
@@ -142,6 +150,12 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
         topic=topic,
         value=compared(text),
     )
+
+
+def _rate_topic(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
+    """Raise JobError if a rate is that of a topic which is not there."""
+    if spec.rate is not None and (wrong := names.unknown(spec.rate, names.topics, "topic")):
+        raise JobError(wrong, where=locate(job, ("checks", index, "rate")))
 
 
 @dataclass(frozen=True, slots=True)

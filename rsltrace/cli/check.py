@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -73,7 +73,9 @@ def check(
     anybody at the other end, a topic that a bag plays and a node publishes, a rule of the job that
     fits nothing), 2 if the job cannot run.
     """
-    from rsltrace.checks.evaluate import check_texts
+    from rsltrace.checks.evaluate import check_texts, wrong_checks
+    from rsltrace.debug.conditions.message_fields import loaded_fields
+    from rsltrace.debug.conditions.names import Names
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 
@@ -87,6 +89,16 @@ def check(
     check_texts(loaded)
     try:
         checked = check_job(loaded, everything=everything)
+        shown = (*checked.overview.of_kind("topic"), *checked.overview.of_kind("service"))
+        names = Names(
+            nodes=tuple(node.name for node in checked.overview.nodes),
+            topics=tuple(dict.fromkeys([*(link.name for link in shown), *checked.interfaces])),
+            are_all=True,
+            interfaces=checked.interfaces,
+            fields=loaded_fields,
+        )
+        wrong = tuple(wrong_checks(checked.job, names))
+        checked = replace(checked, unused=(*checked.unused, *wrong))
     except RunError as error:
         if isinstance(error, NodeError) and error.traceback_text:
             tell(error.traceback_text.rstrip())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,8 @@ class Checked:
     notes: tuple[str, ...]
     unused: tuple[str, ...]
     """What in the job had nothing to do: it names what is not there."""
+    interfaces: Mapping[str, str]
+    """By the names of all topics and services, their interfaces."""
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -70,10 +72,14 @@ def check_job(job: Job, *, everything: bool = False) -> Checked:
         graph = world.domain.graph
         never = impossible_starts(session.job, graph, session.start_ns, session.end_ns)
         unused = (*session.unused(), *never)
+        interfaces = {
+            name: types[0]
+            for name, types in (*graph.topic_names_and_types(), *graph.service_names_and_types())
+        }
         session.stop = Stop("checked")
         session.finish()
         notes += _divisions_by_nothing(session.job)
-        return Checked(session.job, session.start_ns, found, tuple(notes), unused)
+        return Checked(session.job, session.start_ns, found, tuple(notes), unused, interfaces)
 
 
 def _divisions_by_nothing(job: Job) -> Iterator[str]:

@@ -28,7 +28,7 @@ from rsltrace.errors import TraceError
 from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
-from rsltrace.trace.wide_texts import with_wide_texts, without_wide_texts
+from rsltrace.trace.wide_texts import STAND_IN_TYPE, with_wide_texts, without_wide_texts
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
 _CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
@@ -100,6 +100,18 @@ class Decoder:
                 f"a message on {self._channel.topic} does not fit its type {self._channel.type}: "
                 f"{error}"
             ) from error
+
+    def fields_of(self, interface: str) -> dict[str, str] | None:
+        """Return the fields of one of the schema's types, with the types of those that are messages
+        (others: empty); None if it is not in the schema."""
+        found = self.types.get(interface)
+        if found is None:
+            return None
+        return {
+            name: str(detail) if kind == Nodetype.NAME and detail != STAND_IN_TYPE else ""
+            for name, (kind, detail) in found[1]
+            if name not in _NOT_OF_THE_MESSAGE
+        }
 
     def of(self, channel: ChannelInfo) -> Decoder:
         """Return this decoder for another channel of the same schema."""

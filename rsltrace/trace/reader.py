@@ -8,6 +8,7 @@ in the same way, with ``complete`` false.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
@@ -54,7 +55,7 @@ from rsltrace.trace.pieces import read_attachment, read_metadata
 from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
-    from rsltrace.trace.decode import Decoders
+    from rsltrace.trace.decode import Decoder, Decoders
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -401,6 +402,18 @@ class Trace:
         """Yield (channel, stamp in ns, sequence, data) of every message of some channels."""
         yield from self._payloads.messages(channels)
 
+    def fields_of(self, interface: str) -> Mapping[str, str] | None:
+        """Return the fields of an interface (``nav_msgs/msg/Odometry``) with those of them that are
+        messages (others: empty); None if no readable schema of the trace defines it."""
+        package = interface.partition("/")[0]
+        for channel in self.channels.values():
+            if channel.type == interface or package in channel.schema_text:
+                with suppress(TraceError):
+                    fields = self._decoder(channel).fields_of(interface)
+                    if fields is not None:
+                        return fields
+        return None
+
     def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
         """Return ``data`` decoded by the schema of a channel (or its id, or its topic).
 
@@ -414,16 +427,18 @@ class Trace:
             found = channel
         if found is None:
             raise TraceError(f"{self.name} has no topic {channel}")
+        try:
+            return self._decoder(found).decode(data)
+        except TraceError as error:
+            raise TraceError(f"{self.name}: {error}") from error
+
+    def _decoder(self, channel: ChannelInfo) -> Decoder:
         if self._decoders is None:
             # Its library takes as long as opening a trace.
             from rsltrace.trace.decode import Decoders
 
             self._decoders = Decoders()
-        decoders = self._decoders
-        try:
-            return decoders.of(found).decode(data)
-        except TraceError as error:
-            raise TraceError(f"{self.name}: {error}") from error
+        return self._decoders.of(channel)
 
     def _named(self, read: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T:
         """Read something; errors begin with the name of the file, since two may be open."""

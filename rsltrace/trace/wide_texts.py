@@ -11,7 +11,7 @@ import re
 from typing import Any
 
 _STAND_IN = "rsltrace_wide/Text"
-_STAND_IN_TYPE = "rsltrace_wide/msg/Text"
+STAND_IN_TYPE = "rsltrace_wide/msg/Text"
 _DEFINITION = f"\n{'=' * 80}\nMSG: {_STAND_IN}\nuint32[] units\n"
 _FIELD = re.compile(
     r"^([ \t]*)wstring(?:<=\d+)?(\[[^\]\n]*\])?([ \t]+[A-Za-z]\w*)[ \t]*"
@@ -44,7 +44,7 @@ def with_wide_texts(value: Any) -> Any:
         return [with_wide_texts(item) for item in value]
     if not dataclasses.is_dataclass(value) or isinstance(value, type):
         return value
-    if getattr(value, "__msgtype__", "") == _STAND_IN_TYPE:
+    if getattr(value, "__msgtype__", "") == STAND_IN_TYPE:
         units: Any = getattr(value, "units")  # noqa: B009 (of a class made at run time)
         if len(units) and units.max() > 0xFFFF:
             raise ValueError("a character of a wide text is larger than 16 bits")

@@ -100,7 +100,7 @@ def test_what_cannot_be_understood(check: dict[str, Any], said: str) -> None:
 
 
 def test_what_cannot_be_evaluated() -> None:
-    with pytest.raises(CheckError, match="did you mean 'ranges'"):
+    with pytest.raises(JobError, match=r"checks\[0\].*did you mean .ranges."):
         checked({"always": "/scan: rangs[0] > 0"})
     (found,) = checked({"never": "/scan: ranges[100000] > 0"})
     assert found.verdict == "kept"
@@ -284,6 +284,16 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     job.write_text(job.read_text().replace("< 8", "< 80").replace("talkers:few", "talkers:Talker"))
     job.write_text(job.read_text().split("  - {name")[0])
     assert CliRunner().invoke(cli, ["check", "run.mcap", "--job", "job.yaml"]).exit_code == 0
+
+    rest = (
+        "  - eventually: '/x: dta > 1'\n  - {rate: /x, at_least: 1}\n  - {rate: /y, at_least: 1}\n"
+    )
+    job.write_text(job.read_text() + rest)
+    done = CliRunner().invoke(cli, ["check", "job.yaml"])
+    assert done.exit_code == 1, done.output
+    assert "job.yaml:5:17: eventually: the message has no field 'dta'; did you mean" in done.stdout
+    assert "job.yaml:7:12: no topic is called '/y'; there are /x" in done.stdout
+    assert done.stdout.count("job.yaml:") == 2
 
     job.write_text(job.read_text().replace("/x.data < 80", "/x.data <"))
     done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "other.mcap", "--no-pin"])
