@@ -10,6 +10,7 @@
     │   └── ReplayError              2  it cannot be replayed: its job is not here, or not trusted
     ├── BisectError                  2  the revisions of a job cannot be searched, or not judged
     ├── DebugError                   2  a debugging session cannot do what it is asked
+    ├── ExploreError                 2  a search cannot begin or go on: see ``explore``
     ├── OutputError                  2  a trace cannot be written: it exists, no room, no permission
     ├── ConditionError               2  where to stop, or what to evaluate, cannot be understood
     └── RunError                     3  the run itself went wrong; the trace up to there is complete
@@ -81,6 +82,10 @@ class BisectError(RsltraceError):
 
 class DebugError(RsltraceError):
     """A debugging session cannot do what it is asked; it goes on unless the message says not."""
+
+
+class ExploreError(RsltraceError):
+    """A search for a failing run cannot begin or go on. What it has found so far is kept."""
 
 
 class EditError(TraceError):

@@ -21,16 +21,17 @@ if os.getppid() != int(sys.argv.pop(1)):
 del sys.path[0]
 sys.path.append(sys.argv.pop(1))
 import runpy
+module = sys.argv.pop(1)
 sys.argv[0] = 'rsltrace'
-runpy.run_module('rsltrace', run_name='__main__')
+runpy.run_module(module, run_name='__main__')
 """
 OWN_FOLDER = Path(__file__).resolve().parents[2]
 """The folder that this package is in."""
 
 
-def rsltrace_command(words: Sequence[str]) -> list[str]:
+def rsltrace_command(words: Sequence[str], module: str = "rsltrace") -> list[str]:
     """Return a command line of this very rsltrace; its process ends with the present one."""
-    return [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(OWN_FOLDER), *words]
+    return [sys.executable, "-c", _PROGRAM, str(os.getpid()), str(OWN_FOLDER), module, *words]
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable
 
 from rsltrace.checks.properties import Violation
 from rsltrace.errors import CheckError, RsltraceError
+from rsltrace.job.values.target import Target
+from rsltrace.run.plans.target import load_target
 from rsltrace.trace.reader import Trace
 
 
@@ -35,6 +37,17 @@ def violations(function: Callable[[Trace], object], name: str, trace: Trace) -> 
         f"{name} returned {said!r}: nothing or True (all is well), False, a text, or a list of "
         "(event, text)"
     )
+
+
+def load_function(target: Target) -> Callable[[Trace], object]:
+    """Return the function that a check names, imported from the job's search path.
+
+    :raises JobError: there is none.
+    """
+    if not isinstance(target, str):
+        return target
+    loaded: Callable[[Trace], object] = load_target(target, where=f"checks: function {target}")
+    return loaded
 
 
 def _at_end(trace: Trace, text: str) -> Violation:

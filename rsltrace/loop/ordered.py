@@ -7,7 +7,7 @@ own, so that the plain one does not pay for it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from heapq import heappop
 from typing import Any
@@ -92,6 +92,10 @@ class OrderedLoop(EventLoop):
         self.charge = Charge()
         self.choices: Choices | None = None
         """What the policy has chosen so far, where somebody wants to know."""
+        self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
+        """Told of every choice, of one alone, too, if somebody has to know."""
+        self.on_lull: Callable[[], None] | None = None
+        """Told each time that nothing is left that could run, if somebody has to know."""
         self._held: dict[object, None] = {}
         self._ready = _Waiting(lambda item: self.place(item), self._runs)
         self._tasks = _Waiting(lambda item: self.place(item), self._runs)
@@ -119,8 +123,11 @@ class OrderedLoop(EventLoop):
             place = self._next()
             if place is not None:
                 self._dispatch(place)
-            elif not self.idle or not self._run_idle():
-                break
+            else:
+                if self.on_lull is not None:
+                    self.on_lull()
+                if not self.idle or not self._run_idle():
+                    break
             if self.events >= limit:
                 if self.now_ns == now_ns:
                     self._livelock(now_ns)
@@ -139,7 +146,10 @@ class OrderedLoop(EventLoop):
         if not places:
             return None
         moment = Moment(self.now_ns, self.events)
-        choice = self._chosen([place.candidate for place in places], moment)
+        ready = [place.candidate for place in places]
+        choice = self._chosen(ready, moment)
+        if self.on_choice is not None:
+            self.on_choice(ready, choice, moment)
         if self.choices is not None and len(places) > 1:
             self.choices.add(choice)
         place = places[choice]

@@ -44,7 +44,7 @@ from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
-from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan
+from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, unmet_departures
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions, stop_with
 from rsltrace.run.process import (
@@ -424,6 +424,8 @@ class Session:
             rules += unused_rules(self.job, census, self._plan, lasted_ns)
             rules += unused_ros_parameters(self.job, census, parameters)
         starts = missed_starts(self.job, self.world.starts.missed()) if lasted else ()
+        if lasted and isinstance(self.loop, OrderedLoop):
+            rules += unmet_departures(self.job, self.loop.policy)
         return (*rules, *unused_parameters(self.job, parameters), *starts)
 
     def finish(self) -> RunResult:

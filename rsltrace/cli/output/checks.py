@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from rsltrace.checks.evaluate import OPEN, VIOLATED, CheckResult, evaluate_checks
+from rsltrace.checks.functions import load_function
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job
-from rsltrace.job.values.target import Target
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
-from rsltrace.run.plans.target import load_target
 from rsltrace.run.process import search_path
 from rsltrace.trace.reader import Trace
 from rsltrace.words.code import code_place
@@ -30,7 +28,7 @@ class Checked:
     def __init__(self, job: Job, path: Path, *, functions: bool = True) -> None:
         self._path = path
         with Trace.open(path) as trace, search_path(job):
-            self.results = evaluate_checks(trace, job, _load if functions else None)
+            self.results = evaluate_checks(trace, job, load_function if functions else None)
             self._places = {
                 one.event: _place(trace, one.event)
                 for result in self.results
@@ -85,13 +83,6 @@ class Checked:
         at = "at the end" if found.event is None else f"event {found.event}"
         place = "" if found.event is None else self._places.get(found.event, "")
         return printable(f"{at}, {format_seconds(found.stamp_ns)} s{place}: {found.text}")
-
-
-def _load(target: Target) -> Callable[[Trace], object]:
-    if not isinstance(target, str):
-        return target
-    loaded: Callable[[Trace], object] = load_target(target, where=f"checks: function {target}")
-    return loaded
 
 
 def _place(trace: Trace, index: int) -> str:

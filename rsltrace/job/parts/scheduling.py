@@ -48,11 +48,52 @@ class PriorityRuleSpec(Part):
         return self
 
 
+class DepartureSpec(Part):
+    """A choice at which another than the first that became ready runs."""
+
+    choice: Annotated[int, check(whole(0))] = Field(
+        description="Which choice, from 0. Only times at which more than one can run count.",
+        examples=[37],
+    )
+    run: Annotated[int, check(whole(0))] = Field(
+        description="Which of those that can run, from 0, in the order in which they became ready, "
+        "timers last.",
+        examples=[2],
+    )
+    of: Annotated[str | None, check(text(), optional=True)] = Field(
+        default=None,
+        description="Its node and entity, to read and to be checked: another one is an error.",
+        examples=["/planner /scan"],
+    )
+
+
+class PctSpec(Part):
+    """Probabilistic concurrency testing: random priorities, changed at random choices."""
+
+    depth: Annotated[int, check(whole(1, 100))] = Field(
+        default=3,
+        description="How many constraints of order the bug needs: 1 for one pair of events.",
+        examples=[3],
+    )
+    choices: Annotated[int, check(whole(1))] = Field(
+        default=1000,
+        description="How many choices a run has, at most: priorities change within so many.",
+        examples=[500],
+    )
+
+
 class PolicySpec(Part):
     """Which of the callbacks that are ready runs next. Exactly one of the keys; a word alone is an
     ``order``."""
 
-    ONE_OF: ClassVar[tuple[str, ...]] = ("order", "priority", "recorded", "function")
+    ONE_OF: ClassVar[tuple[str, ...]] = (
+        "order",
+        "priority",
+        "departures",
+        "pct",
+        "recorded",
+        "function",
+    )
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((key,) for key in ONE_OF)
 
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
@@ -66,6 +107,18 @@ class PolicySpec(Part):
         default=None,
         description="Highest priority first; the first rule that fits counts.",
         examples=[[{"node": "/controller", "priority": 10}]],
+    )
+    departures: Annotated[tuple[DepartureSpec, ...] | None, parts(optional=True)] = Field(
+        default=None,
+        description="First come, first served, but for these choices: what `rsltrace explore` "
+        "writes of an order that it has found.",
+        examples=[[{"choice": 37, "run": 2}]],
+    )
+    pct: Annotated[PctSpec | None, part("depth")] = Field(
+        default=None,
+        description="Random priorities of entities, as the job's `seed` decides, that change at "
+        "`depth` - 1 random choices.",
+        examples=[{"depth": 3, "choices": 500}],
     )
     recorded: Annotated[str | None, check(check_path, optional=True)] = Field(
         default=None,
@@ -83,6 +136,13 @@ class PolicySpec(Part):
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
         if len(given) != 1:
             raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+        choices: set[int] = set()
+        for index, departure in enumerate(self.departures or ()):
+            if departure.choice in choices:
+                raise Problem(
+                    f"choice {departure.choice} is there twice", ("departures", index, "choice")
+                )
+            choices.add(departure.choice)
         return self
 
 

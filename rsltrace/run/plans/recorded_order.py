@@ -8,6 +8,7 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.chance.stream import Stream
 from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.loop.choices import Choices, decoded
@@ -15,6 +16,7 @@ from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
 from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
+from rsltrace.loop.search_policies import Departure, Departures, Pct
 from rsltrace.model.event import EventKind
 from rsltrace.run.plans.scheduling import of_order, own_policy
 from rsltrace.trace.reader import Trace
@@ -95,6 +97,10 @@ def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
     """Return the policy of a resolved job, None if it cannot be made."""
     if spec.get("priority") is not None:
         return Priority([PriorityRule(**rule) for rule in spec["priority"]])
+    if spec.get("departures") is not None:
+        return Departures([Departure(**one) for one in spec["departures"]])
+    if spec.get("pct") is not None:
+        return Pct(Stream(seed, "pct"), **spec["pct"])
     if spec.get("function") is not None:
         with suppress(JobError):
             return own_policy(spec["function"], "")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.chance.stream import Stream
@@ -15,6 +16,7 @@ from rsltrace.loop.policy import (
     PriorityRule,
     RateMonotonic,
 )
+from rsltrace.loop.search_policies import Departure, Departures, Pct
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.run.plans.target import load_target
 
@@ -65,7 +67,24 @@ def _policy(job: Job) -> Policy:
     if spec.priority is not None:
         rules = [PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in spec.priority]
         return Priority(rules)
+    if spec.departures is not None:
+        return Departures(Departure(one.choice, one.run, one.of) for one in spec.departures)
+    if spec.pct is not None:
+        return Pct(Stream(job.seed, "pct"), spec.pct.depth, spec.pct.choices)
     return own_policy(spec.function, locate(job, ("policy", "function")))
+
+
+def unmet_departures(job: Job, policy: Policy) -> Iterator[str]:
+    """Yield the departures that a run has not come to, which had so few choices."""
+    if job.policy is None or not isinstance(policy, Departures):
+        return
+    unmet = frozenset(policy.unmet())
+    for index, one in enumerate(job.policy.departures or ()):
+        if one.choice in unmet:
+            yield (
+                f"{locate(job, ('policy', 'departures', index, 'choice'))}: there was no choice "
+                f"{one.choice}: the run had {policy.choices}"
+            )
 
 
 def of_order(order: str, seed: int) -> Policy | None:

@@ -1,0 +1,171 @@
+"""One run of a search: what sets it apart from the job, and what came of it.
+
+What sets a trial apart is an *overlay*, plain JSON values:
+
+    {"seed": 7, "policy": {…}, "faults": […], "set": {"nodes.0.parameters.speed": 1.2},
+     "until": "3s"}
+
+``seed``, ``policy`` and ``faults`` stand for these keys of the job, ``set`` for any other, by the
+paths of ``--set``, ``until`` for ``stop.time``. So a trial is its job with the overlay, and
+``JobSource.job(trial).to_yaml()`` is the job file that repeats it: ``rsltrace record`` of that file
+has the trial's digest.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+from rsltrace.job import Job, job_from_text, load_job
+
+CHECK, EXCEPTION, DEADLOCK, LIVELOCK = "check", "exception", "deadlock", "livelock"
+UNFINISHED, EXIT, ERROR, CRASH, TIMEOUT = "unfinished", "exit", "error", "crash", "timeout"
+"""Kinds of failures. ``unfinished``: the job's ``stop.timeout`` came first. ``exit``: the run ended
+with a status of its own. ``error``: it did what a simulation cannot do, or its order could not be
+followed. ``crash``: its process died; ``timeout``: it was killed for taking too long."""
+
+_KEYS = ("seed", "policy", "faults")
+
+
+@dataclass(frozen=True, slots=True)
+class JobSource:
+    """A job as a command line names it: the file, and texts of ``--set`` with what they are called.
+
+    ``text`` stands for the file where there is none (a launch file alone).
+    """
+
+    path: str
+    overrides: tuple[tuple[str, str], ...] = ()
+    text: str | None = None
+    folder: str = "."
+
+    def job(self, trial: Trial | None = None) -> Job:
+        """Return the job, with a trial's overlay.
+
+        :raises JobError: it is wrong.
+        """
+        more = [] if trial is None else list(overrides_of(trial))
+        overrides = [*self.overrides, *more]
+        if self.text is not None:
+            return job_from_text(self.text, self.path, self.folder, overrides=overrides)
+        return load_job(self.path, overrides=overrides)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A run to be made: the ``number``-th of its search, whose ``why`` says what it tries."""
+
+    number: int
+    overlay: Mapping[str, Any]
+    why: str = ""
+
+
+def overrides_of(trial: Trial) -> Iterator[tuple[str, str]]:
+    """Yield an overlay as overrides of a job: what messages call one, and its text."""
+    label = f"trial {trial.number}"
+    for key, value in trial.overlay.items():
+        if key == "set":
+            for path, given in value.items():
+                yield label, f"{path}={_yaml(given)}"
+        elif key == "until":
+            yield label, f"stop.time={_yaml(value)}"
+        elif key in _KEYS:
+            yield label, f"{key}={_yaml(value)}"
+        else:
+            raise ValueError(f"an overlay has no {key!r}")
+
+
+def _yaml(value: Any) -> str:
+    return json.dumps(_literal(value))
+
+
+def _literal(value: Any) -> Any:
+    """Keep ``$(…)`` in texts from being replaced when they are read."""
+    if isinstance(value, str):
+        return value.replace("$(", "\\$(")
+    if isinstance(value, Mapping):
+        return {str(key): _literal(item) for key, item in value.items()}
+    return [_literal(item) for item in value] if isinstance(value, (list, tuple)) else value
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """What is wrong with a run.
+
+    ``kind`` is one of the words above. ``key`` is the same for failures of one cause (a check's
+    name; an exception's type and line), ``event`` where it shows, if anywhere.
+    """
+
+    kind: str
+    text: str
+    key: str
+    event: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What ran next at one asking of the policy, for a search that changes the order.
+
+    ``ready`` are the names of all that could run, ``chosen`` is the index of the one that did; the
+    n-th event of an entity is ``name #n``, so it is called the same in another order. ``phase``
+    counts the stretches of a run at whose ends nothing was left to run. ``touches`` are the things
+    that what ran has read (False) or written (True): the steps of one phase commute unless one
+    writes what the other touches. ``state`` is a hash of everything at the beginning of the phase.
+    """
+
+    ready: tuple[str, ...]
+    chosen: int
+    phase: int
+    touches: Mapping[str, bool]
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class TrialResult:
+    """What came of a trial. Times are simulated nanoseconds, ``wall_s`` is real time.
+
+    ``choices`` is how often more than one could run; ``entities`` how many had events.
+    ``behaviours`` are hashes of what happened (an event with its content and its node's state
+    after it, and pairs of events of one node in their order), ``steps`` the order; both are only
+    there if asked for. ``trace`` is where the trace is, if it was kept.
+    """
+
+    trial: Trial
+    digest: str = ""
+    events: int = 0
+    end_ns: int = 0
+    choices: int = 0
+    entities: int = 0
+    failure: Failure | None = None
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    wall_s: float = 0.0
+    trace: str | None = None
+    final_state: str = ""
+    behaviours: tuple[int, ...] = ()
+    steps: tuple[Step, ...] = ()
+
+    def as_values(self) -> dict[str, Any]:
+        """Return the result as JSON values."""
+        return asdict(self)
+
+    def row(self) -> dict[str, Any]:
+        """Return what a table keeps of it: without behaviours and steps."""
+        values = asdict(replace(self, behaviours=(), steps=()))
+        del values["behaviours"], values["steps"]
+        return values
+
+
+def result_of(values: Mapping[str, Any]) -> TrialResult:
+    """Return the result that ``as_values`` or ``row`` wrote."""
+    given = dict(values)
+    given["trial"] = Trial(**given["trial"])
+    if given.get("failure") is not None:
+        given["failure"] = Failure(**given["failure"])
+    given["behaviours"] = tuple(given.get("behaviours", ()))
+    given["steps"] = tuple(
+        Step(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
+        for one in given.get("steps", ())
+    )
+    return TrialResult(**given)
