@@ -34,7 +34,7 @@ BOXES = (
     Box(180, 44, 223, 54, "testing", "a pytest plugin", SHARED),
     Box(413, 44, 223, 54, "viewer", "terminal screens, Rerun", SHARED),
     Box(646, 44, 444, 54, "cli", "the commands", SHARED),
-    Box(180, 108, 145, 54, "campaign", "verify: many runs", RUNNING),
+    Box(180, 108, 145, 54, "campaign · explore", "many runs", RUNNING),
     Box(335, 108, 146, 54, "replay · debug", "a run again, checked", RUNNING),
     Box(491, 108, 145, 54, "audit · checks", "may differ; must hold", RUNNING),
     Box(180, 172, 456, 54, "run", "puts the floors below together for one job", RUNNING),
