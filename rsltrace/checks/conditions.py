@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+from dataclasses import dataclass, replace
 
-from rsltrace.debug.conditions.condition import Condition
+from rsltrace.debug.conditions.condition import Armed, Condition, is_true
 from rsltrace.debug.conditions.expressions import Expression, parse_expression
 from rsltrace.debug.conditions.names import Names
+from rsltrace.debug.conditions.occurrences import OnTopic
 from rsltrace.debug.conditions.text import parse_condition
+from rsltrace.debug.conditions.view import EventView, Moment
 from rsltrace.errors import ConditionError
 
 _TOPIC = r"/[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*"
@@ -59,18 +62,35 @@ def condition(text: str, names: Names) -> Condition:
 
 
 def opposite(text: str, names: Names) -> Condition:
-    """Read what has to be true of all messages, and return the condition that is met by others.
+    """Read what has to be true of all messages, and return the condition that is met by others:
+    those of which it is false, or cannot be evaluated.
 
     :raises ConditionError: as above, or it is not about messages.
     """
-    condition(text, names)
-    found = _OF_MESSAGE.match(plain(text))
-    if found is None:
+    read = condition(text, names)
+    if _OF_MESSAGE.match(plain(text)) is None:
         raise ConditionError(
             "always is about messages: say /topic: EXPRESSION; for what must not happen, never",
             text,
         )
-    return parse_condition(f"{found[1]}: not ({found[2]})", names)
+
+    def arm(moment: Moment) -> Armed:
+        armed = read.arm(moment)
+        assert isinstance(armed, OnTopic)
+        return _Unless(armed.text, armed.pattern, armed.expression)
+
+    return replace(read, arm=arm)
+
+
+@dataclass
+class _Unless(OnTopic):
+    """After an event that sends a message of which an expression is not true."""
+
+    def _why(self, what: str, view: EventView, message: object) -> str:
+        assert self.expression is not None
+        found, note = is_true(self.expression, view, self.text, message)
+        self.note = note or self.note
+        return "" if found else f"{what}, and not {self.expression.text}"
 
 
 def compared(text: str) -> Expression | None:

@@ -19,7 +19,7 @@ from rsltrace.job.values.target import Target, target_text
 from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.reader import Trace
 
-KEPT, VIOLATED, OPEN, SKIPPED = "kept", "violated", "open", "skipped"
+PASSED, VIOLATED, UNDECIDED, SKIPPED = "passed", "violated", "undecided", "skipped"
 _NO_NAMES = Names()
 
 LoadFunction = Callable[[Target], Callable[[Trace], object]]
@@ -30,7 +30,7 @@ LoadFunction = Callable[[Target], Callable[[Trace], object]]
 class CheckResult:
     """What came of a check.
 
-    ``verdict``: ``kept``, ``violated``, ``open`` (the run ended before it could be said) or
+    ``verdict``: ``passed``, ``violated``, ``undecided`` (the run ended before it could be said) or
     ``skipped`` (a function, where none are called). ``count`` is the number of violations, of
     which ``violations`` has the first ones, in order. ``note`` says what is odd.
     """
@@ -130,7 +130,9 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
         return None
     if spec.rate is not None:
         _rate_topic(job, index, spec, names)
-        return Rate(spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S)
+        return Rate(
+            spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S, trace.start_ns
+        )
     what, after = _conditions(job, index, spec, names)
     assert what is not None
     start = _Start(trace.start_ns)
@@ -194,7 +196,7 @@ def _located(job: Job, index: int, key: str) -> Iterator[None]:
 
 
 def _result(spec: CheckSpec, one: Property) -> CheckResult:
-    verdict = VIOLATED if one.count else OPEN if one.open else KEPT
+    verdict = VIOLATED if one.count else UNDECIDED if one.undecided else PASSED
     return CheckResult(title(spec), verdict, one.count, tuple(one.found), one.note)
 
 
@@ -205,4 +207,4 @@ def _of_function(trace: Trace, spec: CheckSpec, load: LoadFunction | None) -> Ch
             title(spec), SKIPPED, note="functions are called for a job's file, not for a trace's"
         )
     found = violations(load(spec.function), target_text(spec.function), trace)
-    return CheckResult(title(spec), VIOLATED if found else KEPT, len(found), tuple(found))
+    return CheckResult(title(spec), VIOLATED if found else PASSED, len(found), tuple(found))

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from rsltrace.checks.trace_events import TraceEvent
-from rsltrace.debug.conditions.condition import Armed, shown
+from rsltrace.debug.conditions.condition import Armed, error_text, shown
 from rsltrace.debug.conditions.expressions import Expression
+from rsltrace.errors import RsltraceError
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
 
@@ -20,8 +22,8 @@ _KEPT_MAX = 1000
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """Where a check is not kept: an event (None: at the end of the run), its time in ns, and what
-    is wrong there."""
+    """Where a check fails: an event (None: at the end of the run), its time in ns, and what is
+    wrong there."""
 
     event: int | None
     stamp_ns: int
@@ -29,19 +31,20 @@ class Violation:
 
 
 @dataclass
-class Property:
-    """A property of a run, told of its events in order. ``count`` is how often it is not kept,
-    ``open`` how often the end of the run came before it could be said."""
+class Property(ABC):
+    """A property of a run, told of its events in order. ``count`` is how often it is violated,
+    ``undecided`` how often the run ended before that could be said."""
 
     found: list[Violation] = field(default_factory=list, init=False)
     count: int = field(default=0, init=False)
-    open: int = field(default=0, init=False)
+    undecided: int = field(default=0, init=False)
     note: str = field(default="", init=False)
 
+    @abstractmethod
     def see(self, event: TraceEvent) -> None:
         """Take note of an event that has ended."""
-        raise NotImplementedError
 
+    @abstractmethod
     def end(self, stamp_ns: int, *, complete: bool) -> None:
         """Take note of the end of the run; not ``complete``: of what there is of it."""
 
@@ -82,6 +85,9 @@ class Never(Property):
         if self.after is not None and self.after.after(event):
             self._since = (event.index, event.stamp_ns)
 
+    def end(self, stamp_ns: int, *, complete: bool) -> None:
+        """Nothing: what has not happened by then has not happened."""
+
     def _values(self, event: TraceEvent) -> str:
         """Return what was compared, of the messages that the event has sent: `` (x = 0.31)``."""
         if self.value is None or self.count >= _KEPT_MAX:
@@ -91,8 +97,10 @@ class Never(Property):
             if sent.name == self.topic and sent.message is not None:
                 try:
                     values.append(shown(self.value.value(event, message=sent.message())))
-                except Exception:  # of another message than the one that counts
-                    continue
+                except RsltraceError:
+                    raise
+                except Exception as error:  # of this message; another one may be what is wrong
+                    values.append(error_text(error))
         named = self.value.text.removeprefix("msg.")
         return f" ({named} = {', '.join(values[:_SHOWN_MAX])})" if values else ""
 
@@ -132,7 +140,7 @@ class Eventually(Property):
             if complete and self.within_ns is None:
                 self._missed(index, begin_ns, "before the end of the run")
             else:
-                self.open += 1
+                self.undecided += 1
 
     def _pass(self, now_ns: int) -> None:
         """Give up what should have happened by ``now_ns``."""
@@ -155,6 +163,7 @@ class Rate(Property):
     at_least: float | None
     at_most: float | None
     over_ns: int = NS_PER_S
+    start_ns: int = 0
 
     def __post_init__(self) -> None:
         self._sent: list[tuple[int, int]] = []
@@ -166,8 +175,13 @@ class Rate(Property):
                 self._sent.append((event.stamp_ns, event.index))
 
     def end(self, stamp_ns: int, *, complete: bool) -> None:
-        """Count, in the stretches that begin with, or right after, each message."""
+        """Count, in the stretches that begin right after each message."""
+        if not self._sent:
+            self._silent(stamp_ns, complete=complete)
+            return
+        stretches = 0
         for begin_ns, index, count in self._stretches(stamp_ns):
+            stretches += 1
             hz = count * NS_PER_S / self.over_ns
             until = format_seconds(begin_ns + self.over_ns)
             said = f"{count} messages from here to {until} s: {hz:g} Hz"
@@ -175,8 +189,17 @@ class Rate(Property):
                 self._violated(index, begin_ns, f"{said}, at least {self.at_least:g} Hz")
             elif self.at_most is not None and count > self._most:
                 self._violated(index, begin_ns, f"{said}, at most {self.at_most:g} Hz")
-        if not self._sent:
-            self.open += 1
+        if not stretches:
+            self.undecided += 1
+            self.note = f"less than {format_duration(self.over_ns)} is left after its first message"
+
+    def _silent(self, stamp_ns: int, *, complete: bool) -> None:
+        """A topic without a message is too slow, once there was time for one."""
+        if complete and self.at_least is not None and stamp_ns - self.start_ns >= self.over_ns:
+            said = f"there is no message: 0 Hz, at least {self.at_least:g} Hz"
+            self._violated(None, stamp_ns, said)
+        elif self.at_least is not None:
+            self.undecided += 1
             self.note = "there is no message"
 
     @property

@@ -68,7 +68,7 @@ def check(
     With a trace instead of a job (rsltrace check run.mcap), the job's checks (checks:) are held
     against it; functions among them are called only where --job names a file.
 
-    The exit status is 0 if all is well, 1 if a check is not kept, or something in the graph looks
+    The exit status is 0 if all is well, 1 if a check fails, or something in the graph looks
     wrong (QoS that keeps a publisher and a subscription apart, a subscription or a client without
     anybody at the other end, a topic that a bag plays and a node publishes, a rule of the job that
     fits nothing), 2 if the job cannot run.
@@ -82,6 +82,8 @@ def check(
     if graph is not None and graph.suffix != ".svg":
         raise click.BadParameter(f"{graph} should end in .svg", param_hint="--graph")
     if len(words) == 1 and is_trace(words[0]):
+        if graph is not None or everything or overrides or launch is not None:
+            raise click.UsageError(f"{words[0]} is a trace: --graph, --all and --set are for a job")
         return _check_trace(Path(words[0]), other, form)
     if other is not None:
         raise click.UsageError("--job is for a trace: rsltrace check run.mcap --job job.yaml")

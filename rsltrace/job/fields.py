@@ -193,8 +193,8 @@ class JobFields(Part):
     )
     checks: Annotated[tuple[CheckSpec, ...], parts()] = Field(
         default=(),
-        description="What has to be true of a run: `rsltrace record` says what was not, and ends "
-        "with status 1 then; `rsltrace check run.mcap` holds it against a trace.",
+        description="What has to be true of a run: `rsltrace record` says which checks fail, and "
+        "ends with status 1 then; `rsltrace check run.mcap` checks a trace.",
         examples=[
             [
                 {"always": "/odom.pose.pose.position.x < 10"},

@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from rsltrace.checks.evaluate import OPEN, VIOLATED, CheckResult, evaluate_checks
+from rsltrace.checks.evaluate import UNDECIDED, VIOLATED, CheckResult, evaluate_checks
 from rsltrace.checks.functions import load_function
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job
@@ -18,7 +18,7 @@ from rsltrace.words.code import code_place
 from rsltrace.words.events import EventWords
 
 _SHOWN_MAX = 3
-_WORDS = {OPEN: "not decided before the end of the run"}
+_WORDS = {UNDECIDED: "not decided before the end of the run"}
 
 
 class Checked:
@@ -38,11 +38,11 @@ class Checked:
 
     @property
     def violated(self) -> list[CheckResult]:
-        """Those that are not kept."""
+        """Those that failed."""
         return [one for one in self.results if one.verdict == VIOLATED]
 
     def lines(self) -> list[str]:
-        """Return a line for each check, and under those that are not kept where they are not."""
+        """Return a line for each check, and under those that failed where they did."""
         lines = []
         for one in self.results:
             note = f" ({one.note})" if one.note else ""

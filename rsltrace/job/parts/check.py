@@ -57,8 +57,8 @@ class CheckSpec(Part):
     )
     always: Condition = Field(
         default=None,
-        description="Must be true of every message: `/topic: EXPRESSION` over its fields, or "
-        "`/topic.field < 10`. What a debugger's breakpoint can say of messages, a check can.",
+        description="Must hold for every message: `/topic: EXPRESSION` over its fields, or "
+        "`/topic.field < 10`. What a breakpoint of the debugger can say of messages, a check can.",
         examples=["/odom.pose.pose.position.x < 10", "/scan: min(ranges) > 0.1"],
     )
     never: Condition = Field(
@@ -69,14 +69,14 @@ class CheckSpec(Part):
     )
     eventually: Condition = Field(
         default=None,
-        description="Has to happen: `within` a time from the start (or before the end), or, with "
-        "`after`, each time that has happened.",
+        description="Has to happen `within` a time of the start (or before the end) or, with "
+        "`after`, each time after that has happened.",
         examples=["/goal_reached.data"],
     )
     rate: Annotated[str | None, check(text(check_topic), optional=True)] = Field(
         default=None,
-        description="Topic whose messages come `at_least` or `at_most` so often, counted over "
-        "every stretch `over` between its first message and the end of the run.",
+        description="Topic whose messages come `at_least` or `at_most` so often, counted `over` a "
+        "time after each message.",
         examples=["/scan"],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
@@ -88,13 +88,13 @@ class CheckSpec(Part):
     )
     after: Condition = Field(
         default=None,
-        description="The check counts from each time that this has happened on.",
+        description="The check applies from each time that this has happened.",
         examples=["/stop", "/scan: min(ranges) < 0.3"],
     )
     within_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="within",
-        description="For how long it counts: from `after`, or from the start of the run.",
+        description="How long the check applies: from `after`, or from the start of the run.",
         examples=["200ms"],
     )
     at_least: Annotated[float | None, check(_rate, optional=True)] = Field(
@@ -106,7 +106,7 @@ class CheckSpec(Part):
     over_ns: Annotated[int | None, check(positive_time, optional=True)] = Field(
         default=None,
         alias="over",
-        description="The stretch over which a rate is counted; without it, one second.",
+        description="For how long messages are counted; without it, one second.",
         examples=["500ms"],
     )
 

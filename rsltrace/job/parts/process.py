@@ -37,7 +37,7 @@ attach(
 
 
 class RespawnSpec(Part):
-    """A process that has ended, however it has, is started again. A plain time stands for
+    """A process is started again when it has ended, even by a failure. A plain time stands for
     ``{delay: time}``."""
 
     MEANT: ClassVar[str] = "delay"
