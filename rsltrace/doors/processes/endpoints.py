@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Protocol
 
 from rsltrace.doors.processes.wire import Ready, gid_of, packed_item
+from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.middleware.participant import Participant
@@ -65,7 +66,20 @@ class RosoutPublisher(Publisher):
         super().send(data, hash64(log_content(data)))
 
 
-class ProcessSubscription(Subscription):
+class _Named(DomainEntity):
+    """An endpoint whose callback has a name, if the process says it."""
+
+    callback_name = ""
+
+    def named_callback(self, name: str) -> None:
+        """Take note of what its callback is called."""
+        self.callback_name = name
+
+    def trace_detail(self) -> dict[str, object]:
+        return {**super().trace_detail(), "callback": self.callback_name}
+
+
+class ProcessSubscription(_Named, Subscription):
     """A subscription of a process. ``number`` is what the process calls it."""
 
     def __init__(
@@ -81,14 +95,6 @@ class ProcessSubscription(Subscription):
         self.process = process
         self.number = number
         self._received = 0
-        self._callback_name = ""
-
-    def named_callback(self, name: str) -> None:
-        """Take note of what its callback is called."""
-        self._callback_name = name
-
-    def trace_detail(self) -> dict[str, object]:
-        return {**super().trace_detail(), "callback": self._callback_name}
 
     def dispatch(self) -> None:
         if not self.may_run():
@@ -119,7 +125,7 @@ class ProcessSubscription(Subscription):
         )
 
 
-class ProcessService(Service):
+class ProcessService(_Named, Service):
     """A server of a process."""
 
     def __init__(
@@ -136,14 +142,6 @@ class ProcessService(Service):
         self.process = process
         self.number = number
         self._asked: dict[tuple[bytes, int], RequestId] = {}
-        self._callback_name = ""
-
-    def named_callback(self, name: str) -> None:
-        """Take note of what its callback is called."""
-        self._callback_name = name
-
-    def trace_detail(self) -> dict[str, object]:
-        return {**super().trace_detail(), "callback": self._callback_name}
 
     def dispatch(self) -> None:
         if not self.may_run():

@@ -16,10 +16,9 @@ from rsltrace.middleware.qos.status import (
     LIVELINESS_LOST,
     MATCHED,
     MESSAGE_LOST,
-    EndpointEvents,
 )
-from rsltrace.model.entity import EntityKind
-from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.middleware.qos_events import QosEvent
+from rsltrace.model.event import EventKind
 
 _QOS_EVENT = int(EventKind.QOS_EVENT)
 
@@ -42,23 +41,15 @@ def _event_name(event_type: Any) -> str:
     return name.lower()
 
 
-class EventHandle(EntityHandle):
+class EventHandle(QosEvent, EntityHandle):
     """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable."""
 
-    kind = EntityKind.QOS_EVENT
     lists = "waitables"
 
     def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
         self.stacks = parent.stacks
         super().__init__(parent.dispatcher, parent.node)
-        # rclpy makes a handle or two for every endpoint; only those that fire are worth a record.
-        self.announced = False
-        self._events: EndpointEvents = parent.events
-        self._parent = parent
-        self._name = _event_name(event_type)
-        self._queued = False
-        self._cause = (NO_EVENT, 0)
-        parent.events.listeners[self._name] = self
+        self.listen(parent, _event_name(event_type))
 
     def _listed_by(self, node: Any) -> Iterator[tuple[Any, Any]]:
         for waitable in node.waitables:
@@ -69,24 +60,6 @@ class EventHandle(EntityHandle):
     def activate(self) -> None:
         self.trigger()
 
-    def trigger(self) -> None:
-        """Make the callback ready."""
-        if not self._queued and self.active and self._events.news(self._name):
-            self._queued = True
-            if not self.announced:
-                self.announced = True
-                self.dispatcher.entities.pending.append(self)
-            self._cause = (self.dispatcher.loop.events, 0)
-            self.dispatcher.loop.ready.append(self)
-
-    def has_news(self) -> bool:
-        """Return whether there is a status to take."""
-        return self._events.news(self._name)
-
-    def take_event(self) -> Any:
-        """Return the status; its changes are those since the last time."""
-        return self._events.take(self._name)
-
     def dispatch(self) -> None:
         """Run the callback with the status."""
         if self.mailbox_keeps():
@@ -95,26 +68,23 @@ class EventHandle(EntityHandle):
         if wrapper is None or self.destroyed:
             return
         if not self.has_news():
-            self._queued = False
+            self.is_queued = False
             return
         if self.stacks.groups.must_wait(self, wrapper):
             return
-        self._queued = False
+        self.is_queued = False
         status = self.take_event()
         callback = wrapper.callback
         if is_coroutine_function(callback):
-            start_coroutine(self.stacks, self, _QOS_EVENT, callback, (status,), *self._cause, 0)
+            start_coroutine(self.stacks, self, _QOS_EVENT, callback, (status,), *self.cause, 0)
         else:
             self.dispatcher.execute(
-                self, self.entity_id, self.node, _QOS_EVENT, callback, (status,), *self._cause, 0
+                self, self.entity_id, self.node, _QOS_EVENT, callback, (status,), *self.cause, 0
             )
 
     def settle(self) -> bool:
         self.find_wrapper()
         return True
-
-    def trace_name(self) -> str:
-        return f"{self._parent.topic} {self._name}"
 
     def trace_detail(self) -> dict[str, object]:
         return {"callback": callback_name(self.user_callback())}
