@@ -92,10 +92,9 @@ def record(
     The nodes' log records go to stderr. The last line on stdout is
     "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
     The exit status is the job's (0 unless its stop condition says otherwise), 1 if one of its
-    checks (checks:) is not kept, 3 if a node raised,
-    130, 143 or 129 if interrupted (Ctrl-C, SIGTERM, SIGHUP).
+    checks (checks:) fails, 3 if a node raised, 130, 143 or 129 if interrupted (Ctrl-C, SIGTERM,
+    SIGHUP).
     """
-    from rsltrace.run import Observer, run
     from rsltrace.run.process import end_with_run
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
@@ -111,38 +110,11 @@ def record(
         _print_job(loaded)
         return
     path = output or default_output(named)
-    if bag is not None:
-        from rsltrace.bag.export import check_bag_folder, export_bag
-
-        check_bag_folder(bag, force=force)
-    if loaded.checks:
-        from rsltrace.checks.evaluate import check_texts
-
-        check_texts(loaded)
+    _check_first(loaded, bag, force=force)
     told: list[str] = []
-
-    def tell(note: str) -> None:
-        told.append(note)
-        _note(note)
-
-    if sys.__stderr__ is not None and not faulthandler.is_enabled():
-        with suppress(OSError, ValueError):  # a stderr that is no file
-            faulthandler.enable(sys.__stderr__)
-    with interruptible() as on_interrupt, progress(quiet=quiet or as_json) as on_progress:
-
-        def begins(stop: Callable[[Stop], None]) -> None:
-            if not (loaded.stop.model_fields_set or loaded.bags):
-                _say_that_it_has_no_end(loaded)
-            on_interrupt(stop)
-
-        result = run(
-            loaded,
-            path,
-            force=force,
-            echo=not quiet,
-            observer=Observer(progress=on_progress, interrupt=begins, note=tell),
-            replay=replay,
-        )
+    result = _recorded(
+        loaded, path, told, force=force, echo=not quiet, shows=not (quiet or as_json), replay=replay
+    )
     status = result.exit_code
     reopen_standard_streams()
     try:
@@ -150,11 +122,66 @@ def record(
         status = status or checks_status
         _report(result, told, checked, as_json=as_json)
         if bag is not None:
-            count = export_bag(result.path or path, bag, force=force)
-            tell(f"wrote {bag}: {count} messages")
+            _export(result.path or path, bag, force=force)
     except OSError as error:
         status = status_without_output(error, status)
     sys.exit(status)
+
+
+def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
+    """Raise what would be wrong after the run: a bag that is there already, a check's text."""
+    if bag is not None:
+        from rsltrace.bag.export import check_bag_folder
+
+        check_bag_folder(bag, force=force)
+    if job.checks:
+        from rsltrace.checks.evaluate import check_texts
+
+        check_texts(job)
+
+
+def _recorded(
+    job: Job,
+    path: Path,
+    told: list[str],
+    *,
+    force: bool,
+    echo: bool,
+    shows: bool,
+    replay: Path | None,
+) -> RunResult:
+    """Run a job; notes are shown, and added to ``told``. ``shows``: progress, too."""
+    from rsltrace.run import Observer, run
+
+    def note(text: str) -> None:
+        told.append(text)
+        _note(text)
+
+    if sys.__stderr__ is not None and not faulthandler.is_enabled():
+        with suppress(OSError, ValueError):  # a stderr that is no file
+            faulthandler.enable(sys.__stderr__)
+    with interruptible() as on_interrupt, progress(quiet=not shows) as on_progress:
+
+        def begins(stop: Callable[[Stop], None]) -> None:
+            if not (job.stop.model_fields_set or job.bags):
+                _say_that_it_has_no_end(job)
+            on_interrupt(stop)
+
+        return run(
+            job,
+            path,
+            force=force,
+            echo=echo,
+            observer=Observer(progress=on_progress, interrupt=begins, note=note),
+            replay=replay,
+        )
+
+
+def _export(trace: Path, bag: Path, *, force: bool) -> None:
+    from rsltrace.bag.export import export_bag
+
+    count = export_bag(trace, bag, force=force)
+    tell(f"wrote {bag}: {count} messages")
 
 
 def _say_that_it_has_no_end(job: Job) -> None:
