@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rsltrace.job.parts.node import names_to_names
 from rsltrace.job.parts.part import Part
 from rsltrace.job.values.checks import (
     Globs,
@@ -21,6 +20,7 @@ from rsltrace.job.values.checks import (
     positive_time,
     whole,
 )
+from rsltrace.job.values.mappings import names_to_names
 from rsltrace.job.values.names import check_glob, check_topic
 from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem, describe

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
@@ -15,6 +15,7 @@ from rsltrace.job.parts.process import RespawnSpec, check_environment
 from rsltrace.job.parts.start_after import StartAfterSpec
 from rsltrace.job.parts.stdin import InputSpec, inputs
 from rsltrace.job.values.checks import attach, check, flag, items, one_of, part, text
+from rsltrace.job.values.mappings import check_arguments, check_remappings
 from rsltrace.job.values.names import (
     check_component,
     check_container,
@@ -22,102 +23,12 @@ from rsltrace.job.values.names import (
     check_module,
     check_namespace,
     check_node_name,
-    check_remap_from,
-    check_remap_to,
 )
 from rsltrace.job.values.parameters import ParameterValue, flatten_parameters
-from rsltrace.job.values.paths import FileText, check_path
-from rsltrace.job.values.problem import Collected, Problem, Problems, describe
+from rsltrace.job.values.paths import check_path
+from rsltrace.job.values.problem import Problem
 from rsltrace.job.values.target import Target, check_callable_target, target_text
-from rsltrace.job.values.times import ExactFloat, TimeLike
-
-
-def names_to_names(
-    value: object, rule_from: Callable[[str], None], rule_to: Callable[[str], None]
-) -> dict[str, str]:
-    """Check a mapping of names to names, each side by a rule of its own."""
-    if not isinstance(value, dict):
-        raise Problem(f"expected a mapping of names to names (from: to), got {describe(value)}")
-    problems = Collected()
-    for name, to in value.items():
-        with problems.at(str(name), at_key=True):
-            text(rule_from)(name)
-        with problems.at(str(name)):
-            text(rule_to)(to)
-    problems.check()
-    return {str(name): str(to) for name, to in value.items()}
-
-
-def _check_remappings(value: object) -> dict[str, str]:
-    return names_to_names(value, check_remap_from, check_remap_to)
-
-
-def _check_arguments(value: object) -> dict[str, Any] | tuple[str, ...]:
-    if isinstance(value, (list, tuple)):
-        return _check_words(value)
-    if not isinstance(value, dict):
-        raise Problem(
-            "expected a mapping of argument names to values (node:) or a list of command-line "
-            f"words (main:, executable:, script:, module:), got {describe(value)}"
-        )
-    for name in value:
-        if not isinstance(name, str) or not name.isidentifier():
-            raise Problem(f"{name!r} cannot be the name of an argument", (str(name),), at_key=True)
-    return {name: _plain_floats(item) for name, item in value.items()}
-
-
-def _check_words(values: list[object] | tuple[object, ...]) -> tuple[str, ...]:
-    """Check command-line words; a number stands for its digits, as on a command line."""
-    problems = [
-        Problem(f"expected a word of a command line, got {describe(value)}", (index,))
-        for index, value in enumerate(values)
-        if isinstance(value, bool) or not isinstance(value, (str, int, float))
-    ]
-    if problems:
-        raise Problems(problems)
-    return tuple(str(getattr(value, "text", value)) for value in values)
-
-
-attach(
-    _check_arguments,
-    schema={
-        "anyOf": [
-            {"type": "object"},
-            {"type": "array", "items": {"type": ["string", "number"]}},
-        ]
-    },
-)
-
-
-def _check_executable(value: object) -> str:
-    return text(check_executable)(value)
-
-
-def _check_module(value: object) -> str:
-    return text(check_module)(value)
-
-
-def _check_component(value: object) -> str:
-    return text(check_component)(value)
-
-
-attach(_check_component, schema={"type": "string", "pattern": check_component.pattern})  # type: ignore[attr-defined]
-attach(_check_module, schema={"type": "string", "pattern": check_module.pattern})  # type: ignore[attr-defined]
-attach(_check_executable, schema={"type": "string", "pattern": check_executable.pattern})  # type: ignore[attr-defined]
-
-
-def _plain_floats(value: object) -> object:
-    # What user code gets must not carry types of ours.
-    if isinstance(value, ExactFloat):
-        return float(value)
-    if isinstance(value, FileText):
-        return str(value)
-    if type(value) is dict:
-        return {key: _plain_floats(item) for key, item in value.items()}
-    if type(value) is list:
-        return [_plain_floats(item) for item in value]
-    return value
-
+from rsltrace.job.values.times import TimeLike
 
 _KINDS = ("node", "main", "executable", "script", "module", "program", "component")
 """What an entry may be."""
@@ -136,15 +47,6 @@ _RARE = (
 )
 """Keys that are written down only where they say something."""
 
-_NAME = {"pattern": check_remap_from.pattern}  # type: ignore[attr-defined]
-attach(
-    _check_remappings,
-    schema={
-        "type": "object",
-        "propertyNames": _NAME,
-        "additionalProperties": {"type": "string", "pattern": check_remap_to.pattern},  # type: ignore[attr-defined]
-    },
-)
 attach(
     flatten_parameters,
     schema={
@@ -189,7 +91,7 @@ class NodeSpec(Part):
         "as `module:function`.",
         examples=["my_robot.talker:main"],
     )
-    executable: Annotated[str | None, check(_check_executable, optional=True)] = Field(
+    executable: Annotated[str | None, check(text(check_executable), optional=True)] = Field(
         default=None,
         description="Instead of `node`: an installed executable, as `ros2 run` would start it, as "
         "`package/name`. A compiled one runs as a process of its own.",
@@ -200,7 +102,7 @@ class NodeSpec(Part):
         description="Instead of `node`: a Python file, run as `python script.py` runs it.",
         examples=["scripts/talker.py"],
     )
-    module: Annotated[str | None, check(_check_module, optional=True)] = Field(
+    module: Annotated[str | None, check(text(check_module), optional=True)] = Field(
         default=None,
         description="Instead of `node`: a module (or package), run as `python -m module` runs it. "
         "Looked for in `search_path`.",
@@ -212,7 +114,7 @@ class NodeSpec(Part):
         "a process of its own.",
         examples=["build/talker"],
     )
-    component: Annotated[str | None, check(_check_component, optional=True)] = Field(
+    component: Annotated[str | None, check(text(check_component), optional=True)] = Field(
         default=None,
         description="Instead of `node`: a component, as `package/plugin`, that a `container` is "
         "asked to load once it is there.",
@@ -226,7 +128,7 @@ class NodeSpec(Part):
     )
     extra_arguments: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
-        description="What the container is told besides the parameters of a `component`.",
+        description="Extra arguments of a `component`, as `ros2 component load -e` takes them.",
         examples=[{"use_intra_process_comms": True}],
     )
     isolated: Annotated[bool, check(flag)] = Field(
@@ -247,7 +149,7 @@ class NodeSpec(Part):
     )
     respawn: Annotated[RespawnSpec | None, part("delay")] = Field(
         default=None,
-        description="That a process is started again when it has ended: how much later.",
+        description="How long after its end a process is started again; without it, it is not.",
         examples=["1s", {"delay": "500ms", "times": 3}],
     )
     required: Annotated[bool, check(flag)] = Field(
@@ -274,12 +176,12 @@ class NodeSpec(Part):
         description="ROS parameter files, wildcards and all; later ones win.",
         examples=[["ekf.yaml"]],
     )
-    remappings: Annotated[dict[str, str], check(_check_remappings)] = Field(
+    remappings: Annotated[dict[str, str], check(check_remappings)] = Field(
         default_factory=dict,
         description="Names of topics and services that become others, as in `--ros-args -r`.",
         examples=[{"odom": "/husky/odom"}],
     )
-    arguments: Annotated[dict[str, Any] | tuple[str, ...], check(_check_arguments)] = Field(
+    arguments: Annotated[dict[str, Any] | tuple[str, ...], check(check_arguments)] = Field(
         default_factory=dict,
         description="Keyword arguments of a `node`; a list of command-line words of all others.",
         examples=[{"robots": 3}, ["--rate", 10]],
