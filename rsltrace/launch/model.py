@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from rsltrace.launch.scope import Parameters
+from rsltrace.launch.scope import Parameters, full_name
 from rsltrace.model.printable import printable
 
 ENVIRONMENT = (
@@ -68,7 +68,7 @@ class LaunchedNode:
     @property
     def full_name(self) -> str:
         """Its name with its namespace, as far as the launch file says it."""
-        return f"{(self.namespace or '').rstrip('/')}/{self.name or ''}"
+        return full_name(self.namespace, self.name or "")
 
     @property
     def title(self) -> str:

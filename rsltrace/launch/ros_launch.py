@@ -293,7 +293,7 @@ class _Visitor:
         return tuple(self._text(word) for word in words or ())
 
     def _parameters(self, node: Any, name: str | None, namespace: str | None) -> Parameters:
-        full_name = None if name is None else f"{(namespace or '').rstrip('/')}/{name}"
+        whole = None if name is None else full_name(namespace, name)
         found: list[ParameterFile | dict[str, Any]] = []
         shared = self._context.launch_configurations.get("global_params") or ()
         found += [{item[0]: item[1]} for item in shared if isinstance(item, tuple)]
@@ -303,7 +303,7 @@ class _Visitor:
                 found.append({key: yaml_value(value)})
             elif Path(text).parent == Path(tempfile.gettempdir()):
                 # What was given as values, launch has written to a file of its own.
-                found.append(parameters_for(text, full_name))
+                found.append(parameters_for(text, whole))
                 self._scratch.add(text)
             else:
                 found.append(ParameterFile(text))

@@ -9,6 +9,7 @@ from typing import Any
 from rsltrace.doors.rclpy.arguments import RosArguments
 from rsltrace.doors.rclpy.wire.interfaces import get_service_class
 from rsltrace.errors import JobError, RunError, SetupError
+from rsltrace.middleware.participant import full_name
 
 _TYPE = "composition_interfaces/srv/LoadNode"
 _RULES = ("-r", "--remap")
@@ -76,10 +77,10 @@ class Component:
                     yield rule
 
     def _parameters(self) -> dict[str, Any]:
-        full_name = f"{self.namespace.rstrip('/')}/{self.name}" if self.name else ""
+        node = full_name(self.namespace, self.name) if self.name else ""
         values: dict[str, Any] = {}
         for part in self.arguments:
-            values.update(part.parameters(full_name))
+            values.update(part.parameters(node))
         return values
 
 

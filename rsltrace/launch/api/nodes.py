@@ -82,14 +82,13 @@ class ExecuteProcess(ExecuteLocal):
 
     def execute(self, context: LaunchContext) -> None:
         """Note that it cannot be simulated."""
-        words = " ".join("".join(part.describe() for part in word) for word in self.cmd)
+        why = "other programs do not run in a simulation"
         try:
             words = " ".join(context.text(word) for word in self.cmd)
-        except Exception:
-            pass  # it is left out anyway
-        context.refuse(
-            self.where, f"process {words!r:.200}", "other programs do not run in a simulation"
-        )
+        except Exception as error:  # whatever a substitution of the user's own raises
+            words = " ".join("".join(part.describe() for part in word) for word in self.cmd)
+            why += f" (nor can its command be read: {as_job_error(error, '')})"
+        context.refuse(self.where, f"process {words!r:.200}", why)
         self._started(context)
 
 
