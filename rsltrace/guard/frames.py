@@ -31,6 +31,14 @@ def caller() -> FrameType:
         return _next_frame()  # type: ignore[no-any-return]
     except ValueError:  # a signal came while another call was here
         return sys._getframe(2)
+    except StopIteration:  # and its handler has raised
+        _begin_again()
+        return sys._getframe(2)
+
+
+def _begin_again() -> None:
+    global _next_frame
+    _next_frame = _frames().__next__
 
 
 code_of: Callable[[FrameType], CodeType] = method_of(

@@ -6,7 +6,9 @@ Where the code that got one gives it back, the process of the run is meant.
 
 from __future__ import annotations
 
+import os
 import re
+from pathlib import PurePath
 from typing import Any
 
 from rsltrace.guard.guard import Guard, engaged
@@ -34,10 +36,11 @@ def meant_id(pid: Any) -> Any:
 
 def meant_path(path: Any) -> Any:
     """Return a path below ``/proc`` with the real process id in it."""
-    if isinstance(path, str) and path.startswith(_PROC):
-        match = _OF_PROCESS.match(path)
+    text = os.fspath(path) if isinstance(path, PurePath) else path
+    if isinstance(text, str) and text.startswith(_PROC):
+        match = _OF_PROCESS.match(text)
         if match is not None:
-            return f"{_PROC}{meant_id(int(match[1]))}{path[match.end() :]}"
+            return f"{_PROC}{meant_id(int(match[1]))}{text[match.end() :]}"
     return path
 
 

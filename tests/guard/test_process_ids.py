@@ -18,6 +18,7 @@ pytestmark = pytest.mark.ros
 
 MAIN = """
 import json, logging, os, resource, signal, sys
+from pathlib import Path
 import rclpy
 
 rclpy.init()
@@ -36,6 +37,7 @@ def own():
         "record": record.process,
         "name": name,
         "stat": os.stat(f"/proc/{pid}").st_ino == os.stat("/proc/self").st_ino,
+        "path": bool(Path(f"/proc/{pid}/stat").read_text()) and Path("/proc", str(pid)).exists(),
         "tasks": bool(os.listdir(f"/proc/{pid}/task")),
         "exe": os.readlink(f"/proc/{pid}/exe") == os.readlink("/proc/self/exe"),
         "group": os.getpgid(pid) == os.getpgrp(),

@@ -18,7 +18,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace.guard import frames
 from rsltrace.guard.callers import USER
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard
 from rsltrace.model.finding import Policy
 from tests.guard.conftest import node_code
@@ -411,3 +413,17 @@ def test_a_clock_that_jumps_backwards_is_followed() -> None:
     assert [_look(guard, frame), _look(guard, frame)] == [10**9, 10**9 + 1_000]
     context.time_ns = 10**8
     assert [_look(guard, frame), _look(guard, frame)] == [10**8, 10**8 + 1_000]
+
+
+def test_who_calls_is_known_after_a_handler_has_raised_while_it_was_asked() -> None:
+    """A signal may come at any moment; what its handler raises goes through whoever runs."""
+
+    def asked() -> FrameType:
+        return caller()
+
+    here = sys._getframe()
+    assert asked() is here
+    with pytest.raises(KeyboardInterrupt):
+        frames._next_frame.__self__.throw(KeyboardInterrupt)  # type: ignore[attr-defined]
+    assert asked() is here
+    assert asked() is here

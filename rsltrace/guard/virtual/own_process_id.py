@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 import resource
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from typing import Any
 
-from rsltrace.guard.callers import is_nobodys, module_of, user_frame
+from rsltrace.guard.callers import is_nobodys, module_of
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.process_ids import meant_id, meant_path, virtual_id
 from rsltrace.guard.redirect import redirect
@@ -34,7 +34,7 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
         guard = engaged()
         if guard is None:
             return real()
-        frame = sys._getframe(1)
+        frame = caller()
         if is_nobodys(frame):
             return real()
         mode = guard.mode(Source.PID, frame)
@@ -45,7 +45,7 @@ def _getpid(real: Callable[[], int]) -> Callable[[], int]:
             return virtual_id(guard)
         if shown:
             return real()
-        if mode is Mode.RECORD and user_frame(frame, guard.packages) is not None:
+        if mode is Mode.RECORD and guard.is_for_user(frame):
             return int(guard.recorded(Source.PID, _CALL, real, frame))
         value = real()
         guard.watched(Source.PID, _CALL, value, frame)
