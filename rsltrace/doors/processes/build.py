@@ -22,6 +22,7 @@ from rsltrace.errors import SetupError
 from rsltrace.workspace.cache import cached_folder, key_of
 
 SOURCES = Path(__file__).parent / "native"
+_STUB_SOURCE = SOURCES / "python_symbols" / "symbols.cpp"
 _NAME = "librmw_rsltrace.so"
 _STUB = "librsltrace_python_symbols.so"
 _DIGEST = "digest"
@@ -104,15 +105,16 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
     """
     ros, compiler = find_ros(), find_compiler()
     sources = sorted(SOURCES.glob("*.[ch]*"))
+    command = [*compiler, *_options(), *extra]
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, check=False)
     name = key_of(
         [
-            " ".join([*compiler, *_options(), *extra]),
+            " ".join(command),
             version.stdout,
             str(ros.prefix),
             platform.machine(),
             *_stamps(ros),
-            *(part for path in sources for part in (path.name, path.read_bytes())),
+            *(part for path in (*sources, _STUB_SOURCE) for part in (path.name, path.read_bytes())),
         ]
     )
 
@@ -121,7 +123,7 @@ def library(told: Callable[[str], None], extra: Sequence[str] = ()) -> Library:
             f"building the library that processes run with (once; 10 to 30 seconds): "
             f"{compiler[0]}, {ros.prefix}"
         )
-        _build([*compiler, *_options(), *extra], ros, sources, folder)
+        _build(command, ros, sources, folder)
         (folder / _DIGEST).write_text(_digest(folder))
 
     folder = cached_folder("processes", name, make)
@@ -160,13 +162,12 @@ def _build(compiler: list[str], ros: Ros, sources: Sequence[Path], folder: Path)
     with tempfile.TemporaryDirectory(dir=folder) as scratch:
         objects = {path: f"{scratch}/{path.stem}.o" for path in sources if path.suffix == ".cpp"}
         _run([*compiler, "-c", str(path), "-o", made, *include] for path, made in objects.items())
-        stub = str(SOURCES / "python_symbols" / "symbols.cpp")
         where = ros.prefix / "lib"
         link = [f"-L{where}", f"-Wl,-rpath,{where}", *(f"-l{name}" for name in _LIBRARIES), "-ldl"]
         _run(
             [
                 [*compiler, "-shared", *objects.values(), "-o", str(folder / _NAME), *link],
-                [*compiler, "-shared", stub, "-o", str(folder / _STUB)],
+                [*compiler, "-shared", str(_STUB_SOURCE), "-o", str(folder / _STUB)],
             ]
         )
 
