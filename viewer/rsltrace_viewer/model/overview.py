@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -35,6 +35,12 @@ class Times:
     count: int = 0
     total_ns: int = 0
     most_ns: int = 0
+
+    def add(self, count: int, total_ns: int, most_ns: int) -> None:
+        """Add durations: how many, their sum, and the longest."""
+        self.count += count
+        self.total_ns += total_ns
+        self.most_ns = max(self.most_ns, most_ns)
 
     @property
     def mean_ns(self) -> int:
@@ -150,10 +156,7 @@ def _add_times(
     np.maximum.at(most, places, took_ns)
     rows = zip(ids.tolist(), counts.tolist(), total.tolist(), most.tolist(), strict=True)
     for entity, number, total_ns, most_ns in rows:
-        known = times.setdefault(entity, Times())
-        known.count += number
-        known.total_ns += total_ns
-        known.most_ns = max(known.most_ns, most_ns)
+        times.setdefault(entity, Times()).add(number, total_ns, most_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -180,10 +183,9 @@ def nodes_of(run: Run, overview: Overview) -> list[Part]:
         if entity:
             own = nodes.setdefault(run.node_name(entity), (Series(), Times()))
             own[0].add(series.count, series.first_ns, series.last_ns)
-            took = overview.took.get(entity, Times())
-            own[1].count += took.count
-            own[1].total_ns += took.total_ns
-            own[1].most_ns = max(own[1].most_ns, took.most_ns)
+            if (took := overview.took.get(entity)) is not None:
+                own[1].add(took.count, took.total_ns, took.most_ns)
+    whole = _whole(run, overview)
     return _sorted(
         Part(
             name,
@@ -191,7 +193,7 @@ def nodes_of(run: Run, overview: Overview) -> list[Part]:
             name,
             series.count,
             series.rate_hz,
-            _share(run, overview, series.count, took),
+            (took.total_ns if overview.took else series.count) / whole,
             took=took if overview.took else None,
         )
         for name, (series, took) in nodes.items()
@@ -201,7 +203,7 @@ def nodes_of(run: Run, overview: Overview) -> list[Part]:
 
 def callbacks_of(run: Run, overview: Overview) -> list[Part]:
     """Return what ran callbacks, the busiest first."""
-    parts = []
+    parts, whole = [], _whole(run, overview)
     for entity, series in overview.events.items():
         found = run.entities.get(entity)
         if found is None or found.kind in (EntityKind.SYSTEM, EntityKind.NODE):
@@ -214,7 +216,7 @@ def callbacks_of(run: Run, overview: Overview) -> list[Part]:
                 run.node_name(entity),
                 series.count,
                 series.rate_hz,
-                _share(run, overview, series.count, took),
+                (took.total_ns if overview.took else series.count) / whole,
                 overview.waited.get(entity) if found.kind in _RECEIVERS else None,
                 took if overview.took else None,
                 overview.paused.get(entity),
@@ -226,11 +228,11 @@ def callbacks_of(run: Run, overview: Overview) -> list[Part]:
 _RECEIVERS = (EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
 
 
-def _share(run: Run, overview: Overview, count: int, took: Times) -> float:
-    """Return the part of the simulated time; without execution times, of all events."""
+def _whole(run: Run, overview: Overview) -> int:
+    """Return what shares are parts of: the simulated time; without execution times, all events."""
     if overview.took:
-        return took.total_ns / max(run.end_ns - run.start_ns, 1)
-    return count / max(sum(series.count for series in overview.events.values()), 1)
+        return max(run.end_ns - run.start_ns, 1)
+    return max(sum(series.count for series in overview.events.values()), 1)
 
 
 def topics_of(run: Run, overview: Overview) -> list[Part]:
@@ -250,7 +252,7 @@ def topics_of(run: Run, overview: Overview) -> list[Part]:
     )
 
 
-def _sorted(parts: Iterator[Part] | Sequence[Part]) -> list[Part]:
+def _sorted(parts: Iterable[Part]) -> list[Part]:
     return sorted(parts, key=lambda part: (-part.share, -part.count, part.name))
 
 

@@ -68,8 +68,8 @@ class RunPlots:
                 if message.topic in known and message.fields
             ]
             # A parameter that differs is no curve; what a node then sends is.
-            for found in sorted(differing, key=lambda one: one[0] in NODE_TOPICS)[:1]:
-                return found
+            if differing:
+                return min(differing, key=lambda one: one[0] in NODE_TOPICS)
         return (self._topic if self._topic in known else ""), ""
 
     def cursor_s(self) -> float | None:

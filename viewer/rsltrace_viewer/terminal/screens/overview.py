@@ -113,7 +113,9 @@ class OverviewScreen(Screen[Choice | None]):
         if not self.query(ListView):  # it is about to be there, or was closed
             return
         session = self._session
-        runs = [(run, session.overviews.get(name, Overview())) for name, run in _named(session)]
+        runs = [
+            (run, session.overviews.get(name, Overview())) for name, run in session.runs.items()
+        ]
         share = min(overview.share for _, overview in runs)
         self.query_one(HeaderBar).show(
             session.title(),
@@ -225,10 +227,6 @@ class OverviewScreen(Screen[Choice | None]):
             self.update_lines()
         else:
             self.dismiss(choice)
-
-
-def _named(session: Session) -> list[tuple[str, Run]]:
-    return list(session.runs.items())
 
 
 def _trouble(what: str, found: Sequence[Trouble | None]) -> _Line:
