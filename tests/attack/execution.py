@@ -149,9 +149,8 @@ def call(function: Callable[[], bytes], scratch: Path, *, cpu_s: int = 20) -> by
             resource.setrlimit(resource.RLIMIT_AS, (4096 * MIB, 4096 * MIB))
             place.write_bytes(function())
             code = 0
-        except BaseException:
-            pass
-        os._exit(code)
+        finally:  # whatever hostile bytes make it raise: that it failed is the answer
+            os._exit(code)
     _, status = os.waitpid(pid, 0)
     return place.read_bytes() if status == 0 else None
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -98,15 +99,16 @@ class OnTopic(Armed):
         return f"{what}, and {self.expression.text}" if found else ""
 
 
-class _AfterOutputs(Armed):
+class _AfterOutputs(Armed, ABC):
     """After an event with an output for which ``_matches`` says something."""
 
     def after(self, view: EventView) -> str:
         """Look at the outputs, one after the other."""
         return next(filter(None, map(self._matches, view.sent())), "")
 
+    @abstractmethod
     def _matches(self, sent: Sent) -> str:
-        raise NotImplementedError
+        """Return what to say of an output; nothing: go on."""
 
 
 @dataclass

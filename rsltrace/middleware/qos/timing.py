@@ -7,6 +7,8 @@ What happens when follows Fast DDS; ``tests/middleware/test_qos_native.py`` comp
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+
 from rsltrace.loop.loop import EventLoop
 from rsltrace.middleware.qos.policies import INFINITE_NS, Liveliness, Qos
 from rsltrace.middleware.qos.status import (
@@ -17,7 +19,7 @@ from rsltrace.middleware.qos.status import (
 )
 
 
-class _Watch:
+class _Watch(ABC):
     """Calls ``_up`` when nothing was seen for ``period_ns``."""
 
     def __init__(self, loop: EventLoop, period_ns: int) -> None:
@@ -47,11 +49,13 @@ class _Watch:
         elif self._due_ns > 0:
             self._schedule()
 
+    @abstractmethod
     def _wanted(self) -> bool:
-        raise NotImplementedError
+        """Return whether anybody listens."""
 
+    @abstractmethod
     def _up(self) -> None:
-        raise NotImplementedError
+        """Say that the time is up."""
 
 
 class Deadline(_Watch):

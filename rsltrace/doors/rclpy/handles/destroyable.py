@@ -7,6 +7,7 @@ expects. Entering and leaving happens on every publication, so it does no more t
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -26,10 +27,8 @@ class Destroyable:
 
     destroyed: bool
     """Whether it may be used no more; nothing but ``destroy`` sets it."""
-
-    def destroy(self) -> None:
-        """Destroy the handle, unless that has been done."""
-        raise NotImplementedError
+    destroy: Callable[[], None]
+    """Destroys the handle, unless that has been done."""
 
     def __enter__(self) -> Self:
         if self.destroyed:
