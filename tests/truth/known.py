@@ -11,11 +11,7 @@ from fnmatch import fnmatchcase
 ALWAYS = "always"
 SOMETIMES = "sometimes"
 
-KNOWN: dict[str, str] = {
-    # Where each run has outputs that the other one lacks, in another place of the same event, the
-    # first line begins with those of the first run.
-    "mixed: several things at once, *: symmetric": SOMETIMES,
-}
+KNOWN: dict[str, str] = {}
 
 
 def item_of(key: str) -> str:

@@ -3,56 +3,84 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import astuple
 from difflib import SequenceMatcher
 
 from rsltrace.diff.alignment.rows import OutputRow
+from rsltrace.model.event import OutputKind
+from rsltrace.words.entities import EntityKey
 
 _ALIGNED_MAX = 1000
+_RECEIVED = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
+
+_Place = tuple[int, int, bool]
+"""Where an output stands in each of two events (-1: it does not), and whether it only moved."""
 
 
 def matched_outputs(
-    a: list[OutputRow], b: list[OutputRow]
+    a: list[OutputRow], b: list[OutputRow], keys: Sequence[EntityKey]
 ) -> Iterator[tuple[int, OutputRow | None, OutputRow | None, bool]]:
     """Yield (position, output of a, of b, whether it only moved) for the outputs that differ.
 
-    Outputs are matched by what sent them, in order. One that is there in both but at another place
-    has moved.
+    Outputs are matched by what sent them (``keys`` by number), in order. One that is there in both
+    but at another place has moved. Which are matched, and in which order they come, does not depend
+    on which run is a: by position, of two at one position first what others receive.
     """
-    contents_a, contents_b = [x[:3] for x in a], [y[:3] for y in b]
-    if contents_a == contents_b:
+
+    def order(place: _Place) -> tuple[int, bool]:
+        i, j, _ = place
+        kind = a[i][0] if i >= 0 else b[j][0]
+        return min(at for at in (i, j) if at >= 0), kind not in _RECEIVED
+
+    if [x[:3] for x in a] == [y[:3] for y in b]:
         return
+    if _named(a, keys) <= _named(b, keys):
+        places = list(_different(a, b))
+    else:
+        places = [(i, j, moved) for j, i, moved in _different(b, a)]
+    for i, j, moved in sorted(places, key=order):
+        x, y = a[i] if i >= 0 else None, b[j] if j >= 0 else None
+        yield i if i >= 0 else j, x, y, moved
+
+
+def _named(outputs: list[OutputRow], keys: Sequence[EntityKey]) -> list[object]:
+    return [(kind, astuple(keys[number]), content) for kind, number, content, _ in outputs]
+
+
+def _different(a: list[OutputRow], b: list[OutputRow]) -> Iterator[_Place]:
+    contents_a, contents_b = [x[:3] for x in a], [y[:3] for y in b]
     if Counter(contents_a) == Counter(contents_b):
-        for position, content in enumerate(contents_a):
-            if content != contents_b[position]:
-                yield position, a[position], b[contents_b.index(content)], True
+        for i, content in enumerate(contents_a):
+            if content != contents_b[i]:
+                yield i, contents_b.index(content), True
         return
     pairs = list(_paired(a, b))
-    alone_a = {x[:3] for _, x, y in pairs if x is not None and y is None}
-    alone_b = {y[:3]: y for _, x, y in pairs if y is not None and x is None}
-    for position, x, y in pairs:
-        if x is not None and y is not None:
-            if x[:3] != y[:3]:
-                yield position, x, y, False
-        elif x is not None and x[:3] in alone_b:
-            yield position, x, alone_b[x[:3]], True
-        elif y is None or y[:3] not in alone_a:
-            yield position, x, y, False
+    alone: dict[tuple[int, int, int], list[int]] = {}
+    for i, j in pairs:
+        if i < 0:
+            alone.setdefault(contents_b[j], []).append(j)
+    for i, j in pairs:
+        if i >= 0 and j >= 0:
+            if contents_a[i] != contents_b[j]:
+                yield i, j, False
+        elif i >= 0:
+            elsewhere = alone.get(contents_a[i])
+            yield (i, elsewhere.pop(0), True) if elsewhere else (i, -1, False)
+    yield from ((-1, j, False) for places in alone.values() for j in places)
 
 
-def _paired(
-    a: list[OutputRow], b: list[OutputRow]
-) -> Iterator[tuple[int, OutputRow | None, OutputRow | None]]:
+def _paired(a: list[OutputRow], b: list[OutputRow]) -> Iterator[tuple[int, int]]:
+    """Yield the places of outputs that may differ, -1 where the other has none."""
     senders_a, senders_b = [x[:2] for x in a], [y[:2] for y in b]
     if senders_a == senders_b or max(len(a), len(b)) > _ALIGNED_MAX:
-        for position in range(max(len(a), len(b))):
-            x = a[position] if position < len(a) else None
-            y = b[position] if position < len(b) else None
-            if x and y and x[:2] != y[:2]:
-                yield position, x, None
-                yield position, None, y
+        for place in range(max(len(a), len(b))):
+            i, j = place if place < len(a) else -1, place if place < len(b) else -1
+            if min(i, j) >= 0 and senders_a[i] != senders_b[j]:
+                yield i, -1
+                yield -1, j
             else:
-                yield position, x, y
+                yield i, j
         return
     # With the content first: of many messages of one publisher, the one that is new is new.
     matcher = SequenceMatcher(None, [x[:3] for x in a], [y[:3] for y in b], autojunk=False)
@@ -65,13 +93,10 @@ def _paired(
         for inner_tag, i, i_end, j, j_end in inner.get_opcodes():
             if inner_tag == "equal":
                 for nth in range(i_end - i):
-                    x, y = a[begin_a + i + nth], b[begin_b + j + nth]
-                    yield begin_a + i + nth, x, y
+                    yield begin_a + i + nth, begin_b + j + nth
             else:
-                for nth in range(i, i_end):
-                    yield begin_a + nth, a[begin_a + nth], None
-                for nth in range(j, j_end):
-                    yield begin_b + nth, None, b[begin_b + nth]
+                yield from ((begin_a + nth, -1) for nth in range(i, i_end))
+                yield from ((-1, begin_b + nth) for nth in range(j, j_end))
 
 
 def different_outputs(a: list[OutputRow], b: list[OutputRow]) -> list[OutputRow]:

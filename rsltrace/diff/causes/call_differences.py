@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from itertools import zip_longest
+from operator import itemgetter
 
 from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.answers import STARTED_BY, answer_text
@@ -21,6 +22,9 @@ _CALL_MAX = 60
 _ANSWERED = (Source.SOCKET, Source.PROCESS)
 _FOLDER = re.compile(r"(['\"])/[^'\"]*/(?=[^'\"/]*\1)")
 """The folder of an absolute path between quotes."""
+
+_Numbered = tuple[int, int, Finding]
+"""A finding with its event, and its number among those of its run."""
 
 
 def call_differences(
@@ -109,25 +113,32 @@ def _files_of(run: Run, view: EventView) -> frozenset[str]:
 
 
 def _paired(a: list[Finding], b: list[Finding]) -> list[CallDifference]:
-    """Pair the n-th findings of each call at each place; a file may lie in another folder."""
-    places: dict[tuple[str, str], tuple[list[Finding], list[Finding]]] = {}
+    """Pair the n-th findings of each call at each place; a file may lie in another folder.
+
+    They come in the order in which they were made, in whichever run that was first.
+    """
+    places: dict[tuple[str, str], tuple[list[_Numbered], list[_Numbered]]] = {}
     for side, findings in enumerate((a, b)):
-        for finding in findings:
+        for number, finding in enumerate(findings):
             place = (_FOLDER.sub(r"\1", finding.call), finding.stack)
-            places.setdefault(place, ([], []))[side].append(finding)
+            places.setdefault(place, ([], []))[side].append((finding.event, number, finding))
     calls = []
-    for (_, stack), (of_a, of_b) in places.items():
+    for place, (of_a, of_b) in places.items():
         for x, y in zip_longest(of_a, of_b):
-            one = x or y
-            calls.append(
-                CallDifference(
-                    source=one.source.value,
-                    call=one.call,
-                    where=stack.partition("\n")[0],
-                    event_a=None if x is None else x.event,
-                    event_b=None if y is None else y.event,
-                    a=None if x is None else answer_text(x),
-                    b=None if y is None else answer_text(y),
-                )
-            )
-    return calls
+            made = min(one[:2] for one in (x, y) if one is not None)
+            calls.append((made, place, _difference(x and x[2], y and y[2])))
+    return [call for *_, call in sorted(calls, key=itemgetter(0, 1))]
+
+
+def _difference(a: Finding | None, b: Finding | None) -> CallDifference:
+    one = a or b
+    assert one is not None
+    return CallDifference(
+        source=one.source.value,
+        call=one.call,
+        where=one.stack.partition("\n")[0],
+        event_a=None if a is None else a.event,
+        event_b=None if b is None else b.event,
+        a=None if a is None else answer_text(a),
+        b=None if b is None else answer_text(b),
+    )

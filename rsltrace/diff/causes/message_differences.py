@@ -78,7 +78,8 @@ class _Evidence:
         outputs_b = outputs_of(self._run_b, b.index) if b is not None else []
         notes = OutputNotes(self._run_a, self._run_b, a, b)
         bag = any(view is not None and _is_published_input(view) for view in (a, b))
-        for position, x, y, moved in matched_outputs(outputs_a, outputs_b):
+        keys = self._run_a.matching.keys
+        for position, x, y, moved in matched_outputs(outputs_a, outputs_b, keys):
             if not any(row and counts(self._run_a, row) for row in (x, y)):
                 continue
             if bag and (x or y or (0,))[0] == OutputKind.MESSAGE:

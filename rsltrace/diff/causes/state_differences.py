@@ -27,7 +27,8 @@ def state_differences(
         states.append(state_after(trace, node, view.index) if node else {})
     one, other = states
     found: list[StateDifference] = []
-    for path in [*one, *(path for path in other if path not in one)]:
+    alone = one.keys() ^ other.keys()
+    for path in sorted({*one, *other}, key=lambda path: (path in alone, path)):
         found += _differences(path, one.get(path), other.get(path))
         if len(found) >= DIFFERENCES_MAX:
             break
