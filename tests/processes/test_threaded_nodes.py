@@ -14,16 +14,25 @@ from rsltrace.trace.reader import Trace
 pytestmark = pytest.mark.ros
 
 JOB = """
-nodes: [{script: threaded.py, isolated: true}]
-stop: {duration: 1s}
+nodes: [{{script: threaded.py, isolated: true}}]
+stop: {{duration: 1s}}
+{more}
 """
 
 
+@pytest.mark.parametrize(
+    "more",
+    [
+        "",
+        pytest.param("policy: permutation", marks=pytest.mark.long),
+        pytest.param("policy: rate_monotonic", marks=pytest.mark.long),
+    ],
+)
 def test_threads_executors_sleeps_and_chance_are_the_same_in_every_run(
-    compiled: object, tmp_path: Path
+    compiled: object, tmp_path: Path, more: str
 ) -> None:
     shutil.copy(Path(__file__).parent / "threaded.py", tmp_path)  # its path decides what it draws
-    (tmp_path / "job.yaml").write_text(JOB)
+    (tmp_path / "job.yaml").write_text(JOB.format(more=more))
     job = load_job(tmp_path / "job.yaml")
     results = [run(job, tmp_path / f"{n}.mcap") for n in range(2)]
     assert [result.error for result in results] == [None, None]

@@ -13,6 +13,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from rsltrace.doors.processes.life import Life, has_memory
 from rsltrace.doors.processes.shared import Said, Shared
 from rsltrace.doors.processes.wire import HEAD, RECORD, Told
 from rsltrace.errors import JobError
@@ -94,6 +95,7 @@ class Child:
         self._socket = here
         self._head = memoryview(bytearray(_HEAD_SIZE))
         self._patience = 0
+        self._life: Life | None = None
 
     @property
     def pid(self) -> int:
@@ -132,8 +134,8 @@ class Child:
         return self._said.left()
 
     def give_up_after(self, seconds: float) -> None:
-        """Kill the process if it says nothing for so long (real time)."""
-        self._patience = int(seconds / _LOOK_S)
+        """Kill the process if it says nothing for so long, by its own time (``Life``)."""
+        self._patience, self._life = int(seconds / _LOOK_S), Life(self.pid)
 
     def _read_into(self, room: memoryview) -> int:
         """Read what there is, at least something; 0 if the process has ended."""
@@ -146,8 +148,8 @@ class Child:
                     with suppress(BlockingIOError):  # what it said before
                         return self._socket.recv_into(room, 0, socket.MSG_DONTWAIT)
                     return 0
-                looks += 1
-                if looks == self._patience:
+                looks += self._life is not None and self._life.goes_on()
+                if looks > self._patience:
                     self.kill()
                     return 0
             except ConnectionResetError:
@@ -155,12 +157,14 @@ class Child:
 
     def reap(self) -> Ended:
         """Wait for the end of a process that says no more; one that lives on is killed."""
-        try:
-            status = self._process.wait(_GRACE_S)
-            return Ended(status, "closed" if status == _LOST_LINK else "")
-        except subprocess.TimeoutExpired:
-            self.kill()
-            return Ended(self._process.returncode, "closed")
+        while self._process.poll() is None:
+            if has_memory(self.pid):  # what ends has given its memory back before its descriptors
+                self.kill()
+                return Ended(self._process.returncode, "closed")
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(_LOOK_S)
+        status = self._process.returncode
+        return Ended(status, "closed" if status == _LOST_LINK else "")
 
     def dismiss(self) -> None:
         """End the process: it is told to, and killed if it does not."""

@@ -45,7 +45,9 @@ Log = Callable[[int, str, str], None]
 
 class ProcessDoor:
     """The processes of one run. ``on_end`` is called with the key of each that has ended;
-    ``follows_clock`` says of a node whether /clock drives its ROS time."""
+    ``follows_clock`` says of a node whether /clock drives its ROS time. ``clock`` is there if nodes
+    have clocks of their own: given a node (None: nobody) and whether a ROS clock is looked at, it
+    says what is shown, and whether that stays so throughout the event."""
 
     def __init__(self, domain: Domain, interfaces: Interfaces, *, seed: int, log: Log) -> None:
         self.domain = domain
@@ -54,6 +56,7 @@ class ProcessDoor:
         self.service_type = interfaces.service
         self.processes: list[Process] = []
         self.follows_clock: Callable[[str], bool] = lambda node: False
+        self.clock: Callable[[str | None, bool], tuple[int, bool]] | None = None
         self.on_end: Callable[[str], None] = lambda key: None
         self._seed = seed
 

@@ -32,6 +32,7 @@ from rsltrace.doors.processes.wire import (
     packed_qos,
 )
 from rsltrace.errors import NodeError
+from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventFlag, EventKind
@@ -44,7 +45,8 @@ _GRACE_S = 5.0
 _WAITER = struct.Struct("<IIqI")
 _DEADLINE = struct.Struct("<Iq")
 _REQUEST_ID = struct.Struct("<I16sq")
-_HELLO = struct.Struct("<qQ")
+_HELLO = struct.Struct("<qQI")
+_SHOWN = struct.Struct("<qI")
 _RECORD_SIZE = RECORD.size
 _PUBLISH, _WAIT = int(Say.PUBLISH), int(Say.WAIT)
 _number = HEAD.unpack_from
@@ -59,6 +61,7 @@ class Surroundings(Interfaces, Protocol):
 
     log: Callable[[int, str, str], None]
     follows_clock: Callable[[str], bool]
+    clock: Callable[[str | None, bool], tuple[int, bool]] | None
 
     def seed_of(self, key: str) -> int:
         """Return the number from which a process draws what others take for entropy."""
@@ -105,7 +108,9 @@ class Process:
             Say.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
             Say.QOS: self._qos,
             Say.MATCHED: self._matched,
-            Say.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_node)),
+            Say.FOLLOWS: lambda fields: HEAD.pack(door.follows_clock(self.things.last_name)),
+            Say.CLOCK: self._clock,
+            Say.CLOCK_OWNER: self._owner_of_new_clock,
             Say.GRAPH: lambda fields: graph_answers.answer(door.domain.graph, fields),
         }
         self._records: dict[int, Callable[[Fields], None]] = {
@@ -342,7 +347,23 @@ class Process:
     # -- what it asks ----------------------------------------------------------------------------
 
     def _hello(self, fields: Fields) -> bytes:
-        return _HELLO.pack(self.dispatcher.loop.now_ns, self.door.seed_of(self.key))
+        door, now_ns = self.door, self.dispatcher.loop.now_ns
+        return _HELLO.pack(now_ns, door.seed_of(self.key), door.clock is not None)
+
+    def _clock(self, fields: Fields) -> bytes:
+        """Say what a clock shows: that of a node, or of who runs."""
+        node = self.things.get(fields.number()) or self._running_node()
+        assert self.door.clock is not None, "it asks where there are such clocks"
+        name = None if node is None else node.fully_qualified_name
+        return _SHOWN.pack(*self.door.clock(name, bool(fields.number())))
+
+    def _running_node(self) -> Participant | None:
+        """Return the node whose callback runs, else the one that was made last."""
+        node = self.dispatcher.event.node
+        return node if isinstance(node, Participant) else self.things.last_node
+
+    def _owner_of_new_clock(self, fields: Fields) -> bytes:
+        return HEAD.pack(self.things.number_of(self.things.newest_node or self._running_node()))
 
     def _take(self, fields: Fields) -> bytes:
         item = self.things[fields.number()].take()

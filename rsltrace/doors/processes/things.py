@@ -45,6 +45,7 @@ class Things(dict[int, Any]):
         self._process = process
         self._nodes: list[Participant] = []
         self._timers_named = 0
+        self._made_in = -1
         self.records: dict[int, Callable[[Fields], None]] = {
             Say.NODE: self._node,
             Say.PUBLISHER: self._publisher,
@@ -66,6 +67,7 @@ class Things(dict[int, Any]):
         node.process = self._process
         self[number] = node
         self._nodes.append(node)
+        self._made_in = domain.dispatcher.loop.events
 
     def _publisher(self, fields: Fields) -> None:
         number, node = fields.number(), self[fields.number()]
@@ -145,9 +147,24 @@ class Things(dict[int, Any]):
         self[fields.number()].named_callback(fields.text())
 
     @property
-    def last_node(self) -> str:
-        """The full name of the node that was made last, "" if there is none."""
+    def last_node(self) -> Participant | None:
+        """The node that was made last, None if there is none."""
+        return self._nodes[-1] if self._nodes else None
+
+    @property
+    def last_name(self) -> str:
+        """Its full name, "" if there is none."""
         return self._nodes[-1].fully_qualified_name if self._nodes else ""
+
+    @property
+    def newest_node(self) -> Participant | None:
+        """The node that was made last if that was in the event under way, else None."""
+        is_new = self._made_in == self._process.dispatcher.loop.events
+        return self.last_node if is_new else None
+
+    def number_of(self, node: Participant | None) -> int:
+        """Return what the process calls a node; 0 if it is none of its own."""
+        return next((number for number, thing in self.items() if thing is node), 0)
 
     def give_up(self, number: int) -> None:
         """Destroy one of them."""

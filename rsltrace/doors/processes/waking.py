@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from rsltrace.loop.timer import TimerState
+from rsltrace.middleware.entity import Runnable
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.model.event import NO_EVENT, EventKind
 
@@ -66,6 +67,11 @@ class WakingTimer:
             self, entity, node, _RESUME, self._process.wake, (self._thread,), cause, 0, 0
         )
 
+    def runnable(self) -> Runnable:
+        """Describe it to a policy: a callback under way goes on, and has its worker."""
+        entity = self._process.entity_id if self._asleep is None else self._asleep[0]
+        return Runnable("resume", "", entity)
+
     def describe(self) -> str:
         """Name it for people."""
         return f"{self._process.name}: the end of a wait"
@@ -100,6 +106,10 @@ class GraphChange:
         process.dispatcher.execute(
             self, process.entity_id, None, _RESUME, process.see_graph, (), NO_EVENT, 0, 0
         )
+
+    def runnable(self) -> Runnable:
+        """Describe it to a policy."""
+        return Runnable("resume", "", self._process.entity_id)
 
     def describe(self) -> str:
         """Name it for people."""

@@ -58,6 +58,8 @@ class Say(IntEnum):
     FOLLOWS = 25
     CALLBACK = 26
     TIMER_OF = 27
+    CLOCK_OWNER = 28
+    CLOCK = 29
 
 
 class Told(IntEnum):

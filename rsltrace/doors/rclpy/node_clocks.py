@@ -65,11 +65,15 @@ class NodeClocks:
         rule = self._rule(node or "")
         return rule is not None and rule.follows
 
+    def advances(self, node: str | None) -> bool:
+        """Return whether a ROS clock of a node shows more at each look."""
+        rule = self._rule(node or "")
+        return rule is not None and rule.advances
+
     def look(self, node: str | None, now_ns: int) -> int:
         """Return what a ROS clock of ``node`` shows to who looks at it now."""
         shown_ns, name = self.shows(node, now_ns), node or ""
-        rule = self._rule(name)
-        if rule is None or not rule.advances:
+        if not self.advances(name):
             return shown_ns
         before_ns, ahead_ns = self._ahead.get(name, (-1, 0))
         if before_ns != now_ns:

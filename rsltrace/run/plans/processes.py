@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from rsltrace.chance.clock import ClockModel
 from rsltrace.doors.processes.build import Library, library
 from rsltrace.doors.processes.door import Interfaces, ProcessDoor, Program
 from rsltrace.doors.processes.programs import (
@@ -32,6 +33,7 @@ from rsltrace.job import Job, NodeSpec
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.model.printable import printable
 from rsltrace.model.regular_file import not_regular
+from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
 
 
@@ -143,6 +145,14 @@ def _service_type(name: str) -> ServiceType:
         return ServiceType(name, MessageType(f"{name}_Request"), MessageType(f"{name}_Response"))
 
 
+def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
+    """Return what a clock of a process shows, and whether it does so throughout the event."""
+    clocks, now_ns = world.clocks, world.domain.loop.now_ns
+    assert clocks is not None, "the job has some"
+    shown_ns = clocks.look(node, now_ns) if looks else clocks.shows(node, now_ns)
+    return shown_ns, not clocks.advances(node)
+
+
 def process_door(job: Job, world: World) -> ProcessDoor:
     """Return the door through which a job's processes take part in its world."""
     interfaces = Interfaces(_message_type, _service_type)
@@ -162,6 +172,9 @@ def process_door(job: Job, world: World) -> ProcessDoor:
 
     door.on_end = ended
     door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)
+
+    if any(rule.advances or rule.model != ClockModel() for rule in clocks_of(job)):
+        door.clock = lambda node, looks: _shown(world, node, looks)
 
     def start(entry: Entry, cause: tuple[int, int]) -> None:
         assert isinstance(entry.program, Program)

@@ -36,6 +36,7 @@ std::int64_t real_ns() {
 
 bool linked() { return on; }
 std::int64_t now_ns() { return now; }
+std::int64_t shown_ns(std::uint32_t, bool) { return now; }
 std::uint64_t seed() { return 42; }
 
 void report(const std::string &text) { std::fprintf(stderr, "report: %s\n", text.c_str()); }

@@ -5,6 +5,8 @@
 #include <time.h>
 #include <unistd.h>
 
+#include <algorithm>
+
 #include "real.h"
 #include "scheduler.h"
 
@@ -14,13 +16,24 @@ constexpr std::int64_t SECOND_NS = 1'000'000'000;
 
 bool valid(const timespec *when) { return when->tv_nsec >= 0 && when->tv_nsec < SECOND_NS; }
 
+namespace {
+
+std::int64_t length_of(const timespec &span) {
+  if (span.tv_sec >= NEVER_NS / SECOND_NS) return NEVER_NS;
+  return span.tv_sec < 0 ? 0 : span.tv_sec * SECOND_NS + span.tv_nsec;
+}
+
+}  // namespace
+
+// A time of the program's clock, which may be wrong: what is left until then is waited for.
 std::int64_t deadline_of(const timespec &when) {
-  if (when.tv_sec >= NEVER_NS / SECOND_NS) return NEVER_NS;
-  return when.tv_sec < 0 ? 0 : when.tv_sec * SECOND_NS + when.tv_nsec;
+  const std::int64_t shown = length_of(when);
+  const std::int64_t ahead = shown == NEVER_NS ? 0 : shown_ns() - now_ns();
+  return std::max<std::int64_t>(shown - ahead, 0);
 }
 
 std::int64_t deadline_after(const timespec &span) {
-  const std::int64_t length = deadline_of(span);
+  const std::int64_t length = length_of(span);
   const std::int64_t now = now_ns();
   return length >= NEVER_NS - now ? NEVER_NS : now + length;
 }
@@ -51,7 +64,7 @@ int sleep_until(Thread &thread, std::int64_t deadline_ns, timespec *left, const 
 
 std::int64_t look_at_clock(Thread &thread) {
   look(thread, 1);
-  return now_ns();
+  return shown_ns();
 }
 
 }  // namespace
@@ -64,7 +77,9 @@ RSLTRACE_EXPORT int clock_gettime(clockid_t clock, timespec *out) noexcept {
   if (thread == nullptr && !linked()) return REAL(clock_gettime)(clock, out);
   timespec resolution;
   if (clock > CLOCK_TAI && REAL(clock_getres)(clock, &resolution) != 0) return -1;  // there is none
-  *out = to_timespec(thread == nullptr ? now_ns() : look_at_clock(*thread));
+  const bool of_processor = clock == CLOCK_PROCESS_CPUTIME_ID || clock == CLOCK_THREAD_CPUTIME_ID;
+  if (of_processor && thread != nullptr) look(*thread, 1);
+  *out = to_timespec(thread == nullptr || of_processor ? now_ns() : look_at_clock(*thread));
   return 0;
 }
 

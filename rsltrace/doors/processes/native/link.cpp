@@ -30,6 +30,8 @@ constexpr std::size_t ROOM = 1 << 16;
 int link_fd = -1;
 std::int64_t time_ns = 0;
 std::uint64_t seed_of_process = 0;
+bool own_clocks = false;
+std::uint64_t lets_go = 0;
 std::size_t filled = 0;  // bytes of what has been received
 
 // What the process has said and the loop has not taken: its length, then whole records. The loop
@@ -141,6 +143,11 @@ __attribute__((constructor(101))) void begin() {
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
   if (!said.open(files[0]) || !told.open(files[1])) leave(120);
   link_fd = fd;
+  signal(SIGINT, SIG_DFL);  // a run in the background of a shell, or under nohup, is no other run
+  signal(SIGHUP, SIG_DFL);
+  sigset_t none;
+  sigemptyset(&none);
+  sigprocmask(SIG_SETMASK, &none, nullptr);
   fcntl(fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
   forget_environment();
   pthread_atfork(nullptr, nullptr, forked);
@@ -150,6 +157,7 @@ __attribute__((constructor(101))) void begin() {
   Reader reader(answer.data(), answer.size());
   time_ns = reader.number<std::int64_t>();
   seed_of_process = reader.number<std::uint64_t>();
+  own_clocks = reader.number<std::uint32_t>() != 0;
 }
 
 }  // namespace
@@ -159,6 +167,10 @@ bool linked() { return link_fd >= 0; }
 std::int64_t now_ns() { return time_ns; }
 
 std::uint64_t seed() { return seed_of_process; }
+
+bool has_own_clocks() { return own_clocks; }
+
+std::uint64_t times_let_go() { return lets_go; }
 
 void say(Say kind, const Writer &body) {
   if (!linked()) return;
@@ -246,6 +258,7 @@ void idle(Waiter *const *waiters, std::size_t count, bool outside) {
   if (message.kind != Told::GO) lost();
   Reader reader(message.body, message.size);
   time_ns = reader.number<std::int64_t>();
+  ++lets_go;
   const auto thread = reader.number<std::uint32_t>();
   Ready ready;
   ready.kind = static_cast<Wake>(reader.number<std::uint32_t>());

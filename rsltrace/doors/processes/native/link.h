@@ -45,6 +45,14 @@ struct Waiter {
 // Whether a loop runs this process. If not (a grandchild, a forked copy), libc is what it was.
 bool linked();
 std::int64_t now_ns();
+// How often the process was let go on.
+std::uint64_t times_let_go();
+// What clocks show to the program: simulated time, unless the job has other clocks for its nodes.
+// `node` is whose clock it is (0: of who runs); a `look` at a clock of ROS may make it advance.
+std::int64_t shown_ns(std::uint32_t node = 0, bool look = false);
+// Whether the job has such clocks, and then whose one is that is made now (0: nobody's).
+bool has_own_clocks();
+std::uint32_t owner_of_new_clock();
 std::uint64_t seed();
 
 // Append a record to the batch that the loop takes with the next wait or question, or if the process

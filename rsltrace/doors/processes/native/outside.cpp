@@ -9,11 +9,10 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <cstdlib>
-#include <cstring>
 #include <fstream>
 #include <set>
 
+#include "calls.h"
 #include "real.h"
 #include "scheduler.h"
 #include "threads.h"
@@ -23,47 +22,15 @@ namespace {
 
 constexpr long LOOK_EVERY_NS = 250'000'000;
 
-struct Call {
-  long number;
-  const char *name;
-  bool descriptor;  // its first argument is one
-};
-constexpr Call CALLS[] = {
-    {SYS_read, "read", true},          {SYS_readv, "readv", true},     {SYS_write, "write", true},
-    {SYS_writev, "writev", true},      {SYS_ioctl, "ioctl", true},     {SYS_recvfrom, "recv", true},
-    {SYS_recvmsg, "recvmsg", true},    {SYS_sendto, "send", true},     {SYS_sendmsg, "sendmsg", true},
-    {SYS_accept, "accept", true},      {SYS_accept4, "accept", true},  {SYS_connect, "connect", true},
-    {SYS_flock, "flock", true},        {SYS_fcntl, "fcntl", true},     {SYS_openat, "open", false},
-    {SYS_futex, "a lock of libc", false}, {SYS_wait4, "wait", false},  {SYS_msgrcv, "msgrcv", false},
-    {SYS_rt_sigsuspend, "sigsuspend", false}, {SYS_rt_sigtimedwait, "sigwait", false},
-};
-
-std::string target_of(long descriptor) {
-  char path[256] = "";
-  const std::string link = "/proc/self/fd/" + std::to_string(descriptor);
-  if (readlink(link.c_str(), path, sizeof path - 1) < 0) return "descriptor " + std::to_string(descriptor);
-  return "descriptor " + std::to_string(descriptor) + ", " + path;
-}
-
-std::string name_of_call(const std::string &line) {
-  char *rest = nullptr;
-  const long number = std::strtol(line.c_str(), &rest, 10);
-  for (const Call &call : CALLS)
-    if (call.number == number)
-      return std::string(call.name) + (call.descriptor ? " (" + target_of(std::strtol(rest, nullptr, 16)) + ")" : "");
-  return "system call " + std::to_string(number);
-}
-
 // What a thread does in the kernel, empty if it does not sleep in a call: with how often it has
 // slept so far, so that two equal ones mean that it did not run in between.
 std::string asleep(const Thread &thread) {
   const std::string folder = "/proc/self/task/" + std::to_string(thread.tid) + "/";
   std::string call, line, text;
   std::getline(std::ifstream(folder + "syscall"), call);
-  if (call.empty() || call[0] == 'r' || call[0] == '-') return "";
+  if (call.empty() || call[0] == 'r' || call[0] == '-' || prints(call)) return "";
   std::ifstream status(folder + "status");
   while (std::getline(status, line)) {
-    if (line.rfind("State:", 0) == 0 && line.find('S') == std::string::npos) return "";
     if (line.rfind("State:\tS", 0) != 0 && line.rfind("State:", 0) == 0) return "";
     if (line.find("ctxt_switches") != std::string::npos) text += line;
   }
@@ -127,6 +94,7 @@ void *serve(void *) {
 void start_service() {
   if (service.service) return;
   service.service = true;
+  remember_streams();
   sigset_t everything, before;
   sigfillset(&everything);
   pthread_sigmask(SIG_SETMASK, &everything, &before);

@@ -2,6 +2,7 @@
 // comes from, so what /clock says changes nothing, unless the job says that it does.
 #include "ros_clocks.h"
 
+#include <dlfcn.h>
 #include <rcutils/time.h>
 
 #include <map>
@@ -13,10 +14,21 @@ using namespace rsltrace;
 
 namespace {
 
-rcutils_ret_t show(rcutils_time_point_value_t *now, const char *name) {
+// Whether code is rcl's own, or ours on its behalf (rcl's last calls are jumps): its timers and log
+// records go by true simulated time, even where the job has other clocks for nodes.
+bool is_of_rcl(const void *code) {
+  Dl_info where{};
+  if (dladdr(code, &where) == 0 || where.dli_fname == nullptr) return false;
+  const std::string path = where.dli_fname;
+  const std::string file = path.substr(path.rfind('/') + 1);
+  return file.rfind("librcl.", 0) == 0 || file.rfind("librcl_", 0) == 0 ||
+         file.rfind("librcutils.", 0) == 0 || file.rfind("librmw_rsltrace", 0) == 0;
+}
+
+rcutils_ret_t show(rcutils_time_point_value_t *now, const char *name, const void *caller) {
   if (linked()) {
     if (now == nullptr) return RCUTILS_RET_INVALID_ARGUMENT;
-    *now = now_ns();
+    *now = !has_own_clocks() || is_of_rcl(caller) ? now_ns() : shown_ns();
     return RCUTILS_RET_OK;
   }
   using Look = rcutils_ret_t(rcutils_time_point_value_t *);
@@ -26,11 +38,11 @@ rcutils_ret_t show(rcutils_time_point_value_t *now, const char *name) {
 }  // namespace
 
 RSLTRACE_EXPORT rcutils_ret_t rcutils_system_time_now(rcutils_time_point_value_t *now) {
-  return show(now, "rcutils_system_time_now");
+  return show(now, "rcutils_system_time_now", __builtin_return_address(0));
 }
 
 RSLTRACE_EXPORT rcutils_ret_t rcutils_steady_time_now(rcutils_time_point_value_t *now) {
-  return show(now, "rcutils_steady_time_now");
+  return show(now, "rcutils_steady_time_now", __builtin_return_address(0));
 }
 
 namespace {
@@ -44,6 +56,12 @@ std::set<const rcl_clock_t *> &set_by_topic() {
 // Whether what sets a clock counts, for all that somebody has tried to set so far.
 std::map<const rcl_clock_t *, bool> &asked_about() {
   static auto *all = new std::map<const rcl_clock_t *, bool>;
+  return *all;
+}
+
+// The nodes that clocks are of, by their numbers, where the job has other clocks for nodes.
+std::map<const rcl_clock_t *, std::uint32_t> &owners() {
+  static auto *all = new std::map<const rcl_clock_t *, std::uint32_t>;
   return *all;
 }
 
@@ -120,5 +138,25 @@ RSLTRACE_EXPORT rcl_ret_t rcl_clock_fini(rcl_clock_t *clock) {
   static const auto real = rcl<decltype(rcl_clock_fini)>("rcl_clock_fini");
   set_by_topic().erase(clock);
   asked_about().erase(clock);
+  owners().erase(clock);
   return real(clock);
+}
+
+RSLTRACE_EXPORT rcl_ret_t rcl_clock_init(rcl_clock_type_t type, rcl_clock_t *clock,
+                                         rcl_allocator_t *allocator) {
+  static const auto real = rcl<decltype(rcl_clock_init)>("rcl_clock_init");
+  const rcl_ret_t told = real(type, clock, allocator);
+  if (told == RCL_RET_OK && linked() && has_own_clocks()) owners()[clock] = owner_of_new_clock();
+  return told;
+}
+
+RSLTRACE_EXPORT rcl_ret_t rcl_clock_get_now(rcl_clock_t *clock, rcl_time_point_value_t *now) {
+  static const auto real = rcl<decltype(rcl_clock_get_now)>("rcl_clock_get_now");
+  const rcl_ret_t told = real(clock, now);
+  const bool as_it_is = told != RCL_RET_OK || !linked() || !has_own_clocks() ||
+                        is_driven(*clock) || is_of_rcl(__builtin_return_address(0));
+  if (as_it_is) return told;
+  const auto owner = owners().find(clock);
+  *now = shown_ns(owner == owners().end() ? 0 : owner->second, true);
+  return told;
 }

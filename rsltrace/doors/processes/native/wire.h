@@ -40,6 +40,8 @@ enum class Say : std::uint32_t {
   FOLLOWS,
   CALLBACK,
   TIMER_OF,
+  CLOCK_OWNER,
+  CLOCK,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from

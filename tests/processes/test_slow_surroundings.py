@@ -1,0 +1,117 @@
+"""Processes do the same however slow the machine is, and whatever rsltrace was started from."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from rsltrace.doors.processes.child import Child
+from rsltrace.doors.processes.life import Life, has_memory
+from rsltrace.job import load_job
+from rsltrace.run.recording import run
+from rsltrace.trace.reader import Trace
+
+JOB = """
+nodes: [{script: node.py, isolated: true}]
+stop: {duration: 1s}
+"""
+PRINTS = """
+import rclpy
+
+rclpy.init()
+node = rclpy.create_node('prints')
+
+def tick():
+    print('x' * 200_000, flush=True)
+    node.get_logger().info('printed')
+
+node.create_timer(0.3, tick)
+rclpy.spin(node)
+"""
+SAYS_BYE = """
+import rclpy
+
+rclpy.init()
+node = rclpy.create_node('says_bye')
+try:
+    rclpy.spin(node)
+except KeyboardInterrupt:
+    print('bye')
+"""
+
+
+def _logs(path: Path) -> list[tuple[int, str]]:
+    with Trace.open(path) as trace:
+        records = [(s, trace.decode("/rosout", d)) for s, _, d in trace.messages("/rosout")]
+    return [(stamp // 1_000_000, record.msg) for stamp, record in records]  # type: ignore[attr-defined]
+
+
+@pytest.mark.ros
+@pytest.mark.long
+def test_time_stands_while_nobody_reads_what_a_process_prints(
+    compiled: object, tmp_path: Path
+) -> None:
+    (tmp_path / "node.py").write_text(PRINTS)
+    (tmp_path / "job.yaml").write_text(JOB)
+    command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", "t.mcap"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as started:
+        assert started.stdout is not None
+        printed = 0
+        while part := os.read(started.stdout.fileno(), 1 << 16):
+            printed += part.count(b"x")
+            time.sleep(0.4)
+        assert started.stderr is not None
+        assert b"outside" not in started.stderr.read()
+    assert printed == 600_000
+    assert _logs(tmp_path / "t.mcap") == [(300, "printed"), (600, "printed"), (900, "printed")]
+
+
+@pytest.mark.ros
+def test_a_process_ends_in_the_background_as_in_the_foreground(
+    compiled: object, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A shell starts what is in its background with SIGINT ignored."""
+    (tmp_path / "node.py").write_text(SAYS_BYE)
+    (tmp_path / "job.yaml").write_text(JOB)
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        assert run(load_job(tmp_path / "job.yaml"), tmp_path / "t.mcap").error is None
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert capfd.readouterr().out == "bye\n"
+
+
+def _waits_until_it_is(pid: int, state: str) -> None:
+    deadline = time.monotonic() + 100
+    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != state:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_a_process_that_was_stopped_is_not_given_up() -> None:
+    with subprocess.Popen(["/bin/sleep", "600"]) as sleeper:
+        _waits_until_it_is(sleeper.pid, "S")
+        life = Life(sleeper.pid)
+        assert life.goes_on()
+        sleeper.send_signal(signal.SIGSTOP)
+        _waits_until_it_is(sleeper.pid, "T")
+        assert not life.goes_on()
+        assert has_memory(sleeper.pid)
+        sleeper.kill()
+        _waits_until_it_is(sleeper.pid, "Z")
+        assert not has_memory(sleeper.pid)
+
+
+def test_a_process_that_goes_in_circles_is_given_up() -> None:
+    child = Child([sys.executable, "-c", "while True: pass"], {}, None, "circles")
+    child.give_up_after(0.2)
+    assert child.receive() is None
+    assert child.reap().said == "was killed by SIGKILL"
