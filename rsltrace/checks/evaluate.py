@@ -12,7 +12,7 @@ from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violat
 from rsltrace.checks.trace_events import TraceEvent, events_of
 from rsltrace.debug.conditions.condition import Armed, Condition
 from rsltrace.debug.conditions.names import Names, names_of
-from rsltrace.errors import CheckError, ConditionError, JobError
+from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.values.target import Target, target_text
@@ -80,7 +80,8 @@ def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) ->
     :raises CheckError: a check cannot be held against this run.
     :raises TraceError: the trace is damaged, or lacks the messages that a check reads.
     """
-    names = names_of(trace.entities.values(), are_all=trace.complete, fields=trace.fields_of)
+    came_to_its_end = trace.complete and trace.result.get("exit_code") != str(EXIT_RUN)
+    names = names_of(trace.entities.values(), are_all=came_to_its_end, fields=trace.fields_of)
     held = [_property(trace, job, index, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
     if properties:

@@ -308,6 +308,11 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "job.yaml:7:12: no topic is called '/y'; there are /x" in done.stdout
     assert done.stdout.count("job.yaml:") == 2
 
+    (tmp_path / "talkers.py").write_text(NODES.replace("self.count = 0", "self.count = None"))
+    done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "failed.mcap", "--no-pin"])
+    assert done.exit_code == 3, "the run failed, and what would have come later is no mistake"
+    assert "'/y'" not in done.stderr
+
     job.write_text(job.read_text().replace("/x.data < 80", "/x.data <"))
     done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "other.mcap", "--no-pin"])
     assert done.exit_code == 2

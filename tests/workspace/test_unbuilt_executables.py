@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -145,6 +146,32 @@ def test_a_checkout_runs_as_it_is(
     assert listed.returncode == 2
     assert "src/talker_py/talker_py/talker.py\n" in listed.stderr
     assert not mark.exists()
+
+
+@pytest.mark.long
+@pytest.mark.ros
+@pytest.mark.skipif(
+    not any(map(shutil.which, ("c++", "g++", "clang++"))), reason="needs a C++ compiler"
+)
+def test_processes_of_a_checkout_find_its_modules_and_shares(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write(tmp_path, _FILES)
+    share = "from ament_index_python.packages import get_package_share_directory as share\n"
+    asks = "".join(
+        f"    open(share('{package}') + '/{file}')\n"
+        for package, file in (("talker_py", "settings/p.yaml"), ("std_msgs", "package.xml"))
+    )
+    talker = tmp_path / "src/talker_py/talker_py/talker.py"
+    talker.write_text(share + _TALKER.replace("    rclpy.init(", asks + "    rclpy.init("))
+    job = (tmp_path / "job.yaml").read_text()
+    (tmp_path / "job.yaml").write_text(job.replace("talker,", "talker, isolated: true,"))
+    done = command("record", "job.yaml", "-o", "run.mcap")
+    assert done.returncode == 0, done.stderr
+    with Trace.open("run.mcap") as trace:
+        heard = [trace.decode("/heard", data).data for _, _, data in trace.messages("/heard")]  # type: ignore[attr-defined]
+    assert heard == ["from cmake"] * 8
 
 
 def test_what_build_files_say(tmp_path: Path) -> None:

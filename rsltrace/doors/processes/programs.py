@@ -83,9 +83,11 @@ def program(
     environment: Mapping[str, str],
     folder: Path | None,
     search_path: Sequence[str] = (),
+    prefixes: Sequence[str] = (),
 ) -> Program:
     """Return a command as a process of the run.
 
+    Python finds modules in ``search_path``, and the ament index packages in ``prefixes``.
     Python's output is not buffered: a process may be killed at any time. Programs without Python
     get stand-ins for the symbols of Python that libraries of ROS ask for.
     """
@@ -96,16 +98,19 @@ def program(
     if needs_symbols and path.resolve() != Path(sys.executable).resolve():
         preload.append(str(library.python_symbols))
     known = dict(os.environ)
-    places = [str(place) for place in library.ros.libraries]
+    libraries = [str(place) for place in library.ros.libraries]
     around = {
         **known,
         _UNBUFFERED: "1",
         **environment,
     }
     around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
-    around["LD_LIBRARY_PATH"] = os.pathsep.join([*places, *_listed(around, "LD_LIBRARY_PATH")])
+    around["LD_LIBRARY_PATH"] = os.pathsep.join([*libraries, *_listed(around, "LD_LIBRARY_PATH")])
     if search_path:
         around["PYTHONPATH"] = os.pathsep.join([*search_path, *_listed(around, "PYTHONPATH")])
+    if prefixes:  # what is built comes first
+        found = [*_listed(around, "AMENT_PREFIX_PATH"), *prefixes]
+        around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
     return Program(list(command), around, folder)
 
 

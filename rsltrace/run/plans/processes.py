@@ -7,6 +7,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 from rsltrace.chance.clock import ClockModel
@@ -35,6 +36,8 @@ from rsltrace.model.printable import printable
 from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
+from rsltrace.workspace.imports import unbuilt_names, unbuilt_prefix
+from rsltrace.workspace.installs import module_folders
 
 
 class Processes:
@@ -67,8 +70,23 @@ class Processes:
             self._library,
             environment=spec.environment,
             folder=self._folder(spec, where),
-            search_path=[str(self._job.resolve(path)) for path in self._job.search_path],
+            search_path=self._search_path,
+            prefixes=self._prefixes,
         )
+
+    @cached_property
+    def _search_path(self) -> list[str]:
+        """Where modules are: those of packages that nobody has built come first, since folders
+        with sources (``src/my_robot/my_robot``) look like packages themselves."""
+        given = [self._job.resolve(path) for path in self._job.search_path]
+        return [str(path) for path in dict.fromkeys([*module_folders(given), *given])]
+
+    @cached_property
+    def _prefixes(self) -> list[str]:
+        """Where the shares of those packages are, and of wheels, as in the process of the run."""
+        found = [str(path) for name in sorted(unbuilt_names()) if (path := unbuilt_prefix(name))]
+        has_wheels = Path(sys.prefix, "share", "ament_index").is_dir()
+        return [*found, sys.prefix] if has_wheels else found
 
     def _folder(self, spec: NodeSpec, where: str) -> Path | None:
         if spec.working_directory is None:
