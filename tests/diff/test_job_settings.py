@@ -56,6 +56,22 @@ def told(a: Recorded, b: Recorded) -> dict[str, tuple[str | None, str | None]]:
     return found
 
 
+def test_what_may_be_one_file_comes_last(tmp_path: Path) -> None:
+    job = "nodes:\n  - node: m:Ekf\n    parameter_files: [{}]\n    parameters: {{rate: {}}}\n"
+    jobs = tmp_path / "jobs"
+    for name in ("config/p.yaml", "jobs/src/bot/config/p.yaml", "jobs/src/bot/config/q.yaml"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("/**: {ros__parameters: {size: 1}}\n")
+    a = recorded(jobs, job.format("../config/p.yaml", 50.0))
+    elsewhere = recorded(jobs, job.format("src/bot/config/p.yaml", 20.0))
+    other = recorded(jobs, job.format("src/bot/config/q.yaml", 20.0))
+    assert [one.key for one in job_settings(a, elsewhere)] == [  # type: ignore[arg-type]
+        "nodes.0.parameters.rate",
+        "nodes.0.parameter_files.0",
+    ]
+    assert job_settings(a, other)[0].key == "nodes.0.parameter_files.0"  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [

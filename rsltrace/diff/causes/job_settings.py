@@ -27,6 +27,7 @@ _LINES_MAX = 20_000
 
 _BYTES_MAX = 1 << 20
 _NANOSECONDS = "_ns"
+_PATHS = frozenset(("parameter_files", "path", "file", "script", "program"))
 _NOTHING: tuple[object, ...] = (None, [], {})
 _NO_VALUES = tuple((nothing,) for nothing in _NOTHING)
 
@@ -34,7 +35,8 @@ Path = tuple["str | int", ...]
 
 
 def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
-    """Return what differs in the jobs, in the order of the job file; keys without a line last."""
+    """Return what differs in the jobs, in the order of the job file; keys without a line last, and
+    behind them what may be one file as seen from two folders."""
     resolved_a, resolved_b = resolved_job(a), resolved_job(b)
     if not resolved_a or not resolved_b:
         return tuple(_differing_lines(a, b))
@@ -47,7 +49,8 @@ def job_settings(a: Trace, b: Trace) -> tuple[Setting, ...]:
         depth, line = max(places, key=lambda place: place[0])
         name = f"{_name(a, b)}:{line}" if depth else "job"
         key = _shared_key(change, resolved_a, resolved_b)
-        found.append((line or _LINES_MAX, Setting(name, *change.shown(), key)))
+        order = (change.may_be_one_file, line or _LINES_MAX)
+        found.append((order, Setting(name, *change.shown(), key)))
     return tuple(setting for _, setting in sorted(found, key=lambda item: item[0]))
 
 
@@ -67,6 +70,19 @@ class _Change:
         text = text_b if self.a is None else text_a
         unset = (self.a or self.b) in _NO_VALUES
         return unset or (bool(text) and _written(self.path_a[-1]) not in text)
+
+    @property
+    def may_be_one_file(self) -> bool:
+        """Whether both are relative paths (``../config/p.yaml``, ``src/bot/config/p.yaml``) that
+        lead to one file if the jobs lie in folders that fit."""
+        if self.path_a[0] == "search_path":
+            return True
+        a, b = (leaf and leaf[0] for leaf in (self.a, self.b))
+        if not (isinstance(a, str) and isinstance(b, str)) or _PATHS.isdisjoint(self.path_a):
+            return False
+        parts = [[part for part in text.split("/") if part not in ("..", ".")] for text in (a, b)]
+        short, long = sorted(parts, key=len)
+        return len(short) > 0 and long[-len(short) :] == short
 
     def shown(self) -> tuple[str | None, str | None]:
         """Return both values on a line each: times with a unit; parts without unset keys."""
