@@ -18,6 +18,7 @@ from rsltrace._version import __version__
 
 if TYPE_CHECKING:
     from rsltrace.checks.evaluate import CheckResult, evaluate_checks
+    from rsltrace.checks.metrics import MetricResult, evaluate_metrics
     from rsltrace.debug.client import DebugSession
     from rsltrace.diff import diff_files as diff
     from rsltrace.diff.bags.comparison import diff_bags
@@ -29,9 +30,11 @@ if TYPE_CHECKING:
     from rsltrace.job import (
         BagSpec,
         CheckSpec,
+        FaultSpec,
         HooksSpec,
         Job,
         LaunchSpec,
+        MetricSpec,
         NodeSpec,
         RecordSpec,
         StopSpec,
@@ -52,9 +55,12 @@ _HOMES = {
     "DebugSession": "rsltrace.debug.client",
     "Diff": "rsltrace.diff.result.traces",
     "DiffOptions": "rsltrace.diff.options",
+    "FaultSpec": "rsltrace.job",
     "HooksSpec": "rsltrace.job",
     "Job": "rsltrace.job",
     "LaunchSpec": "rsltrace.job",
+    "MetricResult": "rsltrace.checks.metrics",
+    "MetricSpec": "rsltrace.job",
     "NodeReplayResult": "rsltrace.replay.one_node.result",
     "NodeSpec": "rsltrace.job",
     "RecordSpec": "rsltrace.job",
@@ -68,6 +74,7 @@ _HOMES = {
     "Verdict": "rsltrace.diff.result.traces",
     "diff_bags": "rsltrace.diff.bags.comparison",
     "evaluate_checks": "rsltrace.checks.evaluate",
+    "evaluate_metrics": "rsltrace.checks.metrics",
     "load_job": "rsltrace.job",
     "record": "rsltrace.run",
 }
@@ -80,9 +87,12 @@ __all__ = [
     "DebugSession",
     "Diff",
     "DiffOptions",
+    "FaultSpec",
     "HooksSpec",
     "Job",
     "LaunchSpec",
+    "MetricResult",
+    "MetricSpec",
     "NodeReplayResult",
     "NodeSpec",
     "RecordSpec",
@@ -98,6 +108,7 @@ __all__ = [
     "diff",
     "diff_bags",
     "evaluate_checks",
+    "evaluate_metrics",
     "load_job",
     "record",
     "replay",

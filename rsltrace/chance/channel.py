@@ -115,6 +115,10 @@ class Channel:
                 self._last_ns = now_ns + self.duplicate_ns
         return delay_ns
 
+    def hold_back(self, until_ns: int) -> None:
+        """Let nothing arrive before ``until_ns`` where the order is kept: something was late."""
+        self._last_ns = max(self._last_ns, until_ns)
+
     def _troubled(self, now_ns: int) -> int:
         """Return the delay over a link that may lose, duplicate or be cut off.
 

@@ -74,6 +74,7 @@ def check(
     fits nothing), 2 if the job cannot run.
     """
     from rsltrace.checks.evaluate import check_texts, wrong_checks
+    from rsltrace.checks.metrics import check_metrics
     from rsltrace.debug.conditions.message_fields import loaded_fields
     from rsltrace.debug.conditions.names import Names
     from rsltrace.diff.file_kind import is_trace
@@ -89,6 +90,7 @@ def check(
         raise click.UsageError("--job is for a trace: rsltrace check run.mcap --job job.yaml")
     loaded, _ = job_of(words, launch, skip, overrides)
     check_texts(loaded)
+    check_metrics(loaded)
     try:
         checked = check_job(loaded, everything=everything)
         shown = (*checked.overview.of_kind("topic"), *checked.overview.of_kind("service"))
@@ -130,13 +132,17 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
     else:
         with Trace.open(path) as trace:
             job = job_from_text(trace.job_text, f"the job of {path}", Path.cwd())
-    if not job.checks:
+    if not (job.checks or job.metrics):
         named = other if other is not None else f"the job of {path}"
-        tell(f"rsltrace: error: {named} has no checks (checks:); --job names another job")
+        none = f"{named} has neither checks (checks:) nor metrics"
+        tell(f"rsltrace: error: {none}; --job names another job")
         return EXIT_USAGE
     checked = Checked(job, path, functions=other is not None)
     if form == "json":
-        say(json.dumps(checked.values(), indent=2))
+        values: Any = checked.values()
+        if job.metrics:
+            values = {"checks": values, "metrics": checked.numbers()}
+        say(json.dumps(values, indent=2))
     else:
         say("\n".join(checked.lines()))
     return 1 if checked.violated else 0

@@ -134,10 +134,12 @@ def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
         from rsltrace.bag.export import check_bag_folder
 
         check_bag_folder(bag, force=force)
-    if job.checks:
+    if job.checks or job.metrics:
         from rsltrace.checks.evaluate import check_texts
+        from rsltrace.checks.metrics import check_metrics
 
         check_texts(job)
+        check_metrics(job)
 
 
 def _recorded(
@@ -241,7 +243,7 @@ def _silent_topics(result: RunResult) -> list[str]:
 
 def _checked(job: Job, result: RunResult) -> tuple[Checked | None, int]:
     """Hold the job's checks against what was recorded; return what came of it, and a status."""
-    if not job.checks or result.path is None:
+    if not (job.checks or job.metrics) or result.path is None:
         return None, 0
     from rsltrace.cli.output.checks import Checked
 
@@ -280,6 +282,7 @@ def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_j
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
                     **({} if checked is None else {"checks": checked.values()}),
+                    **({} if checked is None else {"metrics": checked.numbers()}),
                     "notes": [*result.notes, *silent, *([result.kept] if result.kept else [])],
                 }
             )

@@ -11,9 +11,11 @@ if TYPE_CHECKING:
     from rsltrace.job.job import Job
     from rsltrace.job.parts.bag import BagSpec, QosSpec
     from rsltrace.job.parts.check import CheckSpec
+    from rsltrace.job.parts.fault import FaultSpec
     from rsltrace.job.parts.guard import GuardSpec, SourceSpec, policy_of
     from rsltrace.job.parts.hooks import HooksSpec
     from rsltrace.job.parts.launch import LaunchSpec
+    from rsltrace.job.parts.metric import MetricSpec
     from rsltrace.job.parts.node import NodeSpec
     from rsltrace.job.parts.record import RecordSpec
     from rsltrace.job.parts.stop import StopSpec, TopicStop
@@ -22,10 +24,12 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagSpec": "parts.bag",
     "CheckSpec": "parts.check",
+    "FaultSpec": "parts.fault",
     "GuardSpec": "parts.guard",
     "HooksSpec": "parts.hooks",
     "Job": "job",
     "LaunchSpec": "parts.launch",
+    "MetricSpec": "parts.metric",
     "NodeSpec": "parts.node",
     "QosSpec": "parts.bag",
     "RecordSpec": "parts.record",
@@ -42,10 +46,12 @@ _HOMES = {
 __all__ = [
     "BagSpec",
     "CheckSpec",
+    "FaultSpec",
     "GuardSpec",
     "HooksSpec",
     "Job",
     "LaunchSpec",
+    "MetricSpec",
     "NodeSpec",
     "QosSpec",
     "RecordSpec",

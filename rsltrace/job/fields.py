@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
@@ -14,9 +14,11 @@ from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.parts.clocks import ClockSpec, clocks_part
 from rsltrace.job.parts.delay import DelaysSpec
 from rsltrace.job.parts.distribution import files_of
+from rsltrace.job.parts.fault import FaultSpec
 from rsltrace.job.parts.guard import GuardSpec, guard_part
 from rsltrace.job.parts.hooks import HooksSpec
 from rsltrace.job.parts.launch import LaunchSpec
+from rsltrace.job.parts.metric import MetricSpec, check_metric_name
 from rsltrace.job.parts.node import NodeSpec
 from rsltrace.job.parts.part import Part
 from rsltrace.job.parts.record import RecordSpec
@@ -28,7 +30,17 @@ from rsltrace.job.parts.scheduling import (
     policy_part,
 )
 from rsltrace.job.parts.stop import StopSpec
-from rsltrace.job.values.checks import attach, check, given, items, one_of, parts, text, whole
+from rsltrace.job.values.checks import (
+    attach,
+    check,
+    given,
+    items,
+    named_parts,
+    one_of,
+    parts,
+    text,
+    whole,
+)
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Loc, Problem, describe
@@ -191,6 +203,18 @@ class JobFields(Part):
             {"advances": True},
         ],
     )
+    faults: Annotated[tuple[FaultSpec, ...], parts()] = Field(
+        default=(),
+        description="What goes wrong, and exactly when: nodes that crash, hang or restart, single "
+        "messages that are lost, late or come twice.",
+        examples=[
+            [
+                {"crash": "/planner", "at": "2s"},
+                {"restart": "/map", "topic": "/goal", "message": 3, "for": "500ms"},
+                {"drop": "/scan", "message": 12, "to": "/slam"},
+            ]
+        ],
+    )
     checks: Annotated[tuple[CheckSpec, ...], parts()] = Field(
         default=(),
         description="What has to be true of a run: `rsltrace record` says which checks fail, and "
@@ -201,6 +225,19 @@ class JobFields(Part):
                 {"eventually": "/stop", "after": "/scan: min(ranges) < 0.3", "within": "200ms"},
                 {"never": "log error"},
             ]
+        ],
+    )
+
+    metrics: Annotated[
+        dict[str, MetricSpec], named_parts("expression", check_metric_name, what="metrics")
+    ] = Field(
+        default_factory=dict,
+        description="Numbers that say how a run went, by name: `rsltrace record` shows them.",
+        examples=[
+            {
+                "distance": {"expression": 'last("/odom").pose.pose.position.x', "unit": "m"},
+                "stops": 'count("/stop")',
+            }
         ],
     )
 
@@ -243,7 +280,9 @@ class JobFields(Part):
             executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,
             execution: ExecutionSpec | dict[str, Any] | None = None,
             clocks: Sequence[ClockSpec | dict[str, Any]] | dict[str, Any] = (),
+            faults: Sequence[FaultSpec | dict[str, Any]] = (),
             checks: Sequence[CheckSpec | dict[str, Any]] = (),
+            metrics: Mapping[str, MetricSpec | dict[str, Any] | str] = ...,
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,

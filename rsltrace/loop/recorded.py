@@ -46,6 +46,8 @@ def event_text(kind: int, name: str, stamp_ns: int) -> str:
     """Describe an event for people; ``name`` is that of the entity."""
     if name == THE_RUN:
         name = _OF_THE_RUN.get(kind, name)
+    if kind == EventKind.FAULT:
+        name = f"a fault of {name}"
     goes_on = ", which goes on," if kind == EventKind.RESUME else ""
     return f"{name}{goes_on} at {format_seconds(stamp_ns)} s"
 

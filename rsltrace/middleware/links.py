@@ -14,6 +14,7 @@ from rsltrace.chance.network import NetworkPlan
 from rsltrace.loop.loop import ORDER_RELEASE, Release
 from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.faults import MessageFault, TopicFaults
 from rsltrace.middleware.qos.policies import INFINITE_NS, Qos, Reliability
 from rsltrace.middleware.qos.status import MESSAGE_LOST
 from rsltrace.middleware.qos.timing import RequestedLease, finite
@@ -94,13 +95,17 @@ class Link:
         offered: Qos,
         subscription: Subscription,
         channel: Channel | None,
+        faults: TopicFaults | None = None,
     ) -> None:
         self.subscription = subscription
+        self._faults = faults
         self._loop = dispatcher.loop
         self._dispatcher = dispatcher
         self._channel = channel
         self._held: deque[tuple[Message, list[int]]] = deque(maxlen=offered.keep)
         self._lost = 0
+        self._behind_ns = 0
+        """When the last message arrives that a fault makes late: later ones come after it."""
         self.last_ns = 0
         self._receiver = subscription.entity_id
         self._lifespan_ns = min(
@@ -116,9 +121,11 @@ class Link:
             for outage in channel.outages if channel is not None else ():
                 self._lease.cut_off(outage.from_ns, outage.to_ns)
         self.send: Send = self._send
-        if not self._timed and channel is None:
+        if self._timed or faults is not None:
+            return
+        if channel is None:
             self.send = direct_send(dispatcher, self)
-        elif not self._timed and channel is not None and channel.plain and channel.keep_order:
+        elif channel.plain and channel.keep_order:
             self.send = quick_send(dispatcher, self, channel.plain)
 
     def _send(
@@ -129,6 +136,12 @@ class Link:
         arrival_ns = now_ns + dispatcher.event.busy_ns
         message = (data, event, position, digest, stamp_ns, count)
         channel = self._channel
+        fault = None
+        if self._faults is not None:
+            fault = self._faults.for_node(self.subscription.node.fully_qualified_name)
+        if fault is not None:
+            self._suffer(fault, message, arrival_ns)
+            return
         if channel is not None:
             delay_ns = channel.transmit(arrival_ns)
             if delay_ns < 0:
@@ -148,7 +161,39 @@ class Link:
             for arrival_ns in arrivals_ns:
                 self._bring(message, arrival_ns)
             return
-        self._bring(message, arrival_ns)
+        self._bring(message, max(arrival_ns, self._behind_ns))
+
+    def _suffer(self, fault: MessageFault, message: Message, sent_ns: int) -> None:
+        """Send a message to which something happens that the job says.
+
+        The model of the link draws for it as for any other, so that those after it fare the same.
+        """
+        draw, channel = self._dispatcher.draw, self._channel
+        sent_ns += fault.late_ns
+        delay_ns = channel.transmit(sent_ns) if channel is not None else 0
+        if fault.is_lost or delay_ns < 0:
+            draw(self._receiver, _LOST[LOST_DROP if fault.is_lost else delay_ns])
+            self._lost += 1
+            return
+        arrivals_ns = [max(sent_ns + delay_ns, self._behind_ns)]
+        draw(self._receiver, encode_draw(Draw.DELAY, fault.late_ns + delay_ns))
+        if channel is not None and channel.duplicate_ns >= 0:
+            arrivals_ns.append(sent_ns + channel.duplicate_ns)
+        if fault.copy_ns >= 0:
+            arrivals_ns.append(arrivals_ns[-1] + fault.copy_ns)
+        now_ns = self._loop.now_ns
+        for copy_ns in arrivals_ns[1:]:
+            draw(self._receiver, encode_draw(Draw.DUPLICATE, copy_ns - now_ns))
+        if channel is None:
+            self._behind_ns = arrivals_ns[-1]
+        else:
+            channel.hold_back(arrivals_ns[-1])
+            self.last_ns = max(self.last_ns, *arrivals_ns)
+        if channel is not None and channel.held_until_ns >= 0:
+            self._hold(message, arrivals_ns, channel.held_until_ns)
+            return
+        for arrival_ns in arrivals_ns:
+            self._bring(message, arrival_ns)
 
     def _bring(self, message: Message, arrival_ns: int) -> None:
         loop = self._loop
@@ -241,7 +286,12 @@ class Network:
         self._responses: dict[tuple[int, int], Exchanges] = {}
 
     def link(
-        self, publisher: DomainEntity, topic: str, qos: Qos, subscription: Subscription
+        self,
+        publisher: DomainEntity,
+        topic: str,
+        qos: Qos,
+        subscription: Subscription,
+        faults: TopicFaults | None,
     ) -> Link:
         """Return the link of a publisher (of that QoS) to a subscription it is now matched with."""
         channel = self._plan.topic_channel(
@@ -250,7 +300,7 @@ class Network:
             self._end("subscription", topic, subscription),
             reliable=subscription.qos.reliability is Reliability.RELIABLE,
         )
-        return Link(self._dispatcher, qos, subscription, channel)
+        return Link(self._dispatcher, qos, subscription, channel, faults)
 
     def request(self, service: str, client: Receiver, server: Receiver, exchange: Any) -> None:
         """Bring a request to the server."""

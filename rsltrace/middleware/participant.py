@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Protocol
+from typing import Any, Protocol
 
 from rsltrace.middleware.entity import DomainEntity, callback_name
 from rsltrace.middleware.events.dispatcher import Dispatcher
@@ -35,6 +35,8 @@ class Participant(DomainEntity):
 
     kind = EntityKind.NODE
     process: object = None
+    held: list[Any] | None = None
+    """What would run of it, besides its callbacks, if it did not hang."""
     number = 1
 
     def __init__(self, dispatcher: Dispatcher, name: str, namespace: str, door: Door) -> None:

@@ -41,7 +41,8 @@ class Publisher(DomainEntity):
         self.links: list[Link] | None = None if transport.network is None else []
         self.events = EndpointEvents()
         self._offers = Offers.of(self.dispatcher.loop, self.qos, self.events)
-        if finite(self.qos.lifespan_ns):
+        self._faults = transport.faults.get(topic)
+        if finite(self.qos.lifespan_ns) or self._faults is not None:
             self.links = []
         self._count = 0
         self._channel: int | None = None
@@ -76,8 +77,13 @@ class Publisher(DomainEntity):
         event, count = loop.events, self._count
         loop.activity_ns = now_ns
         if self.links is not None:
+            faults = self._faults
+            if faults is not None:
+                faults.begin()
             for link in self.links:
                 link.send(data, event, position, digest, now_ns, count)
+            if faults is not None:
+                faults.end()
         else:
             delivery = (now_ns, 0, 0, None, data, event, position, digest, now_ns, count)
             ready = loop.ready
@@ -115,8 +121,8 @@ class Publisher(DomainEntity):
         """Make the link to a subscription, with the model that the job has for it."""
         network = self._transport.network
         if network is None:
-            return Link(self.dispatcher, self.qos, subscription, None)
-        return network.link(self, self.topic, self.qos, subscription)
+            return Link(self.dispatcher, self.qos, subscription, None, self._faults)
+        return network.link(self, self.topic, self.qos, subscription, self._faults)
 
     def disconnect(self, subscription: Subscription) -> None:
         """Send to this subscription no longer."""

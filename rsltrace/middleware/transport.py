@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.faults import TopicFaults
 from rsltrace.middleware.interface import MessageType
 from rsltrace.middleware.links import Network
 
@@ -14,11 +15,13 @@ Watcher = Callable[[Any, bytes], None]
 
 
 class Transport:
-    """How what is sent gets to others. ``network`` is None in a run without models of links."""
+    """How what is sent gets to others. ``network`` is None in a run without models of links;
+    ``faults`` are those of single messages, by topic."""
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self.dispatcher = dispatcher
         self.network: Network | None = None
+        self.faults: dict[str, TopicFaults] = {}
         self.watchers: dict[str, Watcher] = {}
         self._channels: dict[tuple[str, str], int] = {}
 

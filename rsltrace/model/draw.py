@@ -1,4 +1,5 @@
-"""What chance decided, as one number that a trace holds in place of an output's hash.
+"""What chance, or a fault of the job, decided, as one number that a trace holds in place of an
+output's hash.
 
 The upper 8 bits say what, the lower 56 how many nanoseconds. It is no hash: a reader gets the
 value back, so that a diff can name it.
@@ -25,15 +26,25 @@ class Draw(IntEnum):
     EXECUTION = 6
     CLOCK_AHEAD = 7
     CLOCK_BACK = 8
+    CRASH = 9
+    HANG = 10
+    RESTART = 11
+    GOES_ON = 12
 
 
 _WORDS = {
     Draw.DROP: "lost",
     Draw.BURST: "lost in a burst",
     Draw.OUTAGE: "lost in an outage",
+    Draw.CRASH: "crashes",
+    Draw.GOES_ON: "goes on",
 }
 
 
+_FAULTS = {
+    Draw.HANG: ("hangs", " for"),
+    Draw.RESTART: ("crashes and starts again", " after"),
+}
 _CLOCKS = {Draw.CLOCK_AHEAD: "ahead", Draw.CLOCK_BACK: "back"}
 
 
@@ -68,5 +79,8 @@ def draw_text(number: int) -> str:
         return _WORDS[draw]
     if draw in _CLOCKS:
         return f"clock set {format_duration(value_ns)} {_CLOCKS[draw]}"
+    if draw in _FAULTS:
+        word, more = _FAULTS[draw]
+        return word + (f"{more} {format_duration(value_ns)}" if value_ns else "")
     names = {Draw.DELAY: "delay", Draw.DUPLICATE: "second copy after", Draw.EXECUTION: "takes"}
     return f"{names[draw]} {format_duration(value_ns)}"

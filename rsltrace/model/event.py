@@ -33,6 +33,7 @@ class EventKind(IntEnum):
     ACTION = 12
     CLOCK_JUMP = 13
     OUTSIDE = 14
+    FAULT = 15
 
     @property
     def label(self) -> str:

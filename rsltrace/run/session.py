@@ -39,6 +39,7 @@ from rsltrace.run.plans.bags import (
 )
 from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
+from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
 from rsltrace.run.plans.guard import RunGuard, install_guard
 from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
@@ -70,6 +71,7 @@ from rsltrace.trace.writer import TraceWriter
 if TYPE_CHECKING:
     from rsltrace.chance.network import NetworkPlan
     from rsltrace.doors.rclpy.entry import Entry
+    from rsltrace.doors.rclpy.faults import NodeFaults
     from rsltrace.doors.rclpy.world import World
     from rsltrace.middleware.events.recorded_run import RecordedRun
 
@@ -162,6 +164,7 @@ class Session:
         self._late: LateLibraries
         self._processes: ProcessDoor
         self._numerics_known = True
+        self._faults: NodeFaults | None = None
 
     @property
     def has_begun(self) -> bool:
@@ -262,6 +265,7 @@ class Session:
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
+        arm_topics(job, world)
         world.domain.entities.census = Census() if has_rules(job) else None
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
@@ -370,6 +374,8 @@ class Session:
             self.world.domain.watch(self.job.stop.topic.name, watch)
         with self._failures(), self._engaged():
             self.world.plan(self._entries, self.start_ns)
+            if not self.whole_graph:
+                self._faults = arm_nodes(self.job, self.world, self.start_ns)
             stop_with(self.world, self._entries)
             self.world.stacks.programs.fed = bool(self._bags)
             later = [one for one in self._entries if one.start_after and not self.whole_graph]
@@ -423,10 +429,14 @@ class Session:
         if census is not None:
             rules += unused_rules(self.job, census, self._plan, lasted_ns)
             rules += unused_ros_parameters(self.job, census, parameters)
-        starts = missed_starts(self.job, self.world.starts.missed()) if lasted else ()
-        if lasted and isinstance(self.loop, OrderedLoop):
+        parameter_notes = unused_parameters(self.job, parameters)
+        if not lasted:
+            return (*rules, *parameter_notes)
+        starts = missed_starts(self.job, self.world.starts.missed())
+        faults = missed_faults(self.job, self.world, self._faults)
+        if isinstance(self.loop, OrderedLoop):
             rules += unmet_departures(self.job, self.loop.policy)
-        return (*rules, *unused_parameters(self.job, parameters), *starts)
+        return (*rules, *parameter_notes, *starts, *faults)
 
     def finish(self) -> RunResult:
         """Destroy the nodes, close the trace, and say how it went.
@@ -483,7 +493,8 @@ class Session:
 
     def _order_of_starts(self) -> dict[str, str]:
         """Return what a trace keeps of the order of its constructions where it is not the job's."""
-        if all(entry.start_after is None and entry.respawn is None for entry in self._entries):
+        in_order = all(one.start_after is None and one.respawn is None for one in self._entries)
+        if in_order and not any(fault.restart for fault in self.job.faults):
             return {}
         places = [str(self._entries.index(entry)) for entry in self.world.constructed]
         if self._bags:

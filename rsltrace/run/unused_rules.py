@@ -28,6 +28,7 @@ def has_rules(job: Job) -> bool:
     return bool(
         any(part is not None for part in parts)
         or job.clocks
+        or job.faults
         or has_remappings(job)
         or any(_record_globs(job))
     )
@@ -144,6 +145,13 @@ def _single(
     for index, executor in enumerate(job.executors or ()):
         for number, glob in enumerate(executor.nodes):
             yield ("executors", index, "nodes", number), glob, nodes, "node"
+    for index, fault in enumerate(job.faults):
+        what = (nodes, "node") if fault.of_node else (topics, "topic")
+        yield ("faults", index, fault.kind), fault.name, *what
+        if fault.topic is not None:
+            yield ("faults", index, "topic"), fault.topic, topics, "topic"
+        if fault.to is not None:
+            yield ("faults", index, "to"), fault.to, nodes, "node"
     for index, clock in enumerate(job.clocks):
         yield ("clocks", index, "node"), clock.node, nodes, "node"
     if job.stop.topic is not None:

@@ -19,6 +19,7 @@ SHORT_KINDS = {
     EventKind.ACTION: "action",
     EventKind.CLOCK_JUMP: "jump",
     EventKind.OUTSIDE: "driver",
+    EventKind.FAULT: "fault",
 }
 """Kinds of events in at most six letters, for narrow columns."""
 

@@ -41,6 +41,8 @@ def event_phrase(kind: EventKind, entity: EntityKey) -> str:
     if kind is EventKind.OUTSIDE:
         published = entity.kind == EntityKind.PUBLISHER.label
         return f"the message from outside on {name}" if published else "what outside did"
+    if kind is EventKind.FAULT:
+        return f"the fault of {name}"
     if kind is EventKind.SHUTDOWN:
         return f"the end of {name or 'the run'}"
     if kind is EventKind.CLOCK_JUMP:

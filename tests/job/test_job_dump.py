@@ -265,6 +265,8 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "execution": None,
         "clocks": [],
         "checks": [],
+        "faults": [],
+        "metrics": {},
         "hooks": {"before": None, "after": None},
         "progress": None,
         "guard": {

@@ -108,3 +108,24 @@ def test_entries_that_make_no_sense_are_refused(tmp_path: Path, entry: str, expe
     (tmp_path / "job.yaml").write_text(f"nodes:\n  - {entry}\n")
     with pytest.raises(JobError, match=expected):
         load_job(tmp_path / "job.yaml")
+
+
+def test_a_process_crashes_and_starts_again_where_the_job_says(
+    compiled: Compiled, tmp_path: Path
+) -> None:
+    def counted(fault: str) -> list[tuple[int, int]]:
+        entry = f"    arguments: ['100']\nfaults: [{fault}]"
+        result = _run(
+            tmp_path, compiled("counter.c"), entry, f"{len(list(tmp_path.iterdir()))}.mcap"
+        )
+        assert (result.error, result.exit_code) == (None, 0)
+        assert result.path is not None
+        return _counts(result.path)
+
+    crash = counted("{crash: /counter, at: 350ms}")
+    assert crash == [(100, 1), (200, 2), (300, 3)]
+    again = counted("{restart: /counter, at: 350ms, for: 50ms}")
+    assert again[:5] == [*crash, (500, 1), (600, 2)]
+    entry = "    arguments: ['100']\nfaults: [{hang: /counter, at: 350ms}]"
+    result = _run(tmp_path, compiled("counter.c"), entry, "hang.mcap")
+    assert "job.yaml:4:10: /counter cannot hang: it is in a process of its own" in str(result.error)

@@ -9,10 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rsltrace.campaign.bisect.expression import Expression
 from rsltrace.campaign.processes import Processes
-from rsltrace.errors import BisectError
+from rsltrace.errors import BisectError, ConditionError
 from rsltrace.terminal import tell
+from rsltrace.trace.expression import Expression
 from rsltrace.trace.reader import Trace
 
 Judge = Callable[[Path, Path], bool]
@@ -38,11 +38,17 @@ def check_of(text: str) -> Check:
     :raises JobError: there is no such function.
     """
     if not _TARGET.fullmatch(text.strip()):
-        expression = Expression(text)
+        try:
+            expression = Expression(text)
+        except ConditionError as error:
+            raise BisectError(f"--check: {error}") from None
 
         def judge(path: Path, folder: Path) -> bool:
             with Trace.open(path) as trace:
-                return expression.holds(trace)
+                try:
+                    return bool(expression.value(trace))
+                except ConditionError as error:
+                    raise BisectError(f"--check {text!r}: {error.message}") from None
 
         return Check(expression.text, judge)
     from rsltrace.run.plans.target import load_target

@@ -1,13 +1,15 @@
-"""What came of the checks of a job, for people and for programs."""
+"""What came of the checks and metrics of a job, for people and for programs."""
 
 from __future__ import annotations
 
 import shlex
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 from rsltrace.checks.evaluate import UNDECIDED, VIOLATED, CheckResult, evaluate_checks
 from rsltrace.checks.functions import load_function
+from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.checks.properties import Violation
 from rsltrace.job import Job
 from rsltrace.model.printable import printable
@@ -22,13 +24,15 @@ _WORDS = {UNDECIDED: "not decided before the end of the run"}
 
 
 class Checked:
-    """The checks of a job, held against the trace at ``path``, whose functions are called unless
-    ``functions`` is False."""
+    """The checks of a job, held against the trace at ``path``, and its metrics. Functions among
+    them are called unless ``functions`` is False."""
 
     def __init__(self, job: Job, path: Path, *, functions: bool = True) -> None:
         self._path = path
         with Trace.open(path) as trace, search_path(job):
-            self.results = evaluate_checks(trace, job, load_function if functions else None)
+            load = load_function if functions else None
+            self.results = evaluate_checks(trace, job, load)
+            self.metrics = evaluate_metrics(trace, job, load)
             self._places = {
                 one.event: _place(trace, one.event)
                 for result in self.results
@@ -42,8 +46,11 @@ class Checked:
         return [one for one in self.results if one.verdict == VIOLATED]
 
     def lines(self) -> list[str]:
-        """Return a line for each check, and under those that failed where they did."""
-        lines = []
+        """Return a line for each metric and check, and under checks that failed where they did."""
+        lines = [
+            printable(f"metric {one.name}: {one.text}{f' ({one.note})' if one.note else ''}")
+            for one in self.metrics
+        ]
         for one in self.results:
             note = f" ({one.note})" if one.note else ""
             lines.append(
@@ -78,6 +85,17 @@ class Checked:
             }
             for one in self.results
         ]
+
+    def numbers(self) -> dict[str, dict[str, Any]]:
+        """Return the metrics for a program, by name; JSON has no infinity."""
+        return {
+            one.name: {
+                "value": one.value if one.value is None or isfinite(one.value) else None,
+                "unit": one.unit,
+                "note": one.note or ("" if isfinite(one.value or 0.0) else str(one.value)),
+            }
+            for one in self.metrics
+        }
 
     def _where(self, found: Violation) -> str:
         at = "at the end" if found.event is None else f"event {found.event}"

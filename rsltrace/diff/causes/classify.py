@@ -273,6 +273,8 @@ def _one_sided(case: Case) -> Judgement:
         root_sentence = case.because() or f"only the bag of {has} has this message"
     elif one.kind is EventKind.OUTSIDE:
         root_sentence = f"whoever drove the simulation did this only in {has}"
+    elif one.kind is EventKind.FAULT:
+        root_sentence = case.because() or f"the job of {has} has this fault"
     else:
         root_sentence = f"nothing before it differs, and nothing in the trace made it run in {has}"
         if because := case.because():

@@ -21,9 +21,9 @@ from rsltrace.model.finding import Mode, Source
 from rsltrace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
-_NEVER = frozenset(("record", "checks", "livelock_limit", "stop", "vars"))
+_NEVER = frozenset(("record", "checks", "metrics", "livelock_limit", "stop", "vars"))
 _WHEN = frozenset(
-    ("timer_ties", "policy", "execution", "delay", "min_time_step", "executors", "bags")
+    ("timer_ties", "policy", "faults", "execution", "delay", "min_time_step", "executors", "bags")
 )
 """Keys that decide when something happens and whether it arrives, not what a callback does."""
 

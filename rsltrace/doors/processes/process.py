@@ -337,6 +337,12 @@ class Process:
             self.child.dismiss()
             self.vanish()
 
+    def crash(self) -> None:
+        """Be gone at once, as after SIGKILL, within the event under way."""
+        self._is_stopping = True
+        self.child.kill()
+        self._has_ended()
+
     def vanish(self) -> None:
         """Destroy all that it has made."""
         for waking in self._waking.values():

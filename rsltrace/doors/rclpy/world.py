@@ -243,6 +243,13 @@ class World:
         """Destroy ``node`` with the others at the end, although it is not run."""
         self.nodes.append(node)
 
+    def renew(self, program: Program) -> None:
+        """Let a main that has crashed be constructed once more, in a process of its own."""
+        programs = self.stacks.programs
+        new = Program(programs, program.entry)
+        programs.all[programs.all.index(program)] = new
+        self._terminals.hand_over(program, new)
+
     def jump(self, time_ns: int) -> None:
         """Move from construct time to the start of the run, telling clocks of the jump."""
         loop = self.domain.loop

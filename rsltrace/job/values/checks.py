@@ -85,13 +85,15 @@ def parts(shorthand: str | None = None, *, optional: bool = False) -> BeforeVali
     return check(entries, optional=optional, entry_shorthand=shorthand)
 
 
-def named_parts(shorthand: str, rule: Callable[[str], None]) -> BeforeValidator:
+def named_parts(
+    shorthand: str, rule: Callable[[str], None], *, what: str = "models"
+) -> BeforeValidator:
     """Prepare a mapping of names to parts for pydantic; a plain value stands for
     ``{shorthand: value}``."""
 
     def entries(values: object) -> object:
         if not isinstance(values, dict):
-            raise Problem(f"expected a mapping of names to models, got {describe(values)}")
+            raise Problem(f"expected a mapping of names to {what}, got {describe(values)}")
         check_names(values, rule)
         return {
             name: {shorthand: value} if is_plain(value) else value for name, value in values.items()

@@ -35,6 +35,11 @@ class Unit:
         """Which entry each construction of the trace was that of."""
         self._of_event: dict[int, int] = {}
         self.node = find_node(columns, node)
+        if (columns.events["kind"] == EventKind.FAULT).any():
+            raise ReplayError(
+                "in this run the job lets nodes crash, hang or start again (faults:), which is not "
+                "to be had for one node alone: replay the whole run (without --node)"
+            )
         made_by = self._entry_of_entity(self.node.id)
         hooks = int(job.hooks.before is not None)
         count = hooks + len(job.nodes) + int(job.hooks.after is not None)

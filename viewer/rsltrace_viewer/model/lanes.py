@@ -30,6 +30,7 @@ KIND_LETTERS = {
     EventKind.ACTION: "a",
     EventKind.CLOCK_JUMP: "J",
     EventKind.OUTSIDE: "O",
+    EventKind.FAULT: "F",
 }
 
 

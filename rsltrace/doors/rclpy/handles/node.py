@@ -13,11 +13,13 @@ from rsltrace.doors.rclpy.arguments import (
     RosArguments,
     UnknownArgumentsError,
 )
+from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.handles.context import ContextHandle
 from rsltrace.doors.rclpy.handles.destroyable import Destroyable
 from rsltrace.doors.rclpy.handles.node_state import NodeStates
 from rsltrace.doors.rclpy.stacks.construction import policy_of
 from rsltrace.doors.rclpy.stacks.mailbox import Mailbox
+from rsltrace.doors.rclpy.stacks.program import Program
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.middleware.entity import DomainEntity, callback_name
 from rsltrace.middleware.events.census import Asker
@@ -47,6 +49,7 @@ class NodeHandle(Destroyable, Participant):
     """
 
     destroy = Participant.destroy
+    process: Program
 
     def __init__(
         self,
@@ -108,6 +111,11 @@ class NodeHandle(Destroyable, Participant):
         said = [each.rosout() for each in [*self._outer, self.arguments]]
         if enable_rosout and next((s for s in reversed(said) if s is not None), True):
             logs.attach(self, rosout_qos)
+
+    @property
+    def entry(self) -> Entry | None:
+        """The job's entry that made it, if one did."""
+        return self._entry
 
     @property
     def entry_key(self) -> str:

@@ -97,6 +97,9 @@ class TaskRun:
 
     def dispatch(self) -> None:
         """Run the task's next stretch."""
+        if self.node is not None and self.node.held is not None:
+            self.node.held.append(self)
+            return
         if self.mailbox is not None and self.mailbox.keeps(self):
             return
         if self.task.done() or self.task.cancelled():

@@ -95,6 +95,11 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
     if failed:
         assert error is not None
         raise error
+    _has_ended(stacks, program)
+
+
+def _has_ended(stacks: Stacks, program: Program) -> None:
+    """Tell of the end of a process; with the last one the run may be over."""
     programs = stacks.programs
     assert program.entry is not None
     programs.tell("ended", program.entry.key)
@@ -104,6 +109,16 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
     )
     if alone and stacks.loop.stopped is None and all(other.ended for other in mains):
         stacks.loop.stop(Stop(_EVERY_MAIN_ENDED))
+
+
+def crash_program(stacks: Stacks, program: Program) -> None:
+    """Let a process be gone in the event under way; nothing of it runs any more (``Victims``)."""
+    for context in program.contexts:
+        context.end()
+    program.ended = True
+    at = format_seconds(stacks.loop.now_ns)
+    stacks.domain.outcome.notes.append(f"{program.name} crashed at {at} s, as the job says")
+    _has_ended(stacks, program)
 
 
 def _finish_process(stacks: Stacks, program: Program, error: BaseException | None) -> None:

@@ -110,6 +110,8 @@ class Program:
         self.spun = False
         """Whether an executor of this program has looked for work."""
         self.ended = False
+        self.held: list[Any] | None = None
+        """What would run of it if it did not hang; of one that has crashed nothing ever does."""
         self.exit_code = 0
         self._kept: tuple[Any, ...] | None = None
 

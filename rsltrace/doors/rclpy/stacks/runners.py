@@ -13,6 +13,7 @@ import os
 import traceback
 from _thread import get_ident
 from collections.abc import Callable
+from typing import Any
 
 from greenlet import getcurrent, greenlet
 
@@ -163,8 +164,17 @@ class Wait:
             self.woken = self.timed_out = True
             self._runners.domain.loop.ready.append(self)
 
+    @property
+    def held(self) -> list[Any] | None:
+        """Where it is kept if its process hangs or has crashed, else None."""
+        held = self.program.held
+        return held if held is not None or self.event[2] is None else self.event[2].held
+
     def dispatch(self) -> None:
         """Give the loop's runner up to the blocked call (called on the runner's stack)."""
+        if (held := self.held) is not None:
+            held.append(self)
+            return
         self._runners.waiting.append(getcurrent())
         self.stack.switch()
 

@@ -24,6 +24,7 @@ class Thread(Protocol):
     daemon: bool
     ended: bool
     program: Program
+    node: Any
     thread: Any
 
     def join(self, timeout: float | None) -> None:
@@ -113,8 +114,9 @@ class Stacks:
 
     def who_waits(self) -> list[str]:
         """Say of every suspended coroutine and blocked call what it waits for."""
-        suspended = self.coroutines.suspended
-        waits = [run.waits_for() for run in suspended if not run.task.cancelled()]
-        waits += [one.waits_for() for one in self.runners.blocked if not one.is_patient()]
+        suspended = [run for run in self.coroutines.suspended if not run.task.cancelled()]
+        blocked = [one for one in self.runners.blocked if one.held is None]  # does not hang
+        waits = [run.waits_for() for run in suspended if run.node is None or run.node.held is None]
+        waits += [one.waits_for() for one in blocked if not one.is_patient()]
         notes = self.domain.outcome.notes
         return waits + [f"(before: {note})" for note in notes] if waits else []

@@ -99,6 +99,12 @@ class SimThread:
         if self.ended or self.program.ended:
             self.end()
             return
+        held = self.program.held
+        if held is None and self.node is not None:
+            held = self.node.held
+        if held is not None:  # it begins when its process does not hang any more
+            held.append(self)
+            return
         stacks = self.stacks
         stacks.runners.waiting.append(getcurrent())
         self.stack = greenlet(self._run)

@@ -52,6 +52,11 @@ class Terminals:
                 self._all[program] = Terminal(self._stacks, program.entry.stdin, start_ns)
                 self._stacks.programs.on_enter = self._enter
 
+    def hand_over(self, program: Program, successor: Program) -> None:
+        """Let a main that is started again have the terminal of the one before."""
+        if program in self._all:
+            self._all[successor] = self._all[program]
+
     def stdin_of(self, program: Program) -> Any:
         """Return the ``sys.stdin`` of a main."""
         terminal = self._all.get(program)

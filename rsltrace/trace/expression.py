@@ -1,4 +1,4 @@
-"""What ``--check`` says of a finished run: a Python expression over its trace that can only look.
+"""What an expression says of a finished run: Python over its trace that can only look.
 
 It is read wholly before anything runs: the only calls are those of the functions below, the only
 attributes fields of messages.
@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rsltrace.errors import BisectError, did_you_mean
+from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.trace.reader import Trace
 
 _PLAIN: dict[str, Callable[..., Any]] = {
@@ -33,7 +33,7 @@ _VALUES: dict[str, Callable[[Trace], Any]] = {
     "exit_code": lambda trace: int(trace.result.get("exit_code") or 0),
     "stop_reason": lambda trace: trace.result.get("stop_reason", ""),
 }
-_OF_TOPICS = ("count", "first", "last", "messages")
+_OF_TOPICS = ("count", "first", "last", "messages", "times")
 _KNOWN = (
     *(ast.Constant, ast.Name, ast.Attribute, ast.Subscript, ast.Slice, ast.List, ast.Tuple),
     *(ast.Compare, ast.BoolOp, ast.BinOp, ast.UnaryOp, ast.IfExp, ast.Call),
@@ -45,7 +45,7 @@ _KNOWN = (
 class Expression:
     """A checked expression.
 
-    :raises BisectError: it is none, with the place in the text.
+    :raises ConditionError: it is none, with the place in the text.
     """
 
     def __init__(self, text: str) -> None:
@@ -55,7 +55,7 @@ class Expression:
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             message = getattr(error, "msg", None) or str(error)
             column = (getattr(error, "offset", None) or len(self.text) + 1) - 1
-            raise self._wrong(column, message) from None
+            raise ConditionError(message, self._first_line, column, column + 1) from None
         own = {
             node.target.id
             for node in ast.walk(tree)
@@ -65,27 +65,27 @@ class Expression:
         self._values = set()
         for node in ast.walk(tree.body):
             if not isinstance(node, _KNOWN):
-                raise self._at(node, f"{type(node).__name__} is not part of a check")
+                raise self._at(node, f"{type(node).__name__} has no place in an expression")
             if isinstance(node, ast.Attribute) and node.attr.startswith("_"):
                 raise self._at(node, f"{node.attr!r} is no field of a message")
             if isinstance(node, ast.Call):
                 self._check_call(node)
             if isinstance(node, ast.Name) and id(node) not in called and node.id not in own:
                 self._values.add(self._known_value(node))
-        self._code = compile(tree, "<check>", "eval")
+        self._code = compile(tree, "<expression>", "eval")
 
-    def holds(self, trace: Trace) -> bool:
-        """Return whether it holds for a trace.
+    def value(self, trace: Trace) -> Any:
+        """Return what it is worth for a trace.
 
-        :raises BisectError: it has no value there: no message on a topic, no such field, …
+        :raises ConditionError: it has no value there: no message on a topic, no such field, …
         """
         names: dict[str, Any] = {"__builtins__": {}, **_PLAIN, **_of_topics(trace)}
         names.update((name, _VALUES[name](trace)) for name in self._values)
         try:
-            return bool(eval(self._code, names))
+            return eval(self._code, names)
         except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
             what = str(error.args[0]) if error.args else type(error).__name__
-            raise BisectError(f"--check {self.text!r} has no value there: {what}") from None
+            raise ConditionError(f"it has no value there: {what}", self._first_line) from None
 
     def _known_value(self, node: ast.Name) -> str:
         if node.id in _VALUES:
@@ -105,12 +105,13 @@ class Expression:
         if name in _OF_TOPICS and not of_text:
             raise self._at(node, f'{name} takes a topic: {name}("/odom")')
 
-    def _at(self, node: ast.AST, what: str) -> BisectError:
-        return self._wrong(getattr(node, "col_offset", 0), what)
+    def _at(self, node: ast.AST, what: str) -> ConditionError:
+        column = getattr(node, "col_offset", 0)
+        return ConditionError(what, self._first_line, column, column + 1)
 
-    def _wrong(self, column: int, what: str) -> BisectError:
-        first = next(iter(self.text.splitlines()), "")
-        return BisectError(f"--check: {what}\n  {first}\n  {' ' * column}^")
+    @property
+    def _first_line(self) -> str:
+        return next(iter(self.text.splitlines()), "")
 
 
 def _of_topics(trace: Trace) -> dict[str, Callable[[str], Any]]:
@@ -134,6 +135,10 @@ def _of_topics(trace: Trace) -> dict[str, Callable[[str], Any]]:
             return message
         raise LookupError(f"there is no message on {topic}")
 
+    def times(topic: str) -> list[float]:
+        stamps = (stamp_ns for _, stamp_ns, *_ in trace.messages_of(channels(topic)))
+        return [(stamp_ns - trace.start_ns) / 1e9 for stamp_ns in stamps]
+
     def last(topic: str) -> Any:
         latest = None
         for channel, _, _, data in trace.messages_of(channels(topic)):
@@ -147,4 +152,5 @@ def _of_topics(trace: Trace) -> dict[str, Callable[[str], Any]]:
         "first": first,
         "last": last,
         "messages": lambda topic: list(messages(topic)),
+        "times": times,
     }

@@ -1,0 +1,179 @@
+"""``faults:`` of a job: what goes wrong in a run, and exactly when."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, ClassVar
+
+from pydantic import Field, model_validator
+
+from rsltrace.job.parts.part import Part
+from rsltrace.job.values.checks import check, text, whole
+from rsltrace.job.values.names import check_node_glob, check_topic
+from rsltrace.job.values.problem import Problem
+from rsltrace.job.values.times import TimeLike, parse_time
+
+FullName = Annotated[str | None, check(text(check_topic), optional=True)]
+
+
+class FaultSpec(Part):
+    """One thing that goes wrong. Exactly one of ``crash``, ``hang`` and ``restart`` (a node, and
+    when: ``at``, ``event``, or ``message`` of a ``topic``) or of ``drop``, ``duplicate`` and
+    ``delay`` (a topic, and which ``message``)."""
+
+    TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "for": "for_ns", "by": "by_ns"}
+    OF_NODES: ClassVar[tuple[str, ...]] = ("crash", "hang", "restart")
+    OF_MESSAGES: ClassVar[tuple[str, ...]] = ("drop", "duplicate", "delay")
+    ONE_OF: ClassVar[tuple[str, ...]] = OF_NODES + OF_MESSAGES
+
+    crash: FullName = Field(
+        default=None,
+        description="Node that is gone at once, with the process it is in (all that its entry of "
+        "`nodes` has made): no `finally` block and no exit handler runs.",
+        examples=["/planner"],
+    )
+    hang: FullName = Field(
+        default=None,
+        description="Node that does nothing any more, with the process it is in, for some time "
+        "(`for`) or up to the end. What arrives meanwhile waits in its queues.",
+        examples=["/planner"],
+    )
+    restart: FullName = Field(
+        default=None,
+        description="Node that crashes and is made anew at once, or some time (`for`) later.",
+        examples=["/planner"],
+    )
+    drop: FullName = Field(
+        default=None,
+        description="Topic of which one message is lost, reliable or not.",
+        examples=["/scan"],
+    )
+    duplicate: FullName = Field(
+        default=None,
+        description="Topic of which one message arrives twice, `by` some time apart.",
+        examples=["/scan"],
+    )
+    delay: FullName = Field(
+        default=None,
+        description="Topic of which one message is late `by` some time; those that follow from its "
+        "publisher wait for it, as in DDS, unless the link's model says `keep_order: false`.",
+        examples=["/scan"],
+    )
+    at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="at",
+        description="When it happens to a node, since the start of the run.",
+        examples=["2s"],
+    )
+    event: Annotated[int | None, check(whole(0), optional=True)] = Field(
+        default=None,
+        description="The event after which it happens to a node: its number in the trace, from 0.",
+        examples=[1280],
+    )
+    topic: FullName = Field(
+        default=None,
+        description="The topic after whose `message` it happens to a node.",
+        examples=["/goal"],
+    )
+    message: Annotated[int | None, check(whole(1), optional=True)] = Field(
+        default=None,
+        description="Which message of the topic, from 1, in the order of publication, whoever has "
+        "published it.",
+        examples=[3],
+    )
+    for_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="for",
+        description="How long a node hangs (without it: up to the end), or is gone before it "
+        "starts again (without it: no time).",
+        examples=["500ms"],
+    )
+    by_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="by",
+        description="How late a message is, or its second copy (without it: right after the "
+        "first).",
+        examples=["200ms"],
+    )
+    to: Annotated[str | None, check(text(check_node_glob), optional=True)] = Field(
+        default=None,
+        description="The receivers that it happens to, a glob; the others get the message as it "
+        "is. Without it, all of them.",
+        examples=["/slam"],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            crash: str | None = None,
+            hang: str | None = None,
+            restart: str | None = None,
+            drop: str | None = None,
+            duplicate: str | None = None,
+            delay: str | None = None,
+            at: TimeLike | None = None,
+            at_ns: int | None = None,
+            event: int | None = None,
+            topic: str | None = None,
+            message: int | None = None,
+            for_ns: int | None = None,
+            by: TimeLike | None = None,
+            by_ns: int | None = None,
+            to: str | None = None,
+        ) -> None: ...
+
+    @property
+    def kind(self) -> str:
+        """The one of ``ONE_OF`` that is given."""
+        return next(kind for kind in self.ONE_OF if getattr(self, kind) is not None)
+
+    @property
+    def name(self) -> str:
+        """The node or topic that it is about."""
+        return str(getattr(self, self.kind))
+
+    @property
+    def of_node(self) -> bool:
+        """Whether it is about a node."""
+        return self.kind in self.OF_NODES
+
+    @model_validator(mode="after")
+    def _says_one_thing(self) -> FaultSpec:
+        given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
+        if len(given) != 1:
+            what = f"{' and '.join(given)} are given" if given else "none is given"
+            raise Problem(f"give one of {', '.join(self.ONE_OF)}: {what}")
+        for key, field, kinds in (
+            ("at", self.at_ns, self.OF_NODES),
+            ("event", self.event, self.OF_NODES),
+            ("topic", self.topic, self.OF_NODES),
+            ("for", self.for_ns, ("hang", "restart")),
+            ("by", self.by_ns, ("duplicate", "delay")),
+            ("to", self.to, self.OF_MESSAGES),
+        ):
+            if field is not None and self.kind not in kinds:
+                raise Problem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
+        self._says_when()
+        if self.hang is not None and self.for_ns == 0:
+            raise Problem("must be more than 0; without it the node hangs up to the end", ("for",))
+        if self.delay is not None and not self.by_ns:
+            raise Problem("how late is the message? Give by: 200ms", ("delay",))
+        return self
+
+    def _says_when(self) -> None:
+        if not self.of_node:
+            if self.message is None:
+                raise Problem(f"which message of {self.name}? Give message: 3", (self.kind,))
+            return
+        given = [key for key in ("at_ns", "event", "topic") if getattr(self, key) is not None]
+        if len(given) > 1:
+            names = " and ".join(key.removesuffix("_ns") for key in given)
+            raise Problem(f"{names} are given: say only once when it happens", (self.kind,))
+        if (self.topic is None) != (self.message is None):
+            missing = "message: 3" if self.message is None else "topic: /goal"
+            raise Problem(f"topic and message go together: give {missing}", (self.kind,))
+        if not given:
+            raise Problem(
+                "when? Give at: 2s, event: 1280, or topic: /goal with message: 3", (self.kind,)
+            )

@@ -1,0 +1,75 @@
+"""From a job's ``faults:`` to what goes wrong in a world: messages by topic, and nodes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from rsltrace.job import Job, locate
+from rsltrace.job.parts.fault import FaultSpec
+from rsltrace.middleware.faults import MessageFault, TopicFaults
+
+if TYPE_CHECKING:
+    from rsltrace.doors.rclpy.faults import NodeFaults
+    from rsltrace.doors.rclpy.world import World
+
+
+def arm_topics(job: Job, world: World) -> None:
+    """Let single messages go wrong. Before the first node is made."""
+    by_topic: dict[str, list[MessageFault]] = {}
+    for spec in job.faults:
+        if not spec.of_node:
+            by_topic.setdefault(spec.name, []).append(_message_fault(spec))
+    for topic, faults in by_topic.items():
+        world.domain.transport.faults[topic] = TopicFaults(faults)
+
+
+def arm_nodes(job: Job, world: World, start_ns: int) -> NodeFaults | None:
+    """Let nodes crash, hang or start again; None if the job has nothing of the kind. Before the
+    first one is made."""
+    if not any(spec.of_node for spec in job.faults):
+        return None
+    from rsltrace.doors.rclpy.faults import NodeFault, NodeFaults
+
+    faults = [
+        NodeFault(
+            spec.kind,
+            spec.name,
+            locate(job, ("faults", index)),
+            spec.at_ns,
+            spec.event,
+            spec.topic or "",
+            spec.message or 0,
+            spec.for_ns,
+        )
+        for index, spec in enumerate(job.faults)
+        if spec.of_node
+    ]
+    return NodeFaults(world, faults, start_ns)
+
+
+def missed_faults(job: Job, world: World, nodes: NodeFaults | None) -> Iterator[str]:
+    """Yield the faults that have not come to pass in a run that is over."""
+    for index, spec in enumerate(job.faults):
+        if not spec.of_node:
+            faults = world.domain.transport.faults[spec.name]
+            assert spec.message is not None
+            if faults.reached < spec.message:
+                times = "message" if faults.reached == 1 else "messages"
+                yield (
+                    f"{locate(job, ('faults', index))}: this fault did not happen: there were "
+                    f"{faults.reached} {times} on {spec.name}"
+                )
+    for where, why in nodes.missed() if nodes is not None else ():
+        yield f"{where}: this fault did not happen: {why}"
+
+
+def _message_fault(spec: FaultSpec) -> MessageFault:
+    assert spec.message is not None
+    return MessageFault(
+        spec.message,
+        spec.to or "*",
+        is_lost=spec.drop is not None,
+        late_ns=(spec.by_ns or 0) if spec.delay is not None else 0,
+        copy_ns=(spec.by_ns or 0) if spec.duplicate is not None else -1,
+    )
