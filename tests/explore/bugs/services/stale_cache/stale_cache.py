@@ -30,7 +30,7 @@ class Writer(Node):
     def __init__(self):
         super().__init__("writer")
         self.publisher = self.create_publisher(Int32, "write", 10)
-        self.timer = self.create_timer(0.2, self.write)
+        self.timer = self.create_timer(0.15, self.write)
 
     def write(self):
         self.timer.cancel()

@@ -38,7 +38,7 @@ class Pool(Node):
 
     def work(self):
         done = self.done
-        time.sleep(random.uniform(0.01, 0.055))  # the work
+        time.sleep(random.uniform(0.01, 0.0505))  # the work
         self.done = done + 1
         self.publisher.publish(Int32(data=self.done))
 
@@ -51,7 +51,7 @@ class LockedPool(Pool):
         self.lock = threading.Lock()
 
     def work(self):
-        time.sleep(random.uniform(0.01, 0.055))
+        time.sleep(random.uniform(0.01, 0.0505))
         with self.lock:
             self.done += 1
             self.publisher.publish(Int32(data=self.done))

@@ -23,7 +23,7 @@ class Camera(Node):
 class Stereo(Node):
     """Makes depth of images of one number."""
 
-    SIZE = 3
+    SIZE = 2
 
     def __init__(self):
         super().__init__("stereo")

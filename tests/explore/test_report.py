@@ -1,0 +1,182 @@
+"""What a search has found: causes, effects, a page, and formats for machines."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from rsltrace.explore.report.effects import FAILS, effects
+from rsltrace.explore.report.exploration import Exploration, Reduced, causes, repeat_command
+from rsltrace.explore.report.formats import github_text, json_values, junit_text
+from rsltrace.explore.report.page import page, write_page
+from rsltrace.explore.trial import CHECK, EXCEPTION, Failure, Trial, TrialResult
+
+LATE = Failure(CHECK, "it is <late> & wrong\x1b[2J", "never /late", 41)
+RAISED = Failure(EXCEPTION, "raised KeyError", "KeyError at nodes.py:12", 7)
+
+
+def explored(count: int = 300) -> Exploration:
+    """Make results in which the gain decides on the error, and the colour on nothing."""
+    draw = random.Random(5)
+    results = []
+    for number in range(count):
+        gain, colour = draw.uniform(0, 2), draw.choice(["red", "green"])
+        failure = LATE if gain > 1.5 else RAISED if number % 40 == 3 else None
+        overlay = {"seed": number, "set": {"nodes.0.parameters.gain": gain, "colour": colour}}
+        metrics = {"error": gain**2 + draw.gauss(0, 0.1), "noise": draw.random()}
+        trace = f"out/traces/{number:06d}.mcap" if failure else None
+        results.append(
+            TrialResult(
+                Trial(number, overlay, f"seed {number}"),
+                digest=f"{number % 50:016x}",
+                events=100 + number,
+                failure=failure,
+                metrics=metrics,
+                trace=trace,
+            )
+        )
+    return Exploration(
+        "robot/job.yaml",
+        results,
+        strategy="mixed",
+        coverage=["Every order of up to 2 departures was tried."],
+        wall_s=12.5,
+        units={"error": "m"},
+        reduced={LATE.key: Reduced("out/small", "/scan before /tf decides")},
+    )
+
+
+def test_failures_are_put_together_by_cause() -> None:
+    late, raised = causes(explored())
+    assert (late.key, raised.key) == (LATE.key, RAISED.key)
+    assert len(late.runs) + len(raised.runs) == len(explored().failed)
+    assert late.first.trial.number == min(one.trial.number for one in late.runs)
+    assert late.shortest.events == min(one.events for one in late.runs)
+    assert late.reduced is not None
+    assert raised.place == ("nodes.py", 12)
+    assert late.place is None
+
+
+def test_the_setting_that_matters_is_told_from_those_that_do_not() -> None:
+    found = effects(explored().results)
+    by_pair = {(one.setting, one.outcome): one for one in found}
+    gain = "nodes.0.parameters.gain"
+    assert by_pair[gain, "error"].is_sure
+    assert by_pair[gain, "error"].strength > 0.9
+    assert by_pair[gain, "error"].sign == 1
+    assert by_pair[gain, FAILS].is_sure
+    assert {pair for pair, one in by_pair.items() if one.is_sure} == {
+        (gain, "error"),
+        (gain, FAILS),
+    }
+    assert [one.p for one in found] == sorted(one.p for one in found)
+
+
+def test_a_setting_that_harms_in_the_middle_is_seen() -> None:
+    results = [
+        TrialResult(
+            Trial(number, {"set": {"mode": number % 3}}),
+            metrics={"x": float(number % 3 == 1) + number / 1000},
+        )
+        for number in range(60)
+    ]
+    (one,) = effects(results)
+    assert one.is_sure
+    assert one.strength > 0.5
+
+
+def test_nothing_is_said_of_what_does_not_vary() -> None:
+    same = [TrialResult(Trial(n, {"set": {"a": 1.0}}), metrics={"x": n}) for n in range(20)]
+    few = [TrialResult(Trial(n, {"set": {"a": n}}), metrics={"x": n}) for n in range(4)]
+    nan = [TrialResult(Trial(n, {"set": {"a": n}}), metrics={"x": float("nan")}) for n in range(20)]
+    for results in (same, few, nan, []):
+        assert effects(results) == []
+
+
+class _Balanced(HTMLParser):
+    """Sees that what is opened is closed, and keeps texts and classes."""
+
+    VOID = frozenset(("meta", "link", "br", "img"))
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.links: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.links += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+def test_the_page_needs_nothing_beside_it_and_nobodys_text_is_markup(tmp_path: Path) -> None:
+    write_page(explored(), tmp_path / "report.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+    seen = _Balanced()
+    text = (tmp_path / "report.html").read_text("utf-8")
+    seen.feed(text)
+    assert seen.open == []
+    assert seen.links == []
+    assert "script" not in seen.tags
+    assert seen.tags.count("svg") >= 3
+    assert "it is <late> & wrong\\x1b[2J" in seen.text
+    assert "/scan before /tf decides" in seen.text
+    assert "rsltrace record out/small/job.yaml" in seen.text
+    assert re.search(r"rsltrace view out/traces/\d+\.mcap --at 41", seen.text)
+    assert "Every order of up to 2 departures" in seen.text
+    assert "error [m]" in seen.text
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_page_of_next_to_nothing(count: int) -> None:
+    seen = _Balanced()
+    seen.feed(page(Exploration("job.yaml", explored(count).results)).decode())
+    assert seen.open == []
+    assert f"None of the {count} runs failed" in seen.text
+
+
+def test_a_large_search_makes_no_large_page() -> None:
+    assert len(page(explored(20_000))) < 3_000_000
+
+
+def test_formats_for_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    values = json.loads(json.dumps(json_values(explored())))
+    assert values["runs"] == 300
+    assert sum(cause["runs"] for cause in values["causes"]) == values["failed"]
+    assert values["causes"][0]["decides"] == "/scan before /tf decides"
+    suite = ElementTree.fromstring(junit_text(explored()))
+    assert suite.attrib["failures"] == suite.attrib["tests"] == "2"
+    assert [one.attrib["type"] for one in suite.iter("failure")] == [CHECK, EXCEPTION]
+    late, raised = github_text(explored()).splitlines()
+    assert late.startswith("::error file=robot/job.yaml,title=check%3A never /late::")
+    assert "%0A" in late
+    assert raised.startswith("::error file=robot/nodes.py,line=12,title=")
+    kept = Exploration("job.yaml", [TrialResult(Trial(0, {}))])
+    assert ElementTree.fromstring(junit_text(kept)).attrib["failures"] == "0"
+    assert github_text(kept) == "::notice file=job.yaml::1 runs, none failed"
+
+
+def test_a_command_that_nobody_can_read_is_not_shown() -> None:
+    one = TrialResult(Trial(1, {"seed": 4, "policy": {"departures": [{"choice": 2, "run": 1}]}}))
+    found = Exploration("my job.yaml", [one])
+    shown = repeat_command(found, one)
+    assert shown is not None
+    assert shown.startswith("rsltrace record 'my job.yaml' --seed 4 --set 'policy=")
+    many = [{"choice": number, "run": 1} for number in range(100)]
+    assert repeat_command(found, TrialResult(Trial(1, {"policy": {"departures": many}}))) is None
