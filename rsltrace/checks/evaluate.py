@@ -13,7 +13,7 @@ from rsltrace.checks.trace_events import TraceEvent, events_of
 from rsltrace.debug.conditions.condition import Armed, Condition
 from rsltrace.debug.conditions.names import Names, names_of
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
-from rsltrace.job import Job, locate
+from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
 from rsltrace.job.values.target import Target, target_text
 from rsltrace.model.stamp import NS_PER_S, format_duration
@@ -21,6 +21,8 @@ from rsltrace.trace.reader import Trace
 
 PASSED, VIOLATED, UNDECIDED, SKIPPED = "passed", "violated", "undecided", "skipped"
 _NO_NAMES = Names()
+_SOME_NODE = "nodes=[{node: 'none:None'}]"
+"""A job has to have one; it is never made."""
 
 LoadFunction = Callable[[Target], Callable[[Trace], object]]
 """Returns the function that a check names."""
@@ -71,8 +73,30 @@ def wrong_checks(job: Job, names: Names) -> Iterator[str]:
             yield str(error)
 
 
+def job_of_checks(trace: Trace) -> Job:
+    """Return the job of a trace, its checks and metrics only: the files of it may be elsewhere.
+
+    :raises JobError: a check cannot be read.
+    """
+    name = f"the job of {trace.name}"
+    text = trace.job_text or "{}"
+    only = ("checks", "metrics", "nodes")
+    return job_from_text(text, name, ".", overrides=[_SOME_NODE], only=only)
+
+
 def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) -> list[CheckResult]:
-    """Hold the checks of ``job`` against a trace, in their order.
+    """Hold the checks of ``job`` against a trace, in their order; see ``evaluating``."""
+    for results in evaluating(trace, job, load):
+        if results:
+            return results
+    return []
+
+
+def evaluating(
+    trace: Trace, job: Job, load: LoadFunction | None = None
+) -> Iterator[list[CheckResult]]:
+    """Hold the checks of ``job`` against a trace, event by event: yield nothing (an empty list)
+    after each, and in the end what came of the checks, in their order.
 
     ``load`` gives the functions they name; without it, these are skipped.
 
@@ -94,9 +118,10 @@ def evaluate_checks(trace: Trace, job: Job, load: LoadFunction | None = None) ->
                 break  # what follows the end
             for one in properties:
                 _see(one, event)
+            yield []
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
-    return [
+    yield [
         _result(spec, one) if one is not None else _of_function(trace, spec, load)
         for spec, one in zip(job.checks, held, strict=True)
     ]

@@ -123,15 +123,16 @@ def check(
 
 def _check_trace(path: Path, other: Path | None, form: str) -> int:
     """Hold checks against a trace; the code that its own job names is not run."""
+    from rsltrace.checks.evaluate import job_of_checks
     from rsltrace.cli.output.checks import Checked
-    from rsltrace.job import job_from_text, load_job
+    from rsltrace.job import load_job
     from rsltrace.trace.reader import Trace
 
     if other is not None:
         job = load_job(other)
     else:
         with Trace.open(path) as trace:
-            job = job_from_text(trace.job_text, f"the job of {path}", Path.cwd())
+            job = job_of_checks(trace)
     if not (job.checks or job.metrics):
         named = other if other is not None else f"the job of {path}"
         none = f"{named} has neither checks (checks:) nor metrics"

@@ -273,10 +273,11 @@ def few(trace):
 @pytest.mark.ros
 def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "src").mkdir()
     (tmp_path / "talkers.py").write_text(NODES)
     job = tmp_path / "job.yaml"
     job.write_text(
-        "nodes: [{node: talkers:Talker}]\nstop: {duration: 1s}\n"
+        "nodes: [{node: talkers:Talker}]\nstop: {duration: 1s}\nsearch_path: [., src]\n"
         "checks:\n  - always: /x.data < 8\n  - {name: few, function: talkers:few}\n"
     )
     done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "run.mcap", "--no-pin"])
@@ -294,6 +295,10 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert done.exit_code == 1
     found = json.loads(done.stdout)
     assert [one["verdict"] for one in found] == ["violated", "skipped"]
+    monkeypatch.chdir("/")  # where nothing is that the job names
+    elsewhere = CliRunner().invoke(cli, ["check", str(tmp_path / "run.mcap"), "--format", "json"])
+    assert (elsewhere.exit_code, json.loads(elsewhere.stdout)) == (1, found), elsewhere.output
+    monkeypatch.chdir(tmp_path)
     job.write_text(job.read_text().replace("< 8", "< 80").replace("talkers:few", "talkers:Talker"))
     job.write_text(job.read_text().split("  - {name")[0])
     assert CliRunner().invoke(cli, ["check", "run.mcap", "--job", "job.yaml"]).exit_code == 0
@@ -304,8 +309,8 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     job.write_text(job.read_text() + rest)
     done = CliRunner().invoke(cli, ["check", "job.yaml"])
     assert done.exit_code == 1, done.output
-    assert "job.yaml:5:17: eventually: the message has no field 'dta'; did you mean" in done.stdout
-    assert "job.yaml:7:12: no topic is called '/y'; there are /x" in done.stdout
+    assert "job.yaml:6:17: eventually: the message has no field 'dta'; did you mean" in done.stdout
+    assert "job.yaml:8:12: no topic is called '/y'; there are /x" in done.stdout
     assert done.stdout.count("job.yaml:") == 2
 
     (tmp_path / "talkers.py").write_text(NODES.replace("self.count = 0", "self.count = None"))
@@ -316,5 +321,5 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     job.write_text(job.read_text().replace("/x.data < 80", "/x.data <"))
     done = CliRunner().invoke(cli, ["record", "job.yaml", "-o", "other.mcap", "--no-pin"])
     assert done.exit_code == 2
-    assert "job.yaml:4" in done.stderr
+    assert "job.yaml:5" in done.stderr
     assert not (tmp_path / "other.mcap").exists(), "it is said before anything runs"

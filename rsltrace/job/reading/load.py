@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import codecs
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
@@ -46,18 +46,32 @@ def load_job(path: str | os.PathLike[str], *, overrides: Overrides = ()) -> Job:
 
 
 def job_from_text(
-    text: str, name: str, folder: str | os.PathLike[str], *, overrides: Overrides = ()
+    text: str,
+    name: str,
+    folder: str | os.PathLike[str],
+    *,
+    overrides: Overrides = (),
+    only: Collection[str] = (),
 ) -> Job:
-    """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``."""
+    """Do ``load_job`` with the text of a job instead of a file; its paths start at ``folder``.
+
+    With ``only``, other keys than these are passed over: what they name need not be here.
+    """
     base_dir = os.path.abspath(folder)
 
     def read(other: str) -> YamlSource:
         return parse_yaml(text, name, folder=base_dir) if other == name else _parse(other)
 
-    return _load(name, base_dir, read, overrides)
+    return _load(name, base_dir, read, overrides, only)
 
 
-def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides: Overrides) -> Job:
+def _load(
+    name: str,
+    base_dir: str,
+    read: Callable[[str], YamlSource],
+    overrides: Overrides,
+    only: Collection[str] = (),
+) -> Job:
     labelled = [("--set", text) if isinstance(text, str) else text for text in overrides]
     composed = compose(name, read, labelled)
     given = plain(composed.root, base_dir)
@@ -68,6 +82,8 @@ def _load(name: str, base_dir: str, read: Callable[[str], YamlSource], overrides
     problems = _composition_problems({key: given[key] for key in given if key in composing})
     values: dict[str, object] = {}
     for key, value in given.items():
+        if only and key not in only:
+            continue
         if key in job_keys:
             values[key] = value
         elif key not in composing and not str(key).startswith(FREE_PREFIX):
