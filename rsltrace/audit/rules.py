@@ -107,6 +107,9 @@ _PID = Rule(
     "a parameter of the node",
     source=Source.PID,
 )
+_PROCESSORS = Rule(
+    "environment", _V, "is 4, on every machine", "a parameter of the node, or a number of your own"
+)
 _FILE_TIME = Rule(
     "file", _D, "a finding of the run", "what is in the file instead of its age", source=Source.FILE
 )
@@ -307,16 +310,16 @@ RULES: dict[str, Rule] = {
     **_named(
         _ENVIRONMENT,
         "os",
-        "getenv getenvb getppid uname cpu_count process_cpu_count getcwd getlogin "
-        "getloadavg sched_getaffinity",
+        "getenv getenvb getppid uname getcwd getlogin getloadavg",
     ),
+    **_named(_PROCESSORS, "os", "cpu_count process_cpu_count sched_getaffinity"),
     **_named(_PID, "os", "getpid"),
     **_named(_ENVIRONMENT, "os.path", "expanduser expandvars"),
     **_named(_ENVIRONMENT, "pathlib.Path", "cwd home"),
     **_named(_ENVIRONMENT, "platform", "node uname platform machine processor release version"),
     **_named(_ENVIRONMENT, "socket", "gethostname getfqdn"),
     **_named(_ENVIRONMENT, "getpass", "getuser"),
-    **_named(_ENVIRONMENT, "multiprocessing", "cpu_count"),
+    **_named(_PROCESSORS, "multiprocessing", "cpu_count"),
     **_named(
         _ENVIRONMENT,
         "psutil",

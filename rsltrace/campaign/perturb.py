@@ -15,7 +15,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -56,12 +56,23 @@ _RESULT_MAX = 1 << 20
 # What a process does to its heap before anything else, so that fresh memory is never zero and
 # addresses are others.
 _NOISE = """
-import random as r, runpy, sys
+import sys
+del sys.path[0]
+import random as r, runpy
 g = r.Random(int(sys.argv.pop(1)))
 n = [bytes([g.randrange(1, 256)]) * g.randrange(8, 5000) for _ in range(g.randrange(500, 4000))]
 o = [object() for _ in range(g.randrange(20000))]
 del n[::2], o[::3], g, r
 sys.argv = ['rsltrace'] + sys.argv[1:]
+runpy.run_module('rsltrace', run_name='__main__')
+"""
+
+# Starts without the present folder among those that Python looks for modules in.
+_PLAIN = """
+import sys
+del sys.path[0]
+import runpy
+sys.argv[0] = 'rsltrace'
 runpy.run_module('rsltrace', run_name='__main__')
 """
 
@@ -192,10 +203,11 @@ def run_in(
 ) -> Done:
     """Run ``rsltrace`` in a process with these surroundings. Paths in ``words`` are absolute."""
     values = around.values
-    cwd = folder / f"{_name(around)}.cwd" / values.get(FOLDER, ".")
-    cwd.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable]
-    command += ["-c", _NOISE, values[HEAP]] if HEAP in values else ["-m", "rsltrace"]
+    cwd = _working_folder(folder / f"{_name(around)}.cwd", values.get(FOLDER))
+    home = folder / f"{_name(around)}.home"
+    home.mkdir(exist_ok=True)
+    command = [sys.executable, "-c"]
+    command += [_NOISE, values[HEAP]] if HEAP in values else [_PLAIN]
     command += words
     if "nice" in values.get(LOAD, "") and shutil.which("nice"):
         command = ["nice", "-n", "5", *command]
@@ -204,7 +216,24 @@ def run_in(
     started = processes or Processes()
     load = started.beside([sys.executable, "-c", _BUSY]) if LOAD in values else nullcontext()
     with load:
-        return started.run(command, cwd=cwd, env=_environment(values, cwd), timeout_s=timeout_s)
+        return started.run(command, cwd=cwd, env=_environment(values, home), timeout_s=timeout_s)
+
+
+def _working_folder(place: Path, name: str | None) -> Path:
+    """Make a folder in which relative paths lead where they lead in the present one.
+
+    It is in ``place``. What lies in the present folder and in the one above is there as links;
+    files that a run makes beside them are its own.
+    """
+    here = Path.cwd()
+    cwd = place / (name or here.name or "here")
+    cwd.mkdir(parents=True, exist_ok=True)
+    for folder, mirror in ((here, cwd), (here.parent, place)):
+        with suppress(PermissionError):
+            for entry in folder.iterdir():
+                with suppress(FileExistsError):
+                    (mirror / entry.name).symlink_to(entry)
+    return cwd
 
 
 def _name(around: Surroundings) -> str:
@@ -248,11 +277,11 @@ def _result_in(output: str) -> dict[str, Any]:
     return {}
 
 
-def _environment(values: Mapping[str, str], cwd: Path) -> dict[str, str]:
+def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
     env = dict(os.environ)
     env["PYTHONHASHSEED"] = values.get(HASH_SEED, "0")
     if FOLDER in values:
-        env["HOME"] = str(cwd)
+        env["HOME"] = str(home)
     if LOCALE in values:
         env.update(LC_ALL=values[LOCALE], LANG=values[LOCALE])
     if TIME_ZONE in values:

@@ -15,6 +15,7 @@ from rsltrace.guard.virtual.directory_listings import sorted_listings
 from rsltrace.guard.virtual.module_caches import fresh_module_caches
 from rsltrace.guard.virtual.object_texts import numbered_texts
 from rsltrace.guard.virtual.own_process_id import own_process_ids
+from rsltrace.guard.virtual.processors import same_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
 from rsltrace.guard.watched.functions import watched_calls
 
@@ -26,6 +27,7 @@ _REPLACEMENTS = (
     numbered_texts,
     own_process_ids,
     watched_calls,
+    same_processors,
     recorded_files,
     recorded_descriptors,
     recorded_sockets,

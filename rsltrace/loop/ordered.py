@@ -72,6 +72,14 @@ class _Waiting:
         item: Dispatchable = self.places.pop(0).candidate.item
         return item
 
+    def pop(self) -> Dispatchable:
+        item: Dispatchable = self.places.pop().candidate.item
+        return item
+
+    def __getitem__(self, index: int) -> Dispatchable:
+        item: Dispatchable = self.places[index].candidate.item
+        return item
+
     def runnable(self) -> Iterator[Place]:
         return filter(self._runs, self.places)
 

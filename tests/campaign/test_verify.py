@@ -34,14 +34,22 @@ def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None
     assert list(surroundings(1).only(KINDS[0]).values) == [KINDS[0]]
 
 
-def test_one_digest_is_stated_as_what_was_tried(rsltrace: Command, job: WriteJob) -> None:
+def test_one_digest_is_stated_as_what_was_tried(
+    rsltrace: Command, job: WriteJob, tmp_path: Path
+) -> None:
     kinds = surroundings(1).values
     asks = ORDER_OF_A_SET + ", print('Input {x}: ', end='')"  # where the result is printed, too
+    # Relative paths lead to what they lead to in ``record``; what a run writes stays its own.
+    (tmp_path / "gains").mkdir()
+    (tmp_path / "gains" / "p.txt").write_text("7")
+    asks += f", [log(open(f).read()) for f in ('gains/p.txt', '../{tmp_path.name}/gains/p.txt')]"
+    asks += ", open('new.txt', 'x').close() if not os.path.exists('new.txt') else None"
     done = rsltrace("verify", job(asks, AS_IT_IS), "--runs", "3", "--jobs", "2")
     assert done.returncode == 0, done.stderr
     first, second = done.stdout.splitlines()
     assert first.startswith(f"3 runs, {len(kinds)} perturbations, one digest ")
     assert "hash seed" in second
+    assert not (tmp_path / "new.txt").exists()
 
 
 @pytest.mark.parametrize("before", ["", "Input x: ", '{"digest": 1\n{"', "many\nlines {}\n"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import errno
 import os
 import random
 import sys
@@ -427,3 +428,33 @@ def test_who_calls_is_known_after_a_handler_has_raised_while_it_was_asked() -> N
         frames._next_frame.__self__.throw(KeyboardInterrupt)  # type: ignore[attr-defined]
     assert asked() is here
     assert asked() is here
+
+
+PROCESSORS = """
+chosen = os.sched_getaffinity(0)
+os.sched_setaffinity(0, {{3, 7}})
+with ThreadPoolExecutor() as pool:
+    workers = pool._max_workers
+try:
+    os.sched_setaffinity(0, [9])
+except OSError as error:
+    refused = error.errno
+self.say(
+    os.cpu_count(), sorted(chosen), sorted(os.sched_getaffinity(os.getpid())), refused,
+    multiprocessing.cpu_count(), os.sysconf("SC_NPROCESSORS_ONLN"), workers,
+    os.sysconf("SC_PAGE_SIZE") == {page},
+)
+"""
+
+
+def test_every_machine_has_as_many_processors(said: Said) -> None:
+    before = os.sched_getaffinity(0)
+    imports = "import multiprocessing, os\nfrom concurrent.futures import ThreadPoolExecutor"
+    code = node_code(PROCESSORS.format(page=os.sysconf("SC_PAGE_SIZE")), imports=imports)
+    first, second = said(code)
+    assert first == [4, [0, 1, 2, 3], [3], errno.EINVAL, 4, 4, min(32, 4 + 4), True]
+    assert second[1] == [3], "as it was set"
+    assert os.sched_getaffinity(0) == before
+    real = node_code("self.say(os.cpu_count(), len(os.sched_getaffinity(0)))", imports="import os")
+    job = "nodes: [{node: 'm:N'}]\nguard: {environment: allow}"
+    assert said(real, job=job)[0] == [os.cpu_count(), len(before)]

@@ -20,8 +20,8 @@ _CALL = "os.getpid()"
 _LOGGING = "logging"
 _TAKE_IDS = (
     *("getpgid", "getsid", "getpriority", "setpriority", "pidfd_open"),
-    *("sched_getaffinity", "sched_setaffinity", "sched_getparam", "sched_setparam"),
-    *("sched_getscheduler", "sched_setscheduler", "sched_rr_get_interval"),
+    *("sched_getparam", "sched_setparam", "sched_getscheduler", "sched_setscheduler"),
+    "sched_rr_get_interval",
 )
 """Functions of ``os`` that are given the id of a process; ``os.kill`` is the door's."""
 

@@ -100,7 +100,7 @@ def _as_it_is(value: Any) -> Any:
 _RECORDED: dict[str, Callable[[Any], Any]] = {
     **dict.fromkeys(
         (
-            *("os.getppid", "os.cpu_count", "os.getcwd", "os.sysconf"),
+            *("os.getppid", "os.getcwd", "os.sysconf"),
             *("os.getlogin", "os.getloadavg", "thread.get_native_id", "gc.get_count"),
         ),
         _as_it_is,
@@ -140,7 +140,7 @@ def _watched_functions() -> Iterator[tuple[Source, str, Any]]:
     for name, function in builtin(os, "times"):
         yield Source.CLOCK, name, function
     machine = (
-        *("getppid", "uname", "cpu_count", "getcwd", "getlogin", "getloadavg"),
+        *("getppid", "uname", "getcwd", "getlogin", "getloadavg"),
         *("sysconf", "getpgid", "getsid"),
     )
     for name, function in builtin(os, *machine):

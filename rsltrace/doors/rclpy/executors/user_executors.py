@@ -20,9 +20,7 @@ from rsltrace.doors.rclpy.stacks.blocking_calls import lose_patience
 from rsltrace.doors.rclpy.stacks.coroutines import Resume
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.tasks import create_task
-
-WORKERS = 4
-"""Threads of a ``MultiThreadedExecutor()`` that does not say how many: not the machine's."""
+from rsltrace.guard.virtual.processors import PROCESSORS
 
 
 @contextmanager
@@ -38,7 +36,7 @@ def own_executors(stacks: Stacks) -> Iterator[None]:
     for name, method in _methods(stacks, real, made).items():
         setattr(Executor, name, method)
     executors.os = SimpleNamespace(
-        sched_getaffinity=lambda pid: set(range(WORKERS)), cpu_count=lambda: WORKERS
+        sched_getaffinity=lambda pid: set(range(PROCESSORS)), cpu_count=lambda: PROCESSORS
     )
     executors.time = SimpleNamespace(monotonic=lambda: stacks.loop.now_ns / 1_000_000_000)
     try:

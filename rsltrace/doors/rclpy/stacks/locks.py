@@ -44,9 +44,13 @@ def _forget_stacks() -> None:
 
 
 class SimLock:
-    """Stands in for ``threading.Lock``. A lock that is released goes to who has waited longest."""
+    """Stands in for ``threading.Lock``.
 
-    __slots__ = ("__weakref__", "_owner", "_taken", "_waits")
+    As in CPython, a release wakes who has waited longest, and whoever runs may take the lock again
+    before that one comes. It then waits on, and is not overtaken a second time.
+    """
+
+    __slots__ = ("__weakref__", "_called", "_owner", "_taken", "_waits")
 
     def __new__(cls) -> Any:
         return _thread.allocate_lock() if simulated_stacks() is None else object.__new__(cls)
@@ -54,7 +58,10 @@ class SimLock:
     def __init__(self) -> None:
         self._taken = False
         self._owner: greenlet | None = None
-        self._waits: deque[Wait] = deque()
+        self._waits: deque[tuple[Wait, bool]] = deque()
+        """Who waits, and whether it has been overtaken."""
+        self._called: Wait | None = None
+        """Who was woken by a release and has not come yet."""
 
     def acquire(self, blocking: bool = True, timeout: float = -1) -> bool:
         """Take the lock, waiting for it if need be; return whether it is ours now."""
@@ -78,26 +85,55 @@ class SimLock:
             raise UnsupportedError(
                 "a real thread, or code outside of a run, waits for a lock of the simulation"
             )
-        for_ns = None if timeout == -1 else patience_ns(timeout)
         in_condition = sys._getframe(2).f_code is threading.Condition.wait.__code__
-        what: Any = _Holder(stacks, self._owner, for_work=in_condition)
-        if wait(stacks, what, until=self._waits.append, for_ns=for_ns, patient=what.is_idle):
-            self._owner = getcurrent()  # whoever released it has left it taken, for us
-            return True
-        self._waits = deque(blocked for blocked in self._waits if blocked.waiting)
-        return False
+        now_ns = stacks.loop.now_ns
+        until_ns = None if timeout == -1 else now_ns + patience_ns(timeout)
+        overtaken = False
+        while True:
+            for_ns = None if until_ns is None else until_ns - stacks.loop.now_ns
+            what = _Holder(stacks, self._owner, for_work=in_condition)
+            if not self._turn(stacks, what, for_ns, overtaken=overtaken):
+                return False
+            if overtaken or not self._taken:  # left taken for us, or free
+                self._taken = True
+                self._owner = getcurrent()
+                return True
+            overtaken = True
+
+    def _turn(self, stacks: Stacks, what: _Holder, for_ns: int | None, *, overtaken: bool) -> bool:
+        """Wait until a release calls; return whether one did before the time was up."""
+        mine: list[Wait] = []
+
+        def join(blocked: Wait) -> None:
+            mine.append(blocked)
+            (self._waits.appendleft if overtaken else self._waits.append)((blocked, overtaken))
+
+        came = False
+        try:
+            came = wait(stacks, what, until=join, for_ns=for_ns, patient=what.is_idle)
+        finally:
+            called = bool(mine) and self._called is mine[0]
+            if called:
+                self._called = None
+            if not came:
+                self._waits = deque(one for one in self._waits if one[0].waiting)
+                if called and (overtaken or not self._taken):  # raised in: the next one may have it
+                    self._taken = True
+                    self.release()
+        return came
 
     def release(self) -> None:
-        """Give the lock up, to whoever waits for it."""
+        """Give the lock up, and wake who has waited longest for it."""
         if not self._taken:
             raise RuntimeError("release unlocked lock")
         self._owner = None
-        while self._waits:
-            blocked = self._waits.popleft()
-            if blocked.waiting:
-                blocked.wake()
-                return
         self._taken = False
+        while self._waits and self._called is None:
+            blocked, overtaken = self._waits.popleft()
+            if blocked.waiting:
+                self._called = blocked
+                self._taken = overtaken
+                blocked.wake()
 
     def locked(self) -> bool:
         """Return whether somebody has the lock."""

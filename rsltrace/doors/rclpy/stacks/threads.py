@@ -37,6 +37,7 @@ from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.guard.callers import is_user_file, module_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.library_imports import present_import
+from rsltrace.guard.virtual.processors import PROCESSORS
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.middleware.source_position import source_of
 from rsltrace.model.entity import Entity, EntityKind
@@ -51,8 +52,6 @@ _real_get_ident = _thread.get_ident
 _real_start_new_thread = _thread.start_new_thread
 _Thread = threading.Thread
 _pool_worker = futures_thread._worker
-_WORKERS = 4
-"""Processors there are, for a pool that does not say how many workers it wants."""
 _real = {name: getattr(_Thread, name) for name in ("start", "join", "is_alive")}
 
 
@@ -92,7 +91,23 @@ class SimThread:
         stacks.threads.alive[self] = None
         stacks.loop.tasks.append(self)
 
+    def overtake(self) -> None:
+        """Begin before those of the same process that were woken and have not gone on yet.
+
+        As in CPython, where whoever starts a thread waits for it at once: a new thread is there
+        sooner than the kernel has woken another.
+        """
+        tasks = self.stacks.loop.tasks
+        woken: list[Any] = []
+        tasks.pop()
+        while len(tasks) and self._goes_on_later(tasks[-1]):
+            woken.append(tasks.pop())
+        tasks.extend((self, *reversed(woken)))
+
     # -- the loop's view -------------------------------------------------------------------------
+
+    def _goes_on_later(self, task: object) -> bool:
+        return isinstance(task, Wait) and task.program is self.program
 
     def dispatch(self) -> None:
         """Run the thread until it ends or blocks for the first time, as one event."""
@@ -285,6 +300,7 @@ def _begin(stacks: Stacks, self: Any) -> None:
     self._ident = self._native_id = thread.ident
     threading._active[thread.ident] = self  # type: ignore[attr-defined]
     self._started.set()
+    thread.overtake()
     thread.wait_for_begin()
 
 
@@ -395,7 +411,7 @@ def cooperative_threads(stacks: Stacks) -> Iterator[None]:
 
 
 def _count() -> int:
-    return _WORKERS
+    return PROCESSORS
 
 
 def _numbers(first: int = 1) -> Callable[[], int]:

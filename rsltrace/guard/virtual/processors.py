@@ -1,0 +1,104 @@
+"""How many processors there are: four in every run, whatever the machine has.
+
+Pools get as many workers as that, and data as many parts, which a run would otherwise owe to the
+machine. Processes of the run (``rsltrace.doors.processes``) are told the same.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from types import FrameType
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from rsltrace.guard.guard import Guard, engaged
+from rsltrace.guard.process_ids import meant_id
+from rsltrace.guard.redirect import copy_of, redirect
+from rsltrace.model.finding import Mode, Source
+
+PROCESSORS = 4
+_OF_SYSCONF = frozenset(("SC_NPROCESSORS_CONF", "SC_NPROCESSORS_ONLN"))
+_getpid = copy_of(os.getpid)  # type: ignore[arg-type]
+_affinities: WeakKeyDictionary[Guard, frozenset[int]] = WeakKeyDictionary()
+"""Which processors user code has chosen, where it has chosen some."""
+
+
+def _in_charge(call: str, frame: FrameType) -> Guard | None:
+    """Return the guard if user code asks and the job leaves the answer to the run."""
+    guard = engaged()
+    if guard is None or not guard.is_for_user(frame):
+        return None
+    if guard.mode(Source.ENVIRONMENT, frame) is Mode.ALLOW:
+        return None
+    guard.count(Source.ENVIRONMENT, call, frame)
+    return guard
+
+
+def _counting(real: Callable[[], int | None]) -> Callable[[], int | None]:
+    def cpu_count() -> int | None:
+        guard = _in_charge("os.cpu_count()", sys._getframe(1))
+        return real() if guard is None else PROCESSORS
+
+    return cpu_count
+
+
+def _configured(real: Callable[[Any], int]) -> Callable[[Any], int]:
+    numbers = {os.sysconf_names[name] for name in _OF_SYSCONF}
+
+    def sysconf(name: Any, /) -> int:
+        if name in _OF_SYSCONF or name in numbers:
+            guard = _in_charge("os.sysconf()", sys._getframe(1))
+            if guard is not None:
+                return PROCESSORS
+        return real(name)
+
+    return sysconf
+
+
+def _is_own(pid: Any) -> bool:
+    return pid == 0 or bool(meant_id(pid) == _getpid())
+
+
+def _affinity(real: Callable[[Any], set[int]]) -> Callable[[Any], set[int]]:
+    def sched_getaffinity(pid: Any, /) -> set[int]:
+        guard = _in_charge("os.sched_getaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        if guard is None:
+            return real(meant_id(pid))
+        return set(_affinities.get(guard, range(PROCESSORS)))
+
+    return sched_getaffinity
+
+
+def _setting(real: Callable[[Any, Any], None]) -> Callable[[Any, Any], None]:
+    def sched_setaffinity(pid: Any, mask: Iterable[int], /) -> None:
+        guard = _in_charge("os.sched_setaffinity()", sys._getframe(1)) if _is_own(pid) else None
+        if guard is None:
+            real(meant_id(pid), mask)
+            return
+        chosen = frozenset(mask).intersection(range(PROCESSORS))
+        if not chosen:
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        _affinities[guard] = chosen
+
+    return sched_setaffinity
+
+
+@contextmanager
+def same_processors() -> Iterator[None]:
+    """Tell user code of as many processors on every machine."""
+    with ExitStack() as stack:
+        for name, make in (
+            ("cpu_count", _counting),
+            ("sysconf", _configured),
+            ("sched_getaffinity", _affinity),
+            ("sched_setaffinity", _setting),
+        ):
+            redirect(stack, getattr(os, name), make)
+        yield
+
+
+__all__ = ["PROCESSORS", "same_processors"]
