@@ -149,10 +149,7 @@ def _check_trace(path: Path, other: Path | None, form: str) -> int:
         return EXIT_USAGE
     checked = Checked(job, path, functions=other is not None)
     if form == "json":
-        values: Any = checked.values()
-        if job.metrics:
-            values = {"checks": values, "metrics": checked.numbers()}
-        say(json.dumps(values, indent=2))
+        say(json.dumps(checked.values(), indent=2))
     else:
         say("\n".join(checked.lines()))
     return 1 if checked.violated else 0

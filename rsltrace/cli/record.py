@@ -281,8 +281,7 @@ def _report(result: RunResult, told: list[str], checked: Checked | None, *, as_j
                     "stop_reason": result.stop_reason,
                     "exit_code": result.exit_code,
                     "error": None if error is None else str(error),
-                    **({} if checked is None else {"checks": checked.values()}),
-                    **({} if checked is None else {"metrics": checked.numbers()}),
+                    **({} if checked is None else checked.values()),
                     "notes": [*result.notes, *silent, *([result.kept] if result.kept else [])],
                 }
             )

@@ -294,7 +294,8 @@ def test_a_job_with_checks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     done = CliRunner().invoke(cli, ["check", "run.mcap", "--format", "json"])
     assert done.exit_code == 1
     found = json.loads(done.stdout)
-    assert [one["verdict"] for one in found] == ["violated", "skipped"]
+    assert [one["verdict"] for one in found["checks"]] == ["violated", "skipped"]
+    assert found["metrics"] == {}
     monkeypatch.chdir("/")  # where nothing is that the job names
     elsewhere = CliRunner().invoke(cli, ["check", str(tmp_path / "run.mcap"), "--format", "json"])
     assert (elsewhere.exit_code, json.loads(elsewhere.stdout)) == (1, found), elsewhere.output

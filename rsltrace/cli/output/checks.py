@@ -70,8 +70,11 @@ class Checked:
             lines.append(f"next: rsltrace view {path} --at {min(first)}")
         return lines
 
-    def values(self) -> list[dict[str, Any]]:
-        """Return what a program wants to know."""
+    def values(self) -> dict[str, Any]:
+        """Return what a program wants to know: the ``checks`` in order, the ``metrics`` by name."""
+        return {"checks": self._results(), "metrics": self._numbers()}
+
+    def _results(self) -> list[dict[str, Any]]:
         return [
             {
                 "name": one.name,
@@ -86,9 +89,8 @@ class Checked:
             for one in self.results
         ]
 
-    def numbers(self) -> dict[str, dict[str, Any]]:
-        """Return the metrics for a program, by name; JSON has no infinity."""
-        return {
+    def _numbers(self) -> dict[str, dict[str, Any]]:
+        return {  # JSON has no infinity
             one.name: {
                 "value": one.value if one.value is None or isfinite(one.value) else None,
                 "unit": one.unit,
