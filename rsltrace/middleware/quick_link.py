@@ -72,7 +72,8 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
         if recorder is not None:  # what Recorder.draw does
             packed = _pack_output(_DELAY | delay_ns, entity, _DRAW)
             recorder.output_hash = hash64(packed, recorder.output_hash)
-            recorder.add_output(packed)
+            add_output = recorder.add_output
+            add_output(packed)
             recorder.outputs += 1
         place = next_place()
         release = (

@@ -49,8 +49,9 @@ class Recorder:
         """Add an output to the event under way; return which of its outputs it is."""
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        self.add_output(packed)
-        self._add_sequence(sequence)
+        add_output, add_sequence = self.add_output, self._add_sequence
+        add_output(packed)
+        add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
         return position
@@ -59,7 +60,8 @@ class Recorder:
         """Add what chance has decided to the event under way: it has no payload."""
         packed = _pack_output(draw, entity, _DRAW)
         self.output_hash = hash64(packed, self.output_hash)
-        self.add_output(packed)
+        add_output = self.add_output
+        add_output(packed)
         self.outputs += 1
 
     def message(
@@ -67,13 +69,15 @@ class Recorder:
     ) -> int:
         """Add an output whose payload goes to ``channel`` (negative: hash only)."""
         if channel >= 0:
-            sequence = self._add_payload(channel, stamp_ns, data)
+            add_payload = self._add_payload
+            sequence = add_payload(channel, stamp_ns, data)
         else:
             sequence = NO_SEQUENCE
         packed = _pack_output(content_hash, entity, kind)
         self.output_hash = hash64(packed, self.output_hash)
-        self.add_output(packed)
-        self._add_sequence(sequence)
+        add_output, add_sequence = self.add_output, self._add_sequence
+        add_output(packed)
+        add_sequence(sequence)
         position = self.outputs
         self.outputs = position + 1
         return position
@@ -128,7 +132,8 @@ class Recorder:
             flags,
         )
         self.chain_hash = chain_hash = hash64(rest, self.chain_hash)
-        self.add_event(rest, chain_hash)
+        add_event = self.add_event
+        add_event(rest, chain_hash)
         self.index += 1
         self.outputs = 0
         self.output_hash = 0

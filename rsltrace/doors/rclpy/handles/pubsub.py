@@ -39,7 +39,8 @@ class PublisherHandle(EntityHandle, Publisher):
 
     def publish(self, msg: Any) -> None:
         """Publish a message: a snapshot of it goes to every connected subscription."""
-        data = self._serialize(msg)
+        serialize = self._serialize  # as elsewhere: Python calls what is in a variable sooner
+        data = serialize(msg)
         sites = self._sites
         if self._count == sites.due or self._event.entity != sites.running:
             sites.look(self._count)
@@ -117,7 +118,8 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         callback = wrapper._callback
         if callback is not self._callback:
             self._learn(wrapper)
-        message = self._as_received(data) if wrapper.raw else self._deserialize(data)
+        deserialize = self._as_received if wrapper.raw else self._deserialize
+        message = deserialize(data)
         args = (message, _message_info(delivery)) if self._with_info else (message,)
         if self._coroutine:
             start_coroutine(
