@@ -96,6 +96,7 @@ class Standby:
         )
         blocked, future, context, waiting = self.blocked, self._future, self._context, self._waiting
         all_blocked, host, program = self._all_blocked, programs.host, blocked.program
+        entities, own_stack = dispatcher.entities, blocked.stack
         if self._once:
             blocked.stop_waiting()  # its time limit means nothing to a callback that blocks
         while True:
@@ -112,12 +113,14 @@ class Standby:
                 failure, mailbox.raised = mailbox.raised, None
             except BaseException as error:
                 failure = error
+            recorder = dispatcher.recorder
             if (
                 self._once
                 or failure is not None
                 or pump.woken
                 or not context.is_up
-                or dispatcher.has_outputs()
+                or entities.pending
+                or (dispatcher.unrecorded if recorder is None else recorder.outputs)
                 or (future is not None and (future.done() or future.cancelled()))
             ):
                 break
@@ -127,14 +130,15 @@ class Standby:
             pump.standby = self
             all_blocked[blocked] = None
             following = self._following()
-            if following is None:
+            if following is not None:
+                stack, mailbox, item = following
+                if stack is own_stack:
+                    continue
+                given = stack.switch(mailbox, item)
+            else:
                 if programs.present is not host:
                     host.enter()
                 given = (waiting.pop() if waiting else self._runners.next()).switch()
-            else:
-                stack, *given = following
-                if stack is not blocked.stack:
-                    given = stack.switch(*given)
             if not given:
                 return False
             mailbox, item = given
