@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -74,8 +73,10 @@ def check(
     anybody at the other end, a topic that a bag plays and a node publishes, a rule of the job that
     fits nothing), 2 if the job cannot run.
     """
-    from rsltrace.checks.evaluate import check_texts
+    from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
+    from rsltrace.debug.conditions.message_fields import loaded_fields
+    from rsltrace.debug.conditions.names import Names
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 
@@ -92,8 +93,16 @@ def check(
     check_metrics(loaded)
     try:
         checked = check_job(loaded, everything=everything)
-        if loaded.checks:
-            checked = replace(checked, unused=(*checked.unused, *_wrong_checks(checked)))
+        shown = (*checked.overview.of_kind("topic"), *checked.overview.of_kind("service"))
+        names = Names(
+            nodes=tuple(node.name for node in checked.overview.nodes),
+            topics=tuple(dict.fromkeys([*(link.name for link in shown), *checked.interfaces])),
+            are_all=True,
+            interfaces=checked.interfaces,
+            fields=loaded_fields,
+        )
+        wrong = tuple(wrong_checks(checked.job, names))
+        checked = replace(checked, unused=(*checked.unused, *wrong))
     except RunError as error:
         if isinstance(error, NodeError) and error.traceback_text:
             tell(error.traceback_text.rstrip())
@@ -110,24 +119,6 @@ def check(
         if not checked.problems and launch is None and not overrides:
             tell(f"next: rsltrace record {shlex.join(words)}")
     return 1 if checked.problems else 0
-
-
-def _wrong_checks(checked: Checked) -> Iterator[str]:
-    """Yield what is wrong with checks that speak of what the graph does not have."""
-    from rsltrace.checks.evaluate import wrong_checks
-    from rsltrace.debug.conditions.message_fields import loaded_fields
-    from rsltrace.debug.conditions.names import Names
-
-    found = checked.overview
-    shown = (link.name for kind in ("topic", "service") for link in found.of_kind(kind))
-    names = Names(
-        nodes=tuple(node.name for node in found.nodes),
-        topics=tuple(dict.fromkeys([*shown, *checked.interfaces])),
-        are_all=True,
-        interfaces=checked.interfaces,
-        fields=loaded_fields,
-    )
-    return wrong_checks(checked.job, names)
 
 
 def _check_trace(path: Path, other: Path | None, form: str) -> int:

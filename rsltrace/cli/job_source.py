@@ -88,6 +88,23 @@ def job_of(
     """
     from rsltrace.job import job_from_text, load_job
 
+    named, changes, text = job_words(words, launch, skip, overrides)
+    if text is None:
+        return load_job(named, overrides=changes), named
+    return job_from_text(text, str(named), named.parent, overrides=changes), named
+
+
+def job_words(
+    words: Sequence[str],
+    launch: Path | None,
+    skip: bool,
+    overrides: Sequence[str | tuple[str, str]],
+) -> tuple[Path, list[str | tuple[str, str]], str | None]:
+    """Return the path of the file that names the job, all overrides, and the text that stands for
+    the file where there is none.
+
+    :raises click.UsageError: if the words do not fit together.
+    """
     files = [word for word in words if ":=" not in word]
     given = dict(word.split(":=", 1) for word in words if ":=" in word)
     if len(files) > 1:
@@ -109,9 +126,20 @@ def job_of(
         changes.append(f"launch.+={json.dumps(spec, ensure_ascii=False)}")
     ros = click.get_current_context().meta.get(_META, [])
     changes += [f"ros_arguments.+={json.dumps(word)}" for word in _with_paths(ros, named.parent)]
-    if files:
-        return load_job(named, overrides=changes), named
-    return job_from_text("{}", str(named), named.parent, overrides=changes), named
+    return named, changes, None if files else "{}"
+
+
+def all_overrides(
+    overrides: Sequence[str], seed: int | None, until: str | None
+) -> list[str | tuple[str, str]]:
+    """Return what the command line says of the job, the short options last."""
+    found: list[str | tuple[str, str]] = list(overrides)
+    if seed is not None:
+        found.append(("--seed", f"seed={seed}"))
+    if until is not None:
+        time = f"{until}s" if until[-1:].isdigit() else until
+        found.append(("--until", f"stop.time={json.dumps(time)}"))
+    return found
 
 
 def _with_paths(words: Sequence[str], folder: Path) -> list[str]:

@@ -24,6 +24,7 @@ _COMMANDS = {
     "debug": "Stop in a run, look into its nodes, go back.",
     "init": "Write a commented first job, from bags and nodes.",
     "verify": "Record a job many times in unlike surroundings and compare.",
+    "explore": "Search the orders of a job for the run that fails.",
     "bisect": "Find the commit that changed what a job does.",
     "audit": "Look into nodes' sources for what could make runs differ.",
     "check": "Check a job and show its graph, without running it.",

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from rsltrace.cli.job_source import RosArgsCommand, job_of, job_options
+from rsltrace.cli.job_source import RosArgsCommand, all_overrides, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
@@ -99,7 +99,7 @@ def record(
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         end_with_run()
-    changes = _all_overrides(overrides, seed, until)
+    changes = all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:
         guard = loaded.guard.model_copy(update={"pin": False})
@@ -208,19 +208,6 @@ def default_output(job: Path) -> Path:
     stem = job.name.split(".launch.")[0] if ".launch." in job.name else job.stem
     stem = job.resolve().parent.name if stem == "job" else stem
     return Path(f"{stem or 'run'}.mcap")
-
-
-def _all_overrides(
-    overrides: tuple[str, ...], seed: int | None, until: str | None
-) -> list[str | tuple[str, str]]:
-    """Return what the command line says of the job, the short options last."""
-    found: list[str | tuple[str, str]] = list(overrides)
-    if seed is not None:
-        found.append(("--seed", f"seed={seed}"))
-    if until is not None:
-        time = f"{until}s" if until[-1:].isdigit() else until
-        found.append(("--until", f"stop.time={json.dumps(time)}"))
-    return found
 
 
 def _note(text: str) -> None:

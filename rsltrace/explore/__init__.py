@@ -9,4 +9,7 @@ cluster     trials on the workers of a Dask cluster
 report      what was found: a page, and formats for machines
 steps       what a run chose from, and what each thing that ran has touched
 behaviour   what a run did, as hashes that others can be compared with
+table       the folder with a row for each run
+strategies  what is tried next
+search      the strategy's trials are run, until the budget is used up
 """

@@ -9,8 +9,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
 from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks
 from rsltrace.checks.functions import load_function
 from rsltrace.errors import (
@@ -21,7 +19,7 @@ from rsltrace.errors import (
     NodeError,
     RunError,
 )
-from rsltrace.explore.behaviour import behaviours_of, events_of, final_state_of
+from rsltrace.explore.behaviour import behaviours_of, final_state_of
 from rsltrace.explore.steps import Watch
 from rsltrace.explore.trial import (
     CHECK,
@@ -89,11 +87,12 @@ def run_trial(
             digest=ran.digest,
             events=ran.events,
             end_ns=ran.end_ns,
-            choices=watch.choices,
-            entities=len(np.unique(events_of(opened)["entity"])),
+            choices=len(watch.order),
+            entities=len(watch.entities),
             failure=failure,
             final_state=final_state_of(opened),
             behaviours=behaviours_of(opened) if wants.behaviours else (),
+            order=tuple(watch.order) if wants.behaviours else (),
             steps=watch.steps(opened) if wants.steps else (),
         )
     kept = wants.keep or failure is not None

@@ -55,8 +55,10 @@ class Watch:
     """Looks over the shoulder of a run's policy, from before it begins."""
 
     def __init__(self, session: Session, *, steps: bool) -> None:
-        self.choices = 0
-        """How often more than one could run."""
+        self.order: list[tuple[int, int]] = []
+        """Of each choice, which of how many was taken."""
+        self.entities: set[int] = set()
+        """Whatever could run at some time."""
         self._session = session
         self._asked: list[_Asked] = []
         self._lulls: list[_Lull] = []
@@ -68,8 +70,9 @@ class Watch:
                 loop.on_lull = self._note_lull
 
     def _note(self, ready: Sequence[Candidate], chosen: int, moment: Moment) -> None:
+        self.entities.update([one.entity_id for one in ready])
         if len(ready) > 1:
-            self.choices += 1
+            self.order.append((chosen, len(ready)))
         if not self._keeps:
             return
         what = tuple((one.entity_id, one.kind, one.node, one.entity) for one in ready)

@@ -27,6 +27,7 @@ with a status of its own. ``error``: it did what a simulation cannot do, or its 
 followed. ``crash``: its process died; ``timeout``: it was killed for taking too long."""
 
 _KEYS = ("seed", "policy", "faults")
+_NOT_KEPT = ("behaviours", "order", "steps")
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,10 +127,12 @@ class Step:
 class TrialResult:
     """What came of a trial. Times are simulated nanoseconds, ``wall_s`` is real time.
 
-    ``choices`` is how often more than one could run; ``entities`` how many had events.
+    ``choices`` is how often more than one could run; ``entities`` how many
+    there were that could run.
     ``behaviours`` are hashes of what happened (an event with its content and its node's state
-    after it, and pairs of events of one node in their order), ``steps`` the order; both are only
-    there if asked for. ``trace`` is where the trace is, if it was kept.
+    after it, and pairs of events of one node in their order), ``order`` is of each choice which of
+    how many was taken, ``steps`` says more of that; they are only there if asked for. ``trace`` is
+    where the trace is, if it was kept.
     """
 
     trial: Trial
@@ -144,6 +147,7 @@ class TrialResult:
     trace: str | None = None
     final_state: str = ""
     behaviours: tuple[int, ...] = ()
+    order: tuple[tuple[int, int], ...] = ()
     steps: tuple[Step, ...] = ()
 
     def as_values(self) -> dict[str, Any]:
@@ -151,10 +155,9 @@ class TrialResult:
         return asdict(self)
 
     def row(self) -> dict[str, Any]:
-        """Return what a table keeps of it: without behaviours and steps."""
-        values = asdict(replace(self, behaviours=(), steps=()))
-        del values["behaviours"], values["steps"]
-        return values
+        """Return what a table keeps of it: without behaviours, order and steps."""
+        values = asdict(replace(self, behaviours=(), order=(), steps=()))
+        return {key: value for key, value in values.items() if key not in _NOT_KEPT}
 
 
 def result_of(values: Mapping[str, Any]) -> TrialResult:
@@ -164,6 +167,7 @@ def result_of(values: Mapping[str, Any]) -> TrialResult:
     if given.get("failure") is not None:
         given["failure"] = Failure(**given["failure"])
     given["behaviours"] = tuple(given.get("behaviours", ()))
+    given["order"] = tuple((one, two) for one, two in given.get("order", ()))
     given["steps"] = tuple(
         Step(tuple(one["ready"]), one["chosen"], one["phase"], one["touches"], one["state"])
         for one in given.get("steps", ())

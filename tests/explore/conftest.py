@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 NODES = """
-import os, time
+import ctypes
 from rclpy.node import Node
 from std_msgs.msg import UInt64
 
@@ -40,6 +40,14 @@ class Last(Node):
         self.publisher.publish(UInt64(data=self.value))
 
 
+class Relay(Node):
+    def __init__(self):
+        super().__init__('relay')
+        publisher = self.create_publisher(UInt64, self.declare_parameter('to', 'a').value, 10)
+        topic = self.declare_parameter('from', 'b').value
+        self.create_subscription(UInt64, topic, publisher.publish, 10)
+
+
 class Bad(Node):
     def __init__(self):
         super().__init__('bad')
@@ -49,7 +57,7 @@ class Bad(Node):
         raise ValueError('this is bad')
 
     def dies(self):
-        os.kill(os.getpid(), 9)
+        ctypes.string_at(0)
 
     def hangs(self):
         while True:

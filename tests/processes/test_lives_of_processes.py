@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rsltrace.errors import JobError, LivelockError
+from rsltrace.errors import JobError
 from rsltrace.job import load_job
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind
@@ -64,18 +64,6 @@ def test_a_process_starts_again_as_often_as_it_may(
         starts = [event for event in events if event.kind is EventKind.CONSTRUCT]
         assert [event.stamp_ns for event in starts] == [0, 750_000_000]
         assert len({event.entity for event in starts}) == 2
-
-
-def test_a_process_that_ends_as_it_starts_is_not_started_for_ever(tmp_path: Path) -> None:
-    (tmp_path / "brief.py").write_text("")
-    job = "nodes: [{script: brief.py, isolated: true, respawn: %s}]\nstop: {duration: 1s}\n"
-    (tmp_path / "job.yaml").write_text(job % "{times: 2}")
-    result = run(load_job(tmp_path / "job.yaml"), None)
-    assert (result.error, result.events) == (None, 3)  # before the run begins, which is said once
-    (tmp_path / "job.yaml").write_text(job % "0s")
-    error = run(load_job(tmp_path / "job.yaml"), None).error
-    assert isinstance(error, LivelockError)
-    assert "brief.py ends as soon as it starts, 20 times at 0.000000000 s" in str(error)
 
 
 def test_a_run_ends_with_a_process_that_it_requires(compiled: Compiled, tmp_path: Path) -> None:

@@ -29,19 +29,15 @@ from rsltrace.doors.rclpy.wire.interfaces import (
     service_type,
 )
 from rsltrace.doors.rclpy.world import World
-from rsltrace.errors import JobError, LivelockError, SetupError
+from rsltrace.errors import JobError, SetupError
 from rsltrace.job import Job, NodeSpec
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.model.printable import printable
 from rsltrace.model.regular_file import not_regular
-from rsltrace.model.stamp import format_seconds
 from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
 from rsltrace.workspace.imports import unbuilt_names, unbuilt_prefix
 from rsltrace.workspace.installs import module_folders
-
-_AT_ONCE_MAX = 20
-"""How often a process may start again while simulated time stands still."""
 
 
 class Processes:
@@ -175,46 +171,22 @@ def _shown(world: World, node: str | None, looks: bool) -> tuple[int, bool]:
     return shown_ns, not clocks.advances(node)
 
 
-class _Respawning:
-    """Starts processes again that have ended, as their entries say."""
-
-    def __init__(self, world: World) -> None:
-        self._world = world
-        self._restarts: Counter[str] = Counter()
-        self._at_once: Counter[tuple[str, int]] = Counter()
-
-    def ended(self, entry: Entry) -> None:
-        """Let an entry start once more, if it is to.
-
-        :raises LivelockError: it ends as soon as it starts, and would do so for ever.
-        """
-        loop = self._world.domain.loop
-        if entry.respawn is None or loop.stopped is not None:
-            return
-        delay_ns, times = entry.respawn
-        now = entry.key, loop.now_ns
-        if times is None and self._at_once[now] == _AT_ONCE_MAX:
-            raise LivelockError(
-                f"{entry.name} ends as soon as it starts, {_AT_ONCE_MAX} times at "
-                f"{format_seconds(loop.now_ns)} s of simulated time: give its respawn a delay, or "
-                "say how many times it starts again"
-            )
-        if times is None or self._restarts[entry.key] < times:
-            self._restarts[entry.key] += 1
-            self._at_once[now] += 1
-            self._world.starts.add_at(entry, loop.now_ns + delay_ns)
-
-
 def process_door(job: Job, world: World) -> ProcessDoor:
     """Return the door through which a job's processes take part in its world."""
     interfaces = Interfaces(_message_type, _service_type)
     door = ProcessDoor(world.domain, interfaces, seed=job.seed, log=world.show_log)
     programs = world.stacks.programs
-    respawning = _Respawning(world)
+    restarts: Counter[str] = Counter()
 
     def ended(key: str) -> None:
         programs.tell("ended", key)
-        respawning.ended(next(one for one in world.constructed if one.key == key))
+        entry = next(one for one in world.constructed if one.key == key)
+        if entry.respawn is None or world.domain.loop.stopped is not None:
+            return
+        delay_ns, times = entry.respawn
+        if times is None or restarts[key] < times:
+            restarts[key] += 1
+            world.starts.add_at(entry, world.domain.loop.now_ns + delay_ns)
 
     door.on_end = ended
     door.follows_clock = lambda node: world.clocks is not None and world.clocks.follows(node)

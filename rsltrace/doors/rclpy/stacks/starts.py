@@ -51,7 +51,7 @@ class Starts:
         later = LaterStart(self, entry, StartRule())
         self._waiting.append(later)
         self.stacks.programs.to_come.append(entry.key)
-        later.begin_at(time_ns)
+        self.stacks.loop.schedule_release(time_ns, _release, later)
 
     def begin(self, start_ns: int) -> None:
         """Take note that the run begins: times count from here."""
@@ -109,12 +109,9 @@ class LaterStart:
         """Let the entry start when its time has come, if nothing else keeps it waiting."""
         loop, start_ns = self._starts.stacks.loop, self._starts.start_ns
         if not self.unmet and not self._scheduled and start_ns is not None:
-            self.begin_at(max(loop.now_ns, start_ns) + self._rule.delay_ns)
-
-    def begin_at(self, time_ns: int) -> None:
-        """Let the entry start at a time, and not once more."""
-        self._scheduled = True
-        self._starts.stacks.loop.schedule_release(time_ns, _release, self)
+            self._scheduled = True
+            time_ns = max(loop.now_ns, start_ns) + self._rule.delay_ns
+            loop.schedule_release(time_ns, _release, self)
 
     def dispatch(self) -> None:
         """Construct the entry, as one event."""

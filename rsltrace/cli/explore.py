@@ -1,0 +1,214 @@
+"""``rsltrace explore``: search the orders of a job for the run that fails."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from rsltrace.cli.job_source import (
+    RosArgsCommand,
+    all_overrides,
+    job_options,
+    job_words,
+)
+from rsltrace.cli.record import default_output
+from rsltrace.cli.verify import terminated
+from rsltrace.errors import ExploreError
+from rsltrace.terminal import say, tell
+
+if TYPE_CHECKING:
+    from rsltrace.explore.search import Budget, Search
+    from rsltrace.explore.trial import JobSource, TrialResult
+    from rsltrace.job import Job
+
+STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic")
+_FORMAT = 1
+_INTERRUPTED = 130
+
+
+def _budget(context: click.Context, option: click.Parameter, text: str) -> Budget:
+    """Read ``1000`` (trials) or ``10min`` (of real time)."""
+    from rsltrace.explore.search import Budget
+    from rsltrace.job.values.times import parse_time
+    from rsltrace.model.stamp import NS_PER_S
+
+    if re.fullmatch(r"\d+", text.strip()):
+        if int(text) == 0:
+            raise click.BadParameter("nothing can be tried with a budget of 0")
+        return Budget(trials=int(text))
+    try:
+        seconds = parse_time(text) / NS_PER_S
+    except ValueError:
+        raise click.BadParameter(
+            f"expected a number of runs (1000) or a time (10min, 90s, 2h), got {text!r}"
+        ) from None
+    if seconds == 0:
+        raise click.BadParameter("nothing can be tried with a budget of 0")
+    return Budget(seconds=seconds)
+
+
+@click.command(cls=RosArgsCommand)
+@job_options
+@click.option(
+    "--strategy",
+    type=click.Choice(STRATEGIES),
+    default="mixed",
+    show_default=True,
+    help="What is tried: see docs/exploring.md.",
+)
+@click.option(
+    "--budget",
+    default="1000",
+    show_default=True,
+    metavar="N|TIME",
+    callback=_budget,
+    help="How many runs, or how long (10min).",
+)
+@click.option("--stop-at-first", is_flag=True, help="End the search with the first run that fails.")
+@click.option("--resume", is_flag=True, help="Go on with the search in the output folder.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(min=1),
+    metavar="W",
+    help="How many runs at a time (default: one for each processor).",
+)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Folder for results and traces (default: the job's name with .explore, here).",
+)
+@click.option(
+    "--depth",
+    type=click.IntRange(1, 100),
+    help="Depth of bugs that pct looks for (default: 1 to 3); departures from the plain order "
+    "that systematic makes at most (default: any number).",
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Search with other random choices.",
+)
+@click.option("--until", metavar="T", help="Stop runs at simulated time T (seconds, or 90s, 5ms).")
+@click.option(
+    "--timeout",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="S",
+    help="Kill a run after so many seconds (default: 30 times what the first took, at least 60).",
+)
+@click.option("-q", "--quiet", is_flag=True, help="Only the result, nothing while it searches.")
+def explore(
+    words: tuple[str, ...],
+    launch: Path | None,
+    skip: bool,
+    overrides: tuple[str, ...],
+    strategy: str,
+    budget: Budget,
+    stop_at_first: bool,
+    resume: bool,
+    jobs: int | None,
+    output: Path | None,
+    depth: int | None,
+    seed: int,
+    until: str | None,
+    timeout: float | None,
+    quiet: bool,
+) -> int:
+    """Run JOB in many orders of its callbacks, and find those in which something fails.
+
+    What fails is what the job's checks say (checks:), an exception, a deadlock, a livelock, a run
+    that does not end before its timeout (stop: {timeout: …}) or that crashes. Every run can be
+    repeated: it is the job with what sets it apart, and "rsltrace record" of that does the same.
+
+    The exit status is 0 if nothing failed, 1 if something did, 2 for trouble: results that are
+    there by then are kept, and --resume goes on.
+    """
+    from rsltrace.checks.evaluate import check_texts
+    from rsltrace.explore.search import Search
+    from rsltrace.explore.strategies.named import strategy_named
+    from rsltrace.explore.table import Table
+    from rsltrace.explore.trial import JobSource
+    from rsltrace.explore.workers import Workers, default_jobs
+
+    named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
+    labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
+    source = JobSource(str(named), labelled, text, str(named.parent))
+    job = source.job()
+    check_texts(job)
+    folder = output or default_output(named).with_suffix(".explore")
+    about = _about(source, job, strategy, seed, depth)
+    with terminated(), Table(folder, about, resume=resume) as table:
+        chosen = strategy_named(strategy, job, seed=seed, depth=depth)
+        search = Search(
+            job, chosen, table, budget=budget, stop_at_first=stop_at_first, timeout_s=timeout
+        )
+        interrupted = False
+        with Workers(source, jobs or default_jobs(), pins=job.guard.pins) as workers:
+            try:
+                with _telling(search, budget, quiet=quiet) as on_result:
+                    search.run(workers, on_result)
+            except KeyboardInterrupt:
+                interrupted = True
+            except ExploreError:
+                if search.tally.runs:
+                    _report(search, source, folder)
+                raise
+    _report(search, source, folder)
+    if interrupted:
+        tell(f"interrupted: --resume goes on; the results are in {folder}")
+        return _INTERRUPTED
+    return 1 if search.tally.failures else 0
+
+
+def _about(
+    source: JobSource, job: Job, strategy: str, seed: int, depth: int | None
+) -> dict[str, Any]:
+    """Return what a search is about: it can be resumed if that is the same."""
+    from rsltrace.trace.chain import hash64
+
+    return {
+        "format": _FORMAT,
+        "job": source.path,
+        "overrides": [list(one) for one in source.overrides],
+        "what the job says": f"{hash64(job.to_yaml().encode()):016x}",
+        "strategy": strategy,
+        "seed": seed,
+        "depth": depth,
+    }
+
+
+@contextmanager
+def _telling(
+    search: Search, budget: Budget, *, quiet: bool
+) -> Iterator[Callable[[TrialResult], None]]:
+    """Tell on stderr how a search goes: a line on a terminal, causes of failures anywhere."""
+    from rsltrace.cli.output.search_progress import search_line
+
+    if quiet:
+        yield lambda result: None
+        return
+    told: set[str] = set()
+    with search_line(search, budget) as update:
+
+        def on_result(result: TrialResult) -> None:
+            update()
+            trial, failure = result.trial, result.failure
+            if failure is not None and failure.key not in told:
+                told.add(failure.key)
+                tell(f"trial {trial.number} ({trial.why}): {failure.kind}: {failure.text}")
+
+        yield on_result
+
+
+def _report(search: Search, source: JobSource, folder: Path) -> None:
+    from rsltrace.cli.output.search_text import search_lines
+
+    for line in search_lines(search, source, folder):
+        say(line)

@@ -1,0 +1,91 @@
+"""Orders near those that have shown something new: one more departure from one of them."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from rsltrace.explore.strategies.strategy import Proposal
+from rsltrace.explore.trial import TrialResult
+from rsltrace.trace.chain import hash64
+
+_TRIES = 20
+_ORDERS_MAX = 2_000
+
+
+class Feedback:
+    """Keeps the orders of runs in which something happened that had not happened before (an event
+    with its content and its node's state, two events of a node in that order), and departs from
+    one of them at one more choice; the newest are taken most often."""
+
+    behaviours = True
+    steps = False
+
+    def __init__(self, seed: int = 0) -> None:
+        self._seed = seed
+        self._seen: set[int] = set()
+        self._orders: list[tuple[dict[str, Any], tuple[tuple[int, int], ...]]] = []
+        """What else sets a run apart (its seed, say), and of each choice which of how many."""
+        self._tried: set[int] = set()
+        self._runs = self._new_runs = 0
+
+    def begin(self, plain: TrialResult) -> None:
+        self._keep(plain)
+
+    def propose(self, number: int) -> Proposal | None:
+        chance = random.Random(f"{self._seed} {number}")
+        overlay: dict[str, Any] = {}
+        departures: list[tuple[int, int]] = []
+        for _ in range(_TRIES):
+            overlay, departures = self._near(chance)
+            mark = hash64(f"{overlay} {departures}".encode())
+            if mark not in self._tried:
+                self._tried.add(mark)
+                break
+        self._runs += 1
+        policy = {"departures": [{"choice": choice, "run": run} for choice, run in departures]}
+        overlay = {**overlay, "policy": policy}
+        return Proposal(overlay, f"near what was new, {len(departures)} departures")
+
+    def _near(self, chance: random.Random) -> tuple[dict[str, Any], list[tuple[int, int]]]:
+        """Return the departures of a run that was kept up to some choice, and one more."""
+        orders = self._orders
+        if not orders:
+            return {}, []
+        overlay, order = orders[max(chance.randrange(len(orders)), chance.randrange(len(orders)))]
+        if not order:
+            return overlay, []
+        place = chance.randrange(len(order))
+        taken, count = order[place]
+        other = chance.randrange(count - 1)
+        run = other + (other >= taken)
+        found = [(choice, one) for choice, (one, _) in enumerate(order[:place]) if one]
+        return overlay, [*found, (place, run)] if run else found
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        return self._keep(result)
+
+    def recall(self, result: TrialResult) -> None:
+        policy = result.trial.overlay.get("policy")
+        self._runs += isinstance(policy, Mapping) and "departures" in policy
+        self._keep(result)
+
+    def _keep(self, result: TrialResult) -> TrialResult | None:
+        new = [one for one in result.behaviours if one not in self._seen]
+        if not new:
+            return None
+        self._seen.update(new)
+        overlay = {key: value for key, value in result.trial.overlay.items() if key != "policy"}
+        self._orders.append((overlay, result.order))
+        if len(self._orders) > _ORDERS_MAX:
+            del self._orders[0]
+        self._new_runs += 1
+        return replace(result, behaviours=tuple(new))
+
+    def coverage(self) -> list[str]:
+        return [
+            f"feedback: {self._new_runs} of {self._runs + 1} runs showed something new, "
+            f"{len(self._seen)} behaviours in all"
+        ]

@@ -1,0 +1,61 @@
+"""The strategies by the names that a command line gives them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rsltrace.explore.strategies.feedback import Feedback
+from rsltrace.explore.strategies.strategy import Proposal, Strategy
+from rsltrace.explore.strategies.systematic import Systematic
+from rsltrace.explore.strategies.walks import PctWalk, RandomWalk
+from rsltrace.explore.trial import TrialResult
+from rsltrace.job import Job
+
+NAMES = ("mixed", "pct", "random", "feedback", "systematic")
+
+
+def strategy_named(name: str, job: Job, *, seed: int = 0, depth: int | None = None) -> Strategy:
+    """Return a new strategy. ``depth`` is the depth of bugs that PCT looks for (up to 3), or how
+    many departures from the plain order the systematic search makes (any number).
+
+    :raises ExploreError: it cannot be applied to the job.
+    """
+    if name == "systematic":
+        return Systematic(depth)
+    if name == "feedback":
+        return Feedback(seed)
+    if name == "random":
+        return RandomWalk(seed)
+    pct = PctWalk(depth or 3, seed)
+    return pct if name == "pct" else Mixed([pct, Feedback(seed), RandomWalk(seed)])
+
+
+class Mixed:
+    """Several strategies in turn. Those whose trials follow from their numbers, or that always have
+    something to propose."""
+
+    steps = False
+
+    def __init__(self, strategies: Sequence[Strategy]) -> None:
+        self._strategies = tuple(strategies)
+        self.behaviours = any(one.behaviours for one in strategies)
+
+    def begin(self, plain: TrialResult) -> None:
+        for one in self._strategies:
+            one.begin(plain)
+
+    def propose(self, number: int) -> Proposal | None:
+        turn, place = divmod(number, len(self._strategies))
+        return self._strategies[place].propose(turn)
+
+    def learn(self, result: TrialResult) -> TrialResult | None:
+        # What is new in any run is near what else may be new.
+        kept = (one.learn(result) for one in self._strategies)
+        return next((one for one in list(kept) if one is not None), None)
+
+    def recall(self, result: TrialResult) -> None:
+        for one in self._strategies:
+            one.recall(result)
+
+    def coverage(self) -> list[str]:
+        return [line for one in self._strategies for line in one.coverage()]
