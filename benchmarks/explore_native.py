@@ -34,6 +34,10 @@ from rsltrace.model.stamp import NS_PER_S
 
 DISCOVERY_S_MAX = 30.0
 SETTLE_S = 0.2
+TURN_S = 0.02
+"""One timeout for all turns: rclpy's executor begins anew where it changes, and serves only
+coroutines that wait then."""
+
 NAMES = Names()
 
 
@@ -147,8 +151,8 @@ def run_node(job: Job, index: int, seconds: float, ready: Any, go: Any) -> None:
         timer.reset()
     executor.add_node(node)
     try:
-        while (left := end - time.monotonic()) > 0 and rclpy.ok():
-            executor.spin_once(timeout_sec=left)
+        while time.monotonic() < end and rclpy.ok():
+            executor.spin_once(timeout_sec=TURN_S)
     except Exception:
         os._exit(3)
     os._exit(0)

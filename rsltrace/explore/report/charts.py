@@ -10,9 +10,11 @@ from xml.etree.ElementTree import Element, SubElement
 from rsltrace.model.printable import printable
 
 WIDTH, HEIGHT = 420, 180
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 10, 34
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 10, 10, 34
 _BINS = 24
 _POINTS_MAX = 1500
+_ASIDE = 17
+"""Points over a text lie side by side in so many places."""
 
 Points = Sequence[tuple[float, float, bool]]
 """x, y, and whether the run failed."""
@@ -44,9 +46,11 @@ class _Chart:
         self._line(wall, floor, wall, _TOP)
         for value in self._y:
             self._text(wall - 5, self.at(self._x[0], value)[1] + 4, number(value), "end")
-        ends = [(value, number(value)) for value in self._x]
-        for value, said in below or ends:
+        for value, said in below:
             self._text(self.at(value, self._y[0])[0], floor + 14, said, "middle")
+        if not below:
+            for value, anchor in zip(self._x, ("start", "end"), strict=True):
+                self._text(self.at(value, self._y[0])[0], floor + 14, number(value), anchor)
         self._text((wall + WIDTH) / 2, HEIGHT - 4, name, "middle")
 
     def bar(self, x: float, width: float, y: float, height: float, kind: str) -> None:
@@ -105,10 +109,13 @@ def scatter(points: Points, x_name: str, y_name: str, places: Sequence[str] = ()
     chart = _Chart(x, y, f"{y_name} over {x_name}")
     step = max(1, len(points) // _POINTS_MAX)
     for kind, failed in (("good", False), ("bad", True)):
-        for across, up, bad in points[::step]:
+        for index, (across, up, bad) in enumerate(points[::step]):
+            aside = (index % _ASIDE / _ASIDE - 0.5) / 3 if places else 0.0
             if bad is failed:
-                chart.point(across, up, kind)
-    chart.axes(x_name, [(float(index), said) for index, said in enumerate(places)])
+                chart.point(across + aside, up, kind)
+    chart.axes(
+        f"{y_name} over {x_name}", [(float(index), said) for index, said in enumerate(places)]
+    )
     return chart.element
 
 
@@ -125,7 +132,7 @@ def progress(new: Sequence[bool], failed: Sequence[bool]) -> Element:
 
 def number(value: float) -> str:
     """Return a number in few digits."""
-    return f"{value:.4g}"
+    return f"{value:.3g}"
 
 
 def _wide(ends: tuple[float, float]) -> tuple[float, float]:
