@@ -1,4 +1,4 @@
-"""The results of a explored, put in order: its failures by cause, the settings of its runs."""
+"""The results of a search, put in order: its failures by cause, the settings of its runs."""
 
 from __future__ import annotations
 

@@ -37,7 +37,6 @@ from rsltrace.model.regular_file import not_regular
 from rsltrace.run.plans.clocks import clocks_of
 from rsltrace.run.plans.executables import compiled_file, process_command
 from rsltrace.workspace.imports import unbuilt_names, unbuilt_prefix
-from rsltrace.workspace.installs import module_folders
 
 
 class Processes:
@@ -78,6 +77,8 @@ class Processes:
     def _search_path(self) -> list[str]:
         """Where modules are: those of packages that nobody has built come first, since folders
         with sources (``src/my_robot/my_robot``) look like packages themselves."""
+        from rsltrace.workspace.installs import module_folders  # which loads a parser of XML
+
         given = [self._job.resolve(path) for path in self._job.search_path]
         return [str(path) for path in dict.fromkeys([*module_folders(given), *given])]
 
