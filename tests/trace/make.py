@@ -228,15 +228,22 @@ class Opened:
 
 
 def write_run(
-    path: Path, events: int, *, close: bool = True, compression: str = "zstd", force: bool = False
+    path: Path,
+    events: int,
+    *,
+    close: bool = True,
+    compression: str = "zstd",
+    force: bool = False,
+    checks: str = "",
 ) -> Feeder:
     """Write a run of at least ``events`` events to ``path``; without ``close`` as if it was killed.
 
     Every 20 ms a timer of /talker publishes on /count; /listener receives it, calls /check every
-    fifth time and logs every seventh. The last event raises.
+    fifth time and logs every seventh. The last event raises. ``checks`` are those of its job, in
+    YAML.
     """
     with Opened(path, force=force, compression=compression) as feeder:
-        _feed(feeder, events)
+        _feed(feeder, events, checks)
         if close:
             feeder.writer.close(
                 result={
@@ -249,12 +256,12 @@ def write_run(
     return feeder
 
 
-def _feed(feeder: Feeder, events: int) -> None:
+def _feed(feeder: Feeder, events: int, checks: str) -> None:
     writer = feeder.writer
-    job = b"nodes:\n  - node: demo:Talker\n  - node: demo:Listener\n"
+    job = "nodes:\n  - node: demo:Talker\n  - node: demo:Listener\n" + checks
     writer.add_metadata(METADATA_JOB, {"name": "job.yaml", "resolved": "{}"})
     writer.add_metadata(METADATA_ENVIRONMENT, {"python": "3.12.3", "ros_distro": "jazzy"})
-    writer.add_attachment(ATTACHMENT_JOB, "application/yaml", job)
+    writer.add_attachment(ATTACHMENT_JOB, "application/yaml", job.encode())
 
     talker = feeder.entity(EntityKind.NODE, "/talker")
     rosout = feeder.entity(

@@ -128,6 +128,32 @@ def test_the_viewer_can_be_left_from_its_first_screen(made: Path, drive: Drive) 
     drive(made, steps, overview=True)
 
 
+def test_the_overview_says_which_checks_are_violated(tmp_path: Path, drive: Drive) -> None:
+    from trace_maker import write_run
+
+    kept, broken = "  - never: finding clock\n", "  - never: log info\n"
+    path = tmp_path / "checked.mcap"
+    write_run(path, 600, checks=f"checks:\n{kept}{broken}  - {{function: 'not:called'}}\n")
+
+    async def steps(viewer: Any) -> None:
+        assert "1 check passed" in viewer.text
+        run = viewer.app.session.a
+        logged = [event_of(run, line) for line in list(read_logs(run))[-1].lines]
+        line = f"check violated {len(logged)} times, first at event {logged[0]}: never log info"
+        shown = [one.strip() for one in viewer.text.splitlines()]
+        await viewer.press(*["j"] * (shown.index(line) - 1), "enter")
+        assert viewer.app.session.current()[1] == logged[0]
+
+    drive(path, steps, overview=True)
+
+    write_run(path, 600, force=True, checks="checks:\n  - never: '/count: data <'\n")
+
+    async def wrong(viewer: Any) -> None:
+        assert "checks not evaluated: " in viewer.text
+
+    drive(path, wrong, overview=True)
+
+
 def test_the_overview_leads_to_events(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("O")

@@ -14,6 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration
+from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
@@ -83,6 +84,8 @@ class Session:
         """The log records of each run, once they are read."""
         self.overviews: dict[str, Overview] = {}
         """What is counted of each run so far, once counting was asked for."""
+        self.checks: dict[str, Checks] = {}
+        """What came of the checks of each run that has some (nothing while that is found out)."""
 
     @property
     def runs(self) -> dict[str, Run]:
@@ -119,7 +122,7 @@ class Session:
         self.rows = AllRows(run.count)
         self.lane_window.replace_run(run)
         self.logs.clear()
-        self.overviews = {}  # another one: the old is still filled for a moment
+        self.overviews, self.checks = {}, {}  # others: the old are still filled for a moment
         old.close()
 
     def next_side(self) -> str:
@@ -275,19 +278,23 @@ class Session:
             self.logs[name] = logs
 
     def survey(self) -> Iterator[float]:
-        """Count each run for its overview, a segment at a time; nothing if that is done, or under
-        way. The lanes are filled on the way. Yields the part of a run that is read."""
+        """Count each run for its overview, a segment at a time, and hold its checks against it;
+        nothing if that is done, or under way. The lanes are filled on the way. Yields the part of
+        a run that is read."""
         if self.overviews:
             return iter(())
         self.overviews.update((name, Overview()) for name in self.runs)
-        return self._survey(self.overviews)
+        return self._survey(self.overviews, self.checks)
 
-    def _survey(self, overviews: dict[str, Overview]) -> Iterator[float]:
+    def _survey(self, overviews: dict[str, Overview], checks: dict[str, Checks]) -> Iterator[float]:
         for (name, run), maker in zip(self.runs.items(), self.lane_window.makers, strict=True):
             for number, overviews[name] in enumerate(read_overview(run)):
                 if number < len(run.segments):
                     maker.summarise(number)
                 yield overviews[name].share
+        for name, run in self.runs.items():
+            for checks[name] in read_checks(run):
+                yield 1.0
 
     def _in_lanes(self) -> tuple[int, int] | None:
         here = self.current()

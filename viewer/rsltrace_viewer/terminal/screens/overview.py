@@ -16,6 +16,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
 from rsltrace_viewer.model.cells import cells, fit, wrap
+from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.overview import (
     Overview,
     Part,
@@ -154,7 +155,9 @@ class OverviewScreen(Screen[Choice | None]):
         ]
         heads = [(f"{f'run {name}':>10}", "muted") for name in "ab"] if len(runs) > 1 else []
         whole = all(overview.share >= 1 for _, overview in runs) and len(logs) == len(runs)
-        if whole and not any(one.count for known in found for one in known.values()):
+        wrong = any(one.count for known in found for one in known.values())
+        checks = self._session.checks
+        if whole and not wrong and not any(one.violated or one.error for one in checks.values()):
             yield ((("nothing went wrong", "title"),), None)
             usual = "no exceptions, no errors or warnings logged, no findings of the guard"
             yield (((usual, "good"),), None)
@@ -162,6 +165,11 @@ class OverviewScreen(Screen[Choice | None]):
             yield ((fit("what went wrong", _WHAT), "title"), *heads), None
             for what in dict.fromkeys(what for known in found for what in known):
                 yield _trouble(what, [known.get(what) for known in found])
+        for name, one in checks.items():
+            for text, style, event in _of_checks(one, f" of run {name}" if len(runs) > 1 else ""):
+                goes_there = event is not None and name == "a"
+                for line in wrap(text, max(self.app.size.width - 4, 20)):
+                    yield ((line, style),), ("event", str(event)) if goes_there else None
         for name, (run, _) in zip("ab", runs, strict=False):
             yield (_ending(run, f"run {name}" if len(runs) > 1 else "the run"), None)
         unheard = list(dict.fromkeys(filter(None, (unheard_of(run) for run, _ in runs))))
@@ -244,6 +252,21 @@ def _trouble(what: str, found: Sequence[Trouble | None]) -> _Line:
         return pieces, ("filter", some.filter)
     first = some.first
     return pieces, ("event", str(first)) if first is not None else None
+
+
+def _of_checks(checks: Checks, of_run: str) -> Iterator[tuple[str, str, int | None]]:
+    """Yield what came of the checks of a run: text, style, and the first event of a violation."""
+    if checks.error:
+        yield f"checks{of_run} not evaluated: {printable(checks.error)}", "warning", None
+    for one in checks.violated:
+        first = one.violations[0].event
+        times = "" if one.count == 1 else f"{one.count:,} times, first "
+        where = "at the end" if first is None else f"at event {first:,}"
+        text = f"check{of_run} violated {times}{where}: {printable(one.name)}"
+        yield text, "error", first
+    if checks.passed:
+        number = "1 check" if checks.passed == 1 else f"{checks.passed} checks"
+        yield f"{number}{of_run} passed", "good", None
 
 
 def _ending(run: Run, name: str) -> Pieces:

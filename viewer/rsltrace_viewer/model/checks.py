@@ -1,0 +1,44 @@
+"""What came of the checks of a run's own job."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from rsltrace.errors import RsltraceError
+from rsltrace_viewer.model.run import Run
+
+if TYPE_CHECKING:
+    from rsltrace.checks.evaluate import CheckResult
+
+_STEP = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Checks:
+    """The checks that were violated, how many passed, and why none could be held against the run,
+    if so."""
+
+    violated: tuple[CheckResult, ...] = ()
+    passed: int = 0
+    error: str = ""
+
+
+def read_checks(run: Run) -> Iterator[Checks]:
+    """Hold the checks of a run's job against it: yield now and then, and in the end what came of
+    them; nothing if the job has none, or the run is not finished. Functions are not called, since
+    a trace may come from anybody."""
+    if not run.trace.complete or "checks" not in run.trace.job_text:
+        return
+    from rsltrace.checks.evaluate import PASSED, VIOLATED, evaluating, job_of_checks
+
+    try:
+        for number, results in enumerate(evaluating(run.trace, job_of_checks(run.trace))):
+            if results:
+                violated = tuple(one for one in results if one.verdict == VIOLATED)
+                yield Checks(violated, sum(one.verdict == PASSED for one in results))
+            elif number % _STEP == 0:
+                yield Checks()
+    except RsltraceError as error:
+        yield Checks(error=str(error).splitlines()[0])
