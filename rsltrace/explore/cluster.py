@@ -179,7 +179,7 @@ class Cluster:
     @property
     def idle(self) -> int:
         """How many more trials can be begun."""
-        return max(_AHEAD * self.threads, 1) - self.busy
+        return max(_AHEAD * self.threads - self.busy, 0)
 
     @property
     def busy(self) -> int:

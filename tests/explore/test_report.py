@@ -180,3 +180,26 @@ def test_a_command_that_nobody_can_read_is_not_shown() -> None:
     assert shown.startswith("rsltrace record 'my job.yaml' --seed 4 --set 'policy=")
     many = [{"choice": number, "run": 1} for number in range(100)]
     assert repeat_command(found, TrialResult(Trial(1, {"policy": {"departures": many}}))) is None
+
+
+def test_a_table_can_be_queried_and_merged_with_another(tmp_path: Path) -> None:
+    duckdb = pytest.importorskip("duckdb")
+    from rsltrace.explore.report.parquet import write_parquet
+
+    for name in "ab":
+        (tmp_path / name).mkdir()
+        write_parquet(explored(), tmp_path / name / "results.parquet")
+    write_parquet(Exploration("job.yaml", []), tmp_path / "empty.parquet")
+    other = TrialResult(Trial(0, {"set": {"colour": 3.0, "load": "high"}}), metrics={"time": 2.0})
+    write_parquet(Exploration("job.yaml", [other]), tmp_path / "b" / "more.parquet")
+    assert sorted(path.name for path in tmp_path.rglob(".*")) == []
+    both = f"read_parquet('{tmp_path}/*/*.parquet', union_by_name=true)"
+    runs, failed = duckdb.sql(
+        f"SELECT count(*), count(cause) FROM {both} WHERE job = 'robot/job.yaml'"
+    ).fetchall()[0]
+    assert (runs, failed) == (600, 2 * len(explored().failed))
+    (gain,) = duckdb.sql(
+        f"SELECT min(\"set.nodes.0.parameters.gain\") FROM {both} WHERE cause = 'never /late'"
+    ).fetchall()[0]
+    assert gain > 1.5
+    assert duckdb.sql(f'SELECT "metric.time" FROM {both} WHERE "set.load" = \'high\'').fetchall()

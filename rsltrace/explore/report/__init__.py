@@ -5,4 +5,5 @@ effects       which setting matters
 charts        small pictures, as SVG
 page          a page of HTML that needs nothing beside it
 formats       JSON, JUnit, annotations for GitHub
+parquet       a table of all runs
 """
