@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +23,7 @@ from rsltrace.errors import ExploreError
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
-    from rsltrace.explore.search import Budget, Search
+    from rsltrace.explore.search import Budget, Pool, Search
     from rsltrace.explore.trial import JobSource, TrialResult
     from rsltrace.job import Job
 
@@ -103,6 +104,20 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
     metavar="S",
     help="Kill a run after so many seconds (default: 30 times what the first took, at least 60).",
 )
+@click.option(
+    "--cluster",
+    metavar="ADDRESS",
+    help="Run on the workers of a Dask cluster: its scheduler (tcp://host:8786), or dask for what "
+    "Dask's configuration says.",
+)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("text", "json", "junit", "github")),
+    default="text",
+    show_default=True,
+    help="What to print in the end.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="Only the result, nothing while it searches.")
 def explore(
     words: tuple[str, ...],
@@ -119,6 +134,8 @@ def explore(
     seed: int,
     until: str | None,
     timeout: float | None,
+    cluster: str | None,
+    form: str,
     quiet: bool,
 ) -> int:
     """Run JOB in many orders of its callbacks, and find those in which something fails.
@@ -131,17 +148,18 @@ def explore(
     there by then are kept, and --resume goes on.
     """
     from rsltrace.checks.evaluate import check_texts
+    from rsltrace.checks.metrics import check_metrics
     from rsltrace.explore.search import Search
     from rsltrace.explore.strategies.named import strategy_named
     from rsltrace.explore.table import Table
     from rsltrace.explore.trial import JobSource
-    from rsltrace.explore.workers import Workers, default_jobs
 
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
     source = JobSource(str(named), labelled, text, str(named.parent))
     job = source.job()
     check_texts(job)
+    check_metrics(job)
     folder = output or default_output(named).with_suffix(".explore")
     about = _about(source, job, strategy, seed, depth)
     with terminated(), Table(folder, about, resume=resume) as table:
@@ -149,22 +167,42 @@ def explore(
         search = Search(
             job, chosen, table, budget=budget, stop_at_first=stop_at_first, timeout_s=timeout
         )
+        end = _End(search, source, folder, strategy, form)
         interrupted = False
-        with Workers(source, jobs or default_jobs(), pins=job.guard.pins) as workers:
+        with _pool(source, job, jobs, cluster) as pool:
             try:
                 with _telling(search, budget, quiet=quiet) as on_result:
-                    search.run(workers, on_result)
+                    search.run(pool, on_result)
             except KeyboardInterrupt:
                 interrupted = True
             except ExploreError:
                 if search.tally.runs:
-                    _report(search, source, folder)
+                    end.report(job)
                 raise
-    _report(search, source, folder)
+    end.report(job)
     if interrupted:
         tell(f"interrupted: --resume goes on; the results are in {folder}")
         return _INTERRUPTED
     return 1 if search.tally.failures else 0
+
+
+def _pool(
+    source: JobSource, job: Job, jobs: int | None, cluster: str | None
+) -> AbstractContextManager[Pool]:
+    """Return where the trials are run: here, or on a cluster."""
+    from rsltrace.explore.workers import Workers, default_jobs
+
+    if cluster is None:
+        return Workers(source, jobs or default_jobs(), pins=job.guard.pins)
+    if jobs is not None:
+        raise click.UsageError("--jobs is for this machine: a cluster has as many as it has")
+    try:
+        from rsltrace.explore.cluster import Cluster
+    except ImportError:
+        raise ExploreError(
+            "a cluster needs dask.distributed: pip install 'rsltrace[explore]'"
+        ) from None
+    return Cluster(source, cluster, pins=job.guard.pins)
 
 
 def _about(
@@ -207,8 +245,41 @@ def _telling(
         yield on_result
 
 
-def _report(search: Search, source: JobSource, folder: Path) -> None:
-    from rsltrace.cli.output.search_text import search_lines
+class _End:
+    """The end of a search: what is printed, and the page in its folder."""
 
-    for line in search_lines(search, source, folder):
-        say(line)
+    def __init__(
+        self, search: Search, source: JobSource, folder: Path, strategy: str, form: str
+    ) -> None:
+        self._search = search
+        self._source = source
+        self._folder = folder
+        self._strategy = strategy
+        self._form = form
+
+    def report(self, job: Job) -> None:
+        """Write the page, and print what came of the search."""
+        from rsltrace.cli.output.search_text import search_lines
+        from rsltrace.explore.report.exploration import Exploration
+        from rsltrace.explore.report.formats import github_text, json_text, junit_text
+        from rsltrace.explore.report.page import write_page
+        from rsltrace.explore.table import rows
+
+        source, search = self._source, self._search
+        explored = Exploration(
+            source.path,
+            list(rows(self._folder)),
+            strategy=self._strategy,
+            arguments=[word for _, text in source.overrides for word in ("--set", text)],
+            coverage=search.strategy.coverage(),
+            wall_s=time.monotonic() - search.began_s,
+            units={name: spec.unit for name, spec in job.metrics.items() if spec.unit},
+        )
+        page = self._folder / "report.html"
+        write_page(explored, page)
+        if self._form == "text":
+            for line in search_lines(search, source, self._folder):
+                say(line)
+        else:
+            texts = {"json": json_text, "junit": junit_text, "github": github_text}
+            say(texts[self._form](explored))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from rsltrace.checks.evaluate import VIOLATED, CheckResult, evaluate_checks
 from rsltrace.checks.functions import load_function
+from rsltrace.checks.metrics import evaluate_metrics
 from rsltrace.errors import (
     CheckError,
     DeadlockError,
@@ -82,6 +83,9 @@ def run_trial(
     assert ran.path is not None, "it has been recorded"
     with Trace.open(ran.path) as opened:
         failure = _failure(job, ran, opened, wants)
+        metrics: dict[str, float] = {}
+        if failure is None or failure.kind != ERROR:
+            failure, metrics = _metrics(job, opened, failure, wants)
         found = TrialResult(
             trial,
             digest=ran.digest,
@@ -90,6 +94,7 @@ def run_trial(
             choices=len(watch.order),
             entities=len(watch.entities),
             failure=failure,
+            metrics=metrics,
             final_state=final_state_of(opened),
             behaviours=behaviours_of(opened) if wants.behaviours else (),
             order=tuple(watch.order) if wants.behaviours else (),
@@ -112,8 +117,7 @@ def _failure(job: Job, ran: RunResult, trace: Trace, wants: Wants) -> Failure | 
     except (CheckError, JobError) as error:
         if wants.strict:
             raise
-        first = str(error).splitlines()[0]
-        return Failure(ERROR, shortened(str(error), _TEXT_MAX), f"a check: {first}")
+        return _not_held(error)
     failed = min(_violated(checks), key=lambda one: _order(one.event), default=None)
     if failed is not None:
         return failed
@@ -123,6 +127,28 @@ def _failure(job: Job, ran: RunResult, trace: Trace, wants: Wants) -> Failure | 
         return Failure(UNFINISHED, f"it did not end before its {ran.stop_reason}", "timeout")
     text = f"it ended with exit status {ran.exit_code}: {ran.stop_reason}"
     return Failure(EXIT, text, f"exit status {ran.exit_code}")
+
+
+def _not_held(error: CheckError | JobError) -> Failure:
+    """Return the failure of a run that a check or metric cannot be held against."""
+    text = str(error)
+    return Failure(ERROR, shortened(text, _TEXT_MAX), f"a check: {text.splitlines()[0]}")
+
+
+def _metrics(
+    job: Job, trace: Trace, failure: Failure | None, wants: Wants
+) -> tuple[Failure | None, dict[str, float]]:
+    """Return the run's metrics that have a value, and its failure, which may be one of them."""
+    if not job.metrics:
+        return failure, {}
+    try:
+        with search_path(job):
+            found = evaluate_metrics(trace, job, load_function)
+    except (CheckError, JobError) as error:
+        if wants.strict:
+            raise
+        return failure or _not_held(error), {}
+    return failure, {one.name: one.value for one in found if one.value is not None}
 
 
 def _violated(checks: list[CheckResult]) -> Iterator[Failure]:

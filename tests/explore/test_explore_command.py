@@ -24,6 +24,7 @@ nodes:
   - {node: nodes_under_search:Last}
 stop: {duration: 0.25s}
 checks: [{name: the second comes last, never: "/last: data == 1"}]
+metrics: {said: count("/last")}
 """
 BAD = "nodes: [{node: nodes_under_search:Bad, parameters: {how: HOW}}]\nstop: {duration: 0.15s}\n"
 
@@ -42,6 +43,10 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     assert repeated.returncode == 1
     assert f"digest {found[0].digest}  events {found[0].events}" in repeated.stdout
     assert Path(found[0].trace).is_file()
+    assert found[0].metrics == {"said": 2.0}
+    assert b"the second comes last" in (folder / "report.html").read_bytes()
+    shown = command("explore", job, "--budget", 1, "--resume", "--format", "json", "-o", folder)
+    assert json.loads(shown.stdout)["causes"][0]["key"] == "the second comes last"
     refused = command("explore", job, "--budget", 60, "-o", folder)
     assert refused.returncode == 2
     assert "--resume goes on with it" in refused.stderr

@@ -31,7 +31,7 @@ def search_lines(search: Search, source: JobSource, folder: Path) -> Iterator[st
     yield from search.strategy.coverage()
     if search.is_exhausted:
         yield "nothing is left to try"
-    yield f"results: {folder}"
+    yield f"results: {folder}, as a page: {folder / 'report.html'}"
 
 
 def _cause(result: TrialResult, count: int, source: JobSource) -> Iterator[str]:

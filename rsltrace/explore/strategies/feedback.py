@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -44,7 +43,6 @@ class Feedback:
             if mark not in self._tried:
                 self._tried.add(mark)
                 break
-        self._runs += 1
         policy = {"departures": [{"choice": choice, "run": run} for choice, run in departures]}
         overlay = {**overlay, "policy": policy}
         return Proposal(overlay, f"near what was new, {len(departures)} departures")
@@ -68,11 +66,10 @@ class Feedback:
         return self._keep(result)
 
     def recall(self, result: TrialResult) -> None:
-        policy = result.trial.overlay.get("policy")
-        self._runs += isinstance(policy, Mapping) and "departures" in policy
         self._keep(result)
 
     def _keep(self, result: TrialResult) -> TrialResult | None:
+        self._runs += 1
         new = [one for one in result.behaviours if one not in self._seen]
         if not new:
             return None
@@ -86,6 +83,6 @@ class Feedback:
 
     def coverage(self) -> list[str]:
         return [
-            f"feedback: {self._new_runs} of {self._runs + 1} runs showed something new, "
+            f"feedback: {self._new_runs} of {self._runs} runs showed something new, "
             f"{len(self._seen)} behaviours in all"
         ]
