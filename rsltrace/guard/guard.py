@@ -215,6 +215,25 @@ class Guard:
             except KeyError:
                 self._answered[source].setdefault(call, {})[node] = 1
 
+    def answered(
+        self, source: Source, call: str, told: Callable[[], str], frame: FrameType
+    ) -> None:
+        """Let the trace keep what user code was told from outside, in an order that the run makes:
+        no finding, but what two runs may differ in."""
+        user = user_frame(frame, self.packages) if self.is_for_user(frame) else None
+        event, entity = self.context.place()
+        if user is None or not self._has_room(event):
+            return
+        node, stack = self.context.node(), stack_of(user, self.packages)
+        self.on_finding(Finding(event, entity, node, source, Mode.VIRTUAL, call, told(), stack))
+
+    def _has_room(self, event: int) -> bool:
+        """Count one more of an event, and return whether the trace has room for it."""
+        if event != self._event:
+            self._event, self._in_event = event, 0
+        self._in_event += 1
+        return self._in_event <= FINDINGS_PER_EVENT
+
     def found(
         self,
         source: Source,
@@ -231,10 +250,7 @@ class Guard:
         node = self.context.node()
         self._found[source, mode, node, call] += 1
         event, entity = self.context.place()
-        if event != self._event:
-            self._event, self._in_event = event, 0
-        self._in_event += 1
-        if self._in_event <= FINDINGS_PER_EVENT or mode in (Mode.ERROR, Mode.RECORD):
+        if self._has_room(event) or mode in (Mode.ERROR, Mode.RECORD):
             user = user_frame(frame, self.packages)
             stack = stack_of(user or frame, self.packages)
             if told is not None:

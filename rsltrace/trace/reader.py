@@ -27,7 +27,7 @@ from rsltrace.mcap.summary import has_end
 from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
-from rsltrace.model.finding import Finding, GuardCount
+from rsltrace.model.finding import Finding, GuardCount, Mode
 from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.check import check_data_section, check_hashes, check_records
@@ -308,11 +308,20 @@ class Trace:
     @cached_property
     def findings(self) -> dict[int, list[Finding]]:
         """What the guard found, by event and in order; events without findings are missing."""
-        findings: dict[int, list[Finding]] = {}
+        kept = {
+            event: [finding for finding in answers if finding.mode is not Mode.VIRTUAL]
+            for event, answers in self.answers.items()
+        }
+        return {event: findings for event, findings in kept.items() if findings}
+
+    @cached_property
+    def answers(self) -> dict[int, list[Finding]]:
+        """The findings, with what came from outside in an order that the run has made."""
+        answers: dict[int, list[Finding]] = {}
         for _, _, data in self.messages(TOPIC_FINDINGS):
             finding = self._named(unpack_finding, data)
-            findings.setdefault(finding.event, []).append(finding)
-        return findings
+            answers.setdefault(finding.event, []).append(finding)
+        return answers
 
     @cached_property
     def code_lines(self) -> dict[int, list[CodeLine]]:

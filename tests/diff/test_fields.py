@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.bags.content import ContentKeys
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.fields import SAME_WORDS, FieldDifference
 from rsltrace.diff.values.fields import diff_messages, preview
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import ulp_distance
@@ -192,6 +192,23 @@ def test_texts_say_where_they_part() -> None:
     assert found.note == "first at character 120; length 200 and 150"
     assert "xy" in found.b
     assert len(found.a) < 70
+
+
+@pytest.mark.parametrize(
+    ("a", "b", "is_reordered"),
+    [
+        ("left, right, top", "top, left, right", True),
+        ("['near', 'far']", "['far', 'near']", True),
+        ("x=1;y=2", "y=2;x=1", True),
+        ("left right", "left  right", False),
+        ("1.25", "25.1", False),
+        ("left, left, top", "left, top, top", False),
+    ],
+)
+def test_texts_that_list_the_same_in_another_order_say_so(
+    a: str, b: str, is_reordered: bool
+) -> None:
+    assert (only(message(text=a), message(text=b)).note == SAME_WORDS) is is_reordered
 
 
 def test_one_element_is_named_by_its_index() -> None:

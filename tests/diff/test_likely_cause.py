@@ -37,6 +37,10 @@ def call(
             "/picker read gains.yaml only in b, at picker.py:24",
         ),
         (
+            call("directory", "os.listdir('/x/models')", "1 name (a)", "2 names (a, b)"),
+            "/picker listed models, 1 name (a) in a and 2 names (a, b) in b, at picker.py:24",
+        ),
+        (
             call("random", "random.random()", "0.25", "0.5"),
             "/picker drew random.random(), 0.25 in a and 0.5 in b, at picker.py:24",
         ),

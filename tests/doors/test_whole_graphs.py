@@ -87,7 +87,7 @@ def test_the_same_with_a_missing_server_is_a_deadlock_that_names_both_sides(simu
     text = str(caught.value)
     assert log == []
     for who, what in (
-        ("first: service /first", "/second (1 servers)"),
+        ("first: service /first", "/second (1 server)"),
         ("second: service /second", "/third (0 servers)"),
     ):
         assert f"/{who} waits for the response to a service call, of {what}" in text

@@ -50,24 +50,24 @@ def call_differences(
     return (*earlier, *programs, *inside)[:CALLS_MAX]
 
 
-def unrecorded_call(run: Run, view: EventView) -> str:
-    """Say which answer of a socket or a program nobody kept: the last one in an event, else the
-    last one before it in its node; "" if there was none."""
+def unrecorded_call(run: Run, view: EventView) -> tuple[str, str] | None:
+    """Say which answer of a socket or a program nobody kept, and what keeps it: the last one in an
+    event, else the last one before it in its node; None if there was none."""
     found = [*_before(run, view), *_inside(run, view)]
     kept = (f for f in reversed(found) if f.source in _ANSWERED and f.mode is Mode.WARN)
     one = next(kept, None)
     if one is None:
-        return ""
+        return None
     call = one.call.removesuffix("()") + (f"({one.value})" if one.call.endswith("()") else "")
+    place = one.stack.partition(" in ")[0]
     return (
-        f"what came back from {shortened(printable(call), _CALL_MAX)} at "
-        f"{one.stack.partition(' in ')[0]} is not recorded (guard: {{{one.source.value}: record}} "
-        "in the job keeps it)"
+        f"what came back from {shortened(printable(call), _CALL_MAX)} at {place}",
+        f"guard: {{{one.source.value}: record}} in the job keeps it",
     )
 
 
 def _inside(run: Run, view: EventView | None) -> list[Finding]:
-    return run.trace.findings.get(view.index, []) if view is not None else []
+    return run.trace.answers.get(view.index, []) if view is not None else []
 
 
 def _before(run: Run, view: EventView | None) -> list[Finding]:
@@ -78,7 +78,7 @@ def _before(run: Run, view: EventView | None) -> list[Finding]:
     files = _files_of(run, view)
     return [
         finding
-        for index, found in run.trace.findings.items()
+        for index, found in run.trace.answers.items()
         for finding in found
         if (index < view.index and _is_of(run, finding, node, view))
         or _is_of_import(finding, files)

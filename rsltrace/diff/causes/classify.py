@@ -15,6 +15,7 @@ from rsltrace.diff.causes.output_notes import durations
 from rsltrace.diff.causes.propagation import NODE
 from rsltrace.diff.causes.relevance import Place, Relevance
 from rsltrace.diff.causes.wording import (
+    a_first,
     because_of,
     field_text,
     listed,
@@ -33,6 +34,8 @@ from rsltrace.words.phrases import at_time
 _NO_DRAW = "none"
 _QOS_EVENT = "new qos event "
 _NO_CALLBACKS = (EntityKind.MAIN.label, EntityKind.THREAD.label)
+_DRAWN_FROM = ("delay", "execution", "seed", "clocks")
+"""Keys of a job that decide whether something is drawn."""
 _OF_BAGS = ("bags", "start", "construct_time", "min_time_step")
 """Keys of a job that decide when a bag's message is played."""
 
@@ -176,7 +179,7 @@ def _construction(case: Case) -> Judgement:
     elif case.inverted:
         sentence = "the nodes are constructed in another order"
     else:
-        changed = [m for m in case.messages if m.kind is OutputKind.ENTITY]
+        changed = a_first([m for m in case.messages if m.kind is OutputKind.ENTITY])
         if changed:
             where = {"only a": "only in a", "only b": "only in b"}
             types: dict[str, list[str]] = {}
@@ -372,10 +375,18 @@ def _different_input(case: Case, a: EventView, b: EventView) -> Judgement:
 
 
 def _another_cause(case: Case, a: EventView, b: EventView) -> Judgement:
-    sentence = (
-        f"{phrase(a)} {at_time(a.stamp_ns)} received equal inputs, but of other events: "
-        f"{_event(a.cause_event)} in a, {_event(b.cause_event)} in b"
-    )
+    if a.cause_event == b.cause_event and a.output_hash != b.output_hash:
+        sentence = (
+            f"{phrase(a)} {at_time(a.stamp_ns)} did the same in both runs, but in one of them with "
+            "delays of 0 ns, which change nothing"
+        )
+        why = case.because(drawn=True) or "only one of the runs gives what it sent a delay"
+        return Judgement(Verdict.DRAW, Root.DRAW, sentence, why, a, b)
+    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} received equal inputs, but of other "
+    if a.cause_event == b.cause_event:
+        sentence += f"outputs of {_event(a.cause_event)}"
+    else:
+        sentence += f"events: {_event(a.cause_event)} in a, {_event(b.cause_event)} in b"
     why = "two equal messages were delivered in another order"
     return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, why, a, b)
 
@@ -390,12 +401,12 @@ def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDiffere
     if first.topic == drawn_for(a.entity) and not is_clock:
         took = (text.replace("takes ", "").replace(_NO_DRAW, "no time") for text in (was_a, was_b))
         what = "took {} in a and {} in b".format(*took)
-    if _NO_DRAW in (was_a, was_b) and not is_clock and not because:
+    of_delays = any(setting.key.partition(".")[0] in _DRAWN_FROM for setting in case.blamed)
+    if _NO_DRAW in (was_a, was_b) and not is_clock and not of_delays:
         has, has_not = ("b", "a") if was_a == _NO_DRAW else ("a", "b")
         what = f"what it sent goes to {first.topic} only in {has}"
-        because = (
-            f"in {has_not} nothing is under way to {first.topic}: it is gone, or not connected"
-        )
+        gone = f"in {has_not} nothing is under way to {first.topic}: it is gone, or not connected"
+        because = f"{gone}; {because}" if because else gone
     chance = "" if because and "seed" not in because else "chance decided otherwise: "
     sentence = f"{phrase(a)} {at_time(a.stamp_ns)} {same}, but {chance}{what}"
     if len(draws) > 1:

@@ -112,7 +112,8 @@ def _setting(setting: Setting) -> str:
     place = f" ({printable(setting.place)})" if setting.place != "job" else ""
     values = [value for value in (setting.a, setting.b) if value is not None]
     if any(len(value) > _VALUE_MAX or "\n" in value for value in values):
-        return f"{name} differs{place}"
+        which = "differs" if len(values) == 2 else f"only in {'b' if setting.a is None else 'a'}"
+        return f"{name} {which}{place}"
     shown = [printable(value) for value in values]
     if len(shown) == 2:
         return f"{name} {' → '.join(shown)}{place}"

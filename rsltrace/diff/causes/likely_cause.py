@@ -74,10 +74,15 @@ def _with_unrecorded(judgement: Judgement, run: Run, view: EventView) -> Judgeme
     """Name the answer that nobody kept, where nothing that is known explains a divergence."""
     if NOT_DETERMINISTIC not in judgement.root_sentence:
         return judgement
-    text = unrecorded_call(run, view)
-    if not text:
+    found = unrecorded_call(run, view)
+    if found is None:
         return judgement
-    return replace(judgement, root_sentence=f"{judgement.root_sentence}; {text}")
+    call, advice = found
+    return replace(
+        judgement,
+        sentence=f"{judgement.sentence}; possible cause: {call}, which is not recorded",
+        root_sentence=f"{judgement.root_sentence}; {call} is not recorded ({advice})",
+    )
 
 
 def calls_sentence(
@@ -135,7 +140,7 @@ def call_sentence(call: CallDifference, node: str) -> str:
 def _what(source: Source, call: str) -> str:
     if source is Source.ENVIRONMENT and (found := _VARIABLE.match(call)):
         return found[2]
-    if source is Source.FILE and (found := _FILE.match(call)):
+    if source in (Source.FILE, Source.DIRECTORY) and (found := _FILE.match(call)):
         return found[2]
     return call
 

@@ -156,8 +156,10 @@ class _Evidence:
                 value = self._decoded(run, output)
             except TraceError as error:
                 return replace(base, reason=str(error))
+            if value is None and kind not in _WITH_PAYLOAD:
+                return base
             if value is None:
-                return replace(base, reason=self._not_recorded(run, output, topic))
+                return replace(base, reason=self._not_recorded(run, topic))
             values.append(value)
         if kind == OutputKind.EXCEPTION:
             raised = [_last_line(value) for value in values]
@@ -193,9 +195,7 @@ class _Evidence:
             return None
         return trace.decode(channel, found[2])
 
-    def _not_recorded(self, run: Run, row: OutputRow, topic: str) -> str:
-        if row[0] not in _WITH_PAYLOAD:
-            return "nothing more than its hash is recorded"
+    def _not_recorded(self, run: Run, topic: str) -> str:
         where = "b" if run.of_b else "a"
         return (
             f"only its hash was recorded in {where}; to see its fields, record with payloads: true "

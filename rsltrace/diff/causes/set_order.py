@@ -12,7 +12,7 @@ from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.result.divergence import CallDifference, MessageDifference
 from rsltrace.diff.result.events import EventView
-from rsltrace.diff.result.fields import SAME_ELEMENTS
+from rsltrace.diff.result.fields import SAME_ELEMENTS, SAME_WORDS
 from rsltrace.errors import JobError
 from rsltrace.model.finding import Source
 from rsltrace.trace.format import METADATA_SOURCES
@@ -47,7 +47,10 @@ def set_behind(
 
 
 def _is_reordered(message: MessageDifference) -> bool:
-    return message.note == IN_ANOTHER_ORDER or any(SAME_ELEMENTS in f.note for f in message.fields)
+    notes = [field.note for field in message.fields]
+    return message.note == IN_ANOTHER_ORDER or any(
+        same in note for note in notes for same in (SAME_ELEMENTS, SAME_WORDS)
+    )
 
 
 def _is_as_recorded(run: Run, file: Path) -> bool:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 from rsltrace.diff.causes.output_notes import IN_ANOTHER_ORDER
 from rsltrace.diff.result.divergence import MessageDifference, StateDifference
-from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
+from rsltrace.diff.result.fields import SAME_ELEMENTS, SAME_WORDS, FieldDifference
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.values.constants import NAMED
 from rsltrace.model.event import OutputKind
@@ -23,10 +24,19 @@ _IN_ONE = {"only a": " only in a", "only b": " only in b"}
 _LABELS = {OutputKind.REQUEST: "call ", OutputKind.RESPONSE: "reply "}
 
 
+def a_first(messages: Sequence[MessageDifference]) -> list[MessageDifference]:
+    """Return messages with what is only in a in front, among as many as a sentence names."""
+    named = sorted(messages[:NAMED_MAX], key=lambda message: message.presence == "only b")
+    return [*named, *messages[NAMED_MAX:]]
+
+
 def what_differs(messages: Sequence[MessageDifference]) -> str:
     """Return `` (/odom: pose.x 1.0 → 1.5, call /plan only in b)``, "" if no output differs."""
-    moved = [_label(m) for m in messages if m.position >= 0 and m.note == IN_ANOTHER_ORDER]
-    things = [_thing(m) for m in messages if m.position >= 0 and m.note != IN_ANOTHER_ORDER]
+    outputs = [m for m in messages if m.position >= 0]
+    moved = [_label(m) for m in outputs if m.note == IN_ANOTHER_ORDER]
+    things = [_thing(m) for m in a_first([m for m in outputs if m.note != IN_ANOTHER_ORDER])]
+    times = Counter(things)
+    things = [f"{thing}, {n} times" if n > 1 else thing for thing, n in times.items()]
     if moved:
         things.insert(0, f"{_and(moved)} {IN_ANOTHER_ORDER}")
     return f" ({listed(things)})" if things else ""
@@ -54,7 +64,7 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
     else:
         a, b = (shortened(value, _VALUE_MAX) for value in (first.a, first.b))
         text = f"{first.path} {a} → {b}"
-        text += f" ({first.note})" if NAMED in first.note else ""
+        text += f" ({first.note})" if NAMED in first.note or first.note == SAME_WORDS else ""
     more = len(fields) - 1 + more_fields
     return f"{text} and {more} more field{'s' if more > 1 else ''}" if more else text
 

@@ -20,6 +20,7 @@ _VERBS = {
     OutputKind.RESPONSE: "response of",
     OutputKind.LOG: "log record on",
 }
+_TYPED = (None, OutputKind.ENTITY, *_VERBS)
 
 
 def message_title(message: MessageDifference) -> str:
@@ -28,12 +29,15 @@ def message_title(message: MessageDifference) -> str:
         what = "input"
     else:
         verb = _VERBS.get(message.kind, message.kind.label)
-        what = f"output {message.position}: {verb}" if message.position >= 0 else f"input: {verb}"
-    named = message.kind is None or message.topic != message.kind.label
-    text = f"{what} {printable(message.topic)}".rstrip() if named else what
-    if message.type:
+        what = f"output {message.position}:" if message.position >= 0 else "input:"
+        if not message.topic.startswith(verb):  # "timer Arm.control" says what it is
+            what = f"{what} {verb}"
+    text = f"{what} {printable(message.topic)}".rstrip()
+    if message.type and message.kind in _TYPED:
         text += f" ({printable(message.type)})"
-    if message.presence != "both":
+    if message.kind is OutputKind.TIMER and message.note:
+        text += f", {message.note}"
+    elif message.presence != "both":
         text += f", {message.presence}"
     if message.code:
         text += f", at {printable(places_text(list(message.code)))}"

@@ -9,6 +9,8 @@ ULP_TOLD_MAX = 1_000_000
 
 SAME_ELEMENTS = "the same elements in another order"
 """In the note of an array, or a list, that was put together in another order."""
+SAME_WORDS = "the same words in another order"
+"""In the note of a text."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,6 +18,7 @@ from rsltrace.words.phrases import at_time, seconds_text
 
 _LOOKED_AT_MAX = 100
 _ERROR_MAX = 300
+_WAITS_MAX = 160
 NOTHING_LEFT = "nothing left to do"
 
 
@@ -62,6 +63,13 @@ def _why_ended(over: Trace, name: str, job: Sequence[Setting]) -> str:
 def had_nothing_left(trace: Trace) -> bool:
     """Whether a run ended since no timer, wait or message was left in it."""
     return trace.complete and not exit_code(trace) and stop_reason(trace) == NOTHING_LEFT
+
+
+def _waits(trace: Trace) -> str:
+    """Return who waits for what in a run that ended in a deadlock, "" for any other."""
+    if not exit_code(trace) or stop_reason(trace) != NOTHING_LEFT:
+        return ""
+    return error_text(trace).partition(": ")[2]
 
 
 def exit_code(trace: Trace) -> int:
@@ -141,8 +149,11 @@ def judge_end(
     verdict = Verdict.ENDED_EARLY if over is b else Verdict.RAN_LONGER
     name, other_name, other = ("b", "a", a) if over is b else ("a", "b", b)
     where = f" {at_time(over.end_ns)}" if over.event_count else ""
+    how = f"ended{where} ({stop_reason(over)})"
+    if waits := _waits(over):
+        how = f"got stuck{where} ({shortened(waits, _WAITS_MAX)})"
     sentence = (
-        f"run {name} ended{where} ({stop_reason(over)}), {other_name} did the same until then and "
+        f"run {name} {how}, {other_name} did the same until then and "
         f"went on {'to' if other.end_ns != over.end_ns else 'until'} "
         f"{seconds_text(other.end_ns)} s ({stop_reason(other)})"
     )

@@ -8,6 +8,7 @@ module calls equal has equal canonical CDR.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Hashable, Iterator
 from functools import lru_cache
 from typing import Any, cast
@@ -15,7 +16,7 @@ from typing import Any, cast
 import numpy as np
 
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.fields import SAME_ELEMENTS, FieldDifference
+from rsltrace.diff.result.fields import SAME_ELEMENTS, SAME_WORDS, FieldDifference
 from rsltrace.diff.values.constants import with_names
 from rsltrace.diff.values.globs import FieldRules
 from rsltrace.diff.values.numbers import (
@@ -37,6 +38,8 @@ _NO_FIELD = "only one of the types has this field"
 _SECONDS_MAX = 2.0**33
 """More than any two times are apart."""
 _TEXT_MAX = 60
+_WORDS_MAX = 10_000
+_BETWEEN_WORDS = re.compile(r"[\s,;|&()\[\]{}'\"]+")
 _TEXT_BEFORE = 20
 _SORTED_MAX = 1000
 _ITEM_MAX = 2000
@@ -220,11 +223,18 @@ def _text_difference(path: str, a: str, b: str) -> FieldDifference:
     at = next(
         (i for i, (x, y) in enumerate(zip(a, b, strict=False)) if x != y), min(len(a), len(b))
     )
-    note = ""
+    note = SAME_WORDS if _is_reordered(a, b) else ""
     if max(len(a), len(b)) > _TEXT_MAX:
-        note = f"first at character {at}; length {len(a)} and {len(b)}"
+        note = note or f"first at character {at}; length {len(a)} and {len(b)}"
         a, b = _excerpt(a, at), _excerpt(b, at)
     return FieldDifference(path or WHOLE, _quoted(a), _quoted(b), note=note)
+
+
+def _is_reordered(a: str, b: str) -> bool:
+    """Whether two texts list the same in another order: they may have been put together from a
+    set."""
+    words_a, words_b = (_BETWEEN_WORDS.split(text[:_WORDS_MAX]) for text in (a, b))
+    return words_a != words_b and sorted(words_a) == sorted(words_b)
 
 
 def _excerpt(text: str, at: int) -> str:

@@ -51,7 +51,8 @@ def answer(rng: random.Random) -> Planted:
 @fault("answer on a socket that is not recorded")
 def unrecorded(rng: random.Random) -> Planted:
     a, b, truth = _asked(rng, "warn", "ask({port})")
-    return Planted(a, b, replace(truth, says=(r"not deterministic", r"socket|connect")))
+    first = (r"possible cause: what came back from socket\.connect.* at .*\.py:\d+",)
+    return Planted(a, b, replace(truth, first=first, says=(r"not deterministic",)))
 
 
 @fault("answer over HTTP")

@@ -159,7 +159,18 @@ def directory(rng: random.Random) -> Planted:
     b = a.copy()
     b.files["more.txt"] = "more\n"
     b.folder = "elsewhere"
-    return Planted(a, b, _truth(node, r"listdir"))
+    return Planted(a, b, _truth(node, r"listed"))
+
+
+@fault("name in a directory that is listed in order")
+def name(rng: random.Random) -> Planted:
+    line = 'float(len(os.listdir(pathlib.Path(__file__).with_name("things"))))'
+    a, node = _reads(rng, line, in_constructor=False)
+    a.files["things/one"] = "1\n"
+    b = a.copy()
+    b.files["things/more"] = "2\n"
+    listed = r"listed things, 1 name \(one\) in a and 2 names \(more, one\) in b, at .*:\d+"
+    return Planted(a, b, _truth(node, listed))
 
 
 @fault("output of a program")

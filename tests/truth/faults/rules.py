@@ -66,6 +66,15 @@ def bounds(rng: random.Random) -> Planted:
     return Planted(a, b, Truth(("draw", "timing"), first=first, says=(r"delay",), never=DRAWN))
 
 
+@fault("delay of 0 ns")
+def no_delay(rng: random.Random) -> Planted:
+    a = random_world(rng)
+    topic = one_of(rng, a, "relay").hears[0]
+    b = changed(a, "delay", {"topics": {topic: "0ms"}})
+    first = (r"delays of 0 ns, which change nothing",)
+    return Planted(a, b, Truth(("draw",), first=first, says=(r"delay",), never=DRAWN))
+
+
 @fault("delay of a service")
 def service_delay(rng: random.Random) -> Planted:
     a = random_world(rng, service=True)

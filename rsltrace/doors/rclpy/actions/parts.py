@@ -16,6 +16,7 @@ from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHan
 from rsltrace.doors.rclpy.handles.services import ClientHandle, ServiceHandle
 from rsltrace.doors.rclpy.stacks.code_lines import Functions
 from rsltrace.doors.rclpy.stacks.tasks import executor_of, start_coroutine
+from rsltrace.doors.rclpy.stacks.wait_reasons import servers_text
 from rsltrace.doors.rclpy.wire.interfaces import type_name
 from rsltrace.model.event import EventKind
 
@@ -145,9 +146,10 @@ class ActionHandle(Handle):
         for what in ("goal", "result", "cancel"):
             pending = getattr(waitable, f"_pending_{what}_requests", {})
             if future in pending.values():
-                servers = len(self.stacks.domain.graph.services(self.path("send_goal")))
+                graph = self.stacks.domain.graph
+                servers = servers_text(len(graph.services(self.path("send_goal"))))
                 answer = "the result of a goal" if what == "result" else f"the answer to a {what}"
-                return f"{answer}, of action {self.name} ({servers} servers)"
+                return f"{answer}, of action {self.name} ({servers})"
         return ""
 
     async def execute(self, part: Part) -> None:

@@ -8,6 +8,11 @@ from typing import Any
 from rsltrace.middleware.graph import Graph
 
 
+def servers_text(servers: int) -> str:
+    """Return ``1 server``, ``0 servers``."""
+    return f"{servers} server{'' if servers == 1 else 's'}"
+
+
 def awaited(graph: Graph, future: object) -> str:
     """Say what would complete a future: the service it is a request to, if it is one."""
     if future is None:
@@ -21,8 +26,8 @@ def awaited(graph: Graph, future: object) -> str:
                     "shares a mutually exclusive callback group with this callback, which "
                     "keeps the group busy; give the client a callback group of its own"
                 )
-            servers = len(graph.services(client.service))
-            return f"the response of {client.service} ({servers} servers)"
+            servers = servers_text(len(graph.services(client.service)))
+            return f"the response of {client.service} ({servers})"
     actions: list[Any] = [action for node in graph.nodes for action in node.actions]
     for action in actions:
         what: str = action.waits_for(future)
@@ -38,7 +43,7 @@ def called_service(graph: Graph, frame: FrameType | None) -> str:
     while frame is not None:
         if frame.f_code is Client.call.__code__:
             service = frame.f_locals["self"].handle.service
-            servers = len(graph.services(service))
-            return f"the response to a service call, of {service} ({servers} servers)"
+            servers = servers_text(len(graph.services(service)))
+            return f"the response to a service call, of {service} ({servers})"
         frame = frame.f_back
     return ""
