@@ -63,6 +63,8 @@ def explored(bug: Bug, strategy: str, seeds: Sequence[int], budget: int, jobs: i
 
 def native(bug: Bug, seconds: float) -> Figures:
     """Run a bug natively for some time."""
+    if not bug.native:
+        return {"problem": "its checks cannot be watched natively"}
     command = [sys.executable, str(ROOT / "benchmarks" / "explore_native.py"), str(bug.job)]
     done = subprocess.run(
         [*command, "--seconds", str(seconds)], capture_output=True, text=True, timeout=3600

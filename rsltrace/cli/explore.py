@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -258,11 +258,12 @@ class _End:
         self._form = form
 
     def report(self, job: Job) -> None:
-        """Write the page, and print what came of the search."""
+        """Write the page and the table, and print what came of the search."""
         from rsltrace.cli.output.search_text import search_lines
         from rsltrace.explore.report.exploration import Exploration
         from rsltrace.explore.report.formats import github_text, json_text, junit_text
         from rsltrace.explore.report.page import write_page
+        from rsltrace.explore.report.parquet import write_parquet
         from rsltrace.explore.table import rows
 
         source, search = self._source, self._search
@@ -275,8 +276,15 @@ class _End:
             wall_s=time.monotonic() - search.began_s,
             units={name: spec.unit for name, spec in job.metrics.items() if spec.unit},
         )
-        page = self._folder / "report.html"
-        write_page(explored, page)
+        try:
+            write_page(explored, self._folder / "report.html")
+            with suppress(ExploreError):  # without pyarrow there are the rows alone
+                write_parquet(explored, self._folder / "results.parquet")
+        except OSError as error:
+            raise ExploreError(
+                f"the report in {self._folder} cannot be written: {error.strerror}; the results "
+                "are kept there, and --resume goes on"
+            ) from None
         if self._form == "text":
             for line in search_lines(search, source, self._folder):
                 say(line)

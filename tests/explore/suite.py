@@ -21,6 +21,8 @@ class Bug:
     folder: Path
     kind: str
     search: str
+    native: bool = True
+    """Whether its checks can be watched natively."""
 
     @property
     def name(self) -> str:
@@ -43,5 +45,5 @@ def all_bugs() -> list[Bug]:
     found = []
     for job in sorted(BUGS.glob("*/*/job.yaml")):
         about = YAML(typ="safe").load(job)["x-bug"]
-        found.append(Bug(job.parent, about["kind"], about["search"]))
+        found.append(Bug(job.parent, about["kind"], about["search"], about.get("native", True)))
     return found
