@@ -20,14 +20,16 @@ from rsltrace.cli.job_source import (
 from rsltrace.cli.record import default_output
 from rsltrace.cli.verify import terminated
 from rsltrace.errors import ExploreError
+from rsltrace.model.printable import printable
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
     from rsltrace.explore.search import Budget, Pool, Search
+    from rsltrace.explore.small.causes import SmallRun
     from rsltrace.explore.trial import JobSource, TrialResult
     from rsltrace.job import Job
 
-STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic")
+STRATEGIES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 _FORMAT = 1
 _INTERRUPTED = 130
 
@@ -118,6 +120,12 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
     show_default=True,
     help="What to print in the end.",
 )
+@click.option(
+    "--small",
+    is_flag=True,
+    help="Make the first run of each cause small, and write it as a folder that repeats it (with "
+    "--resume also later).",
+)
 @click.option("-q", "--quiet", is_flag=True, help="Only the result, nothing while it searches.")
 def explore(
     words: tuple[str, ...],
@@ -136,6 +144,7 @@ def explore(
     timeout: float | None,
     cluster: str | None,
     form: str,
+    small: bool,
     quiet: bool,
 ) -> int:
     """Run JOB in many orders of its callbacks, and find those in which something fails.
@@ -153,6 +162,7 @@ def explore(
     from rsltrace.explore.strategies.named import strategy_named
     from rsltrace.explore.table import Table
     from rsltrace.explore.trial import JobSource
+    from rsltrace.explore.vary import check_vary
 
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
@@ -160,6 +170,8 @@ def explore(
     job = source.job()
     check_texts(job)
     check_metrics(job)
+    if strategy == "vary":
+        check_vary(source, job)
     folder = output or default_output(named).with_suffix(".explore")
     about = _about(source, job, strategy, seed, depth)
     with terminated(), Table(folder, about, resume=resume) as table:
@@ -179,6 +191,8 @@ def explore(
                 if search.tally.runs:
                     end.report(job)
                 raise
+    if small and not interrupted:
+        end.make_small(job, timeout, quiet=quiet)
     end.report(job)
     if interrupted:
         tell(f"interrupted: --resume goes on; the results are in {folder}")
@@ -256,11 +270,38 @@ class _End:
         self._folder = folder
         self._strategy = strategy
         self._form = form
+        self._small: dict[str, SmallRun] = {}
+
+    def make_small(self, job: Job, timeout_s: float | None, *, quiet: bool) -> None:
+        """Make one run of each cause small."""
+        from rsltrace.explore.small.causes import make_small
+
+        def on_begin(cause: str) -> None:
+            if not quiet:
+                tell(f"making it small: {cause}")
+
+        self._small = make_small(
+            self._source,
+            self._search.tally.first,
+            self._folder,
+            pins=job.guard.pins,
+            timeout_s=timeout_s,
+            on_begin=on_begin,
+        )
+
+    def _say_small(self) -> None:
+        for cause, one in self._small.items():
+            if one.trouble:
+                say(printable(f"not made small: {cause}: {one.trouble}"))
+                continue
+            say(printable(f"made small: {cause}: {one.folder / 'README.md'}"))
+            if one.decides:
+                say(printable(f"  {one.decides}"))
 
     def report(self, job: Job) -> None:
         """Write the page and the table, and print what came of the search."""
         from rsltrace.cli.output.search_text import search_lines
-        from rsltrace.explore.report.exploration import Exploration
+        from rsltrace.explore.report.exploration import Exploration, Reduced
         from rsltrace.explore.report.formats import github_text, json_text, junit_text
         from rsltrace.explore.report.page import write_page
         from rsltrace.explore.report.parquet import write_parquet
@@ -274,6 +315,11 @@ class _End:
             arguments=[word for _, text in source.overrides for word in ("--set", text)],
             coverage=search.strategy.coverage(),
             wall_s=time.monotonic() - search.began_s,
+            reduced={
+                cause: Reduced(str(one.folder), one.decides)
+                for cause, one in self._small.items()
+                if not one.trouble
+            },
             units={name: spec.unit for name, spec in job.metrics.items() if spec.unit},
         )
         try:
@@ -288,6 +334,7 @@ class _End:
         if self._form == "text":
             for line in search_lines(search, source, self._folder):
                 say(line)
+            self._say_small()
         else:
             texts = {"json": json_text, "junit": junit_text, "github": github_text}
             say(texts[self._form](explored))

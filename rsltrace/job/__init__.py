@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rsltrace.job.parts.node import NodeSpec
     from rsltrace.job.parts.record import RecordSpec
     from rsltrace.job.parts.stop import StopSpec, TopicStop
+    from rsltrace.job.parts.vary import VarySpec
     from rsltrace.job.reading.load import job_from_text, load_job, locate, showing_line
 
 _HOMES = {
@@ -40,6 +41,7 @@ _HOMES = {
     "load_job": "reading.load",
     "locate": "reading.load",
     "showing_line": "reading.load",
+    "VarySpec": "parts.vary",
     "policy_of": "parts.guard",
 }
 
@@ -58,6 +60,7 @@ __all__ = [
     "SourceSpec",
     "StopSpec",
     "TopicStop",
+    "VarySpec",
     "job_from_text",
     "load_job",
     "locate",

@@ -62,6 +62,11 @@ def _relative(job: JobFields, path: str) -> str:
     return os.path.relpath(job.resolve(path), job.base_dir).replace(os.sep, "/")
 
 
+def plain_part(part: Part) -> dict[str, Any]:
+    """Return a part of a job as a job file has it: every key that differs from its default."""
+    return _explicit(part)
+
+
 def _explicit(part: Part) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name, field in type(part).model_fields.items():

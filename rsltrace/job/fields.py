@@ -30,6 +30,7 @@ from rsltrace.job.parts.scheduling import (
     policy_part,
 )
 from rsltrace.job.parts.stop import StopSpec
+from rsltrace.job.parts.vary import VarySpec
 from rsltrace.job.values.checks import (
     attach,
     check,
@@ -241,6 +242,13 @@ class JobFields(Part):
         ],
     )
 
+    vary: Annotated[VarySpec | None, given] = Field(
+        default=None,
+        description="What differs from run to run when the job is explored (`rsltrace explore "
+        "--strategy vary`); other commands run the job as it is.",
+        examples=[{"settings": {"nodes.ekf.parameters.rate": [10.0, 50.0]}, "method": "grid"}],
+    )
+
     # Not keys of a job file, hence ``exclude``: where the job came from.
     base_dir: Annotated[Path, check(_folder)] = Field(
         default_factory=Path.cwd, exclude=True, repr=False
@@ -283,6 +291,7 @@ class JobFields(Part):
             faults: Sequence[FaultSpec | dict[str, Any]] = (),
             checks: Sequence[CheckSpec | dict[str, Any]] = (),
             metrics: Mapping[str, MetricSpec | dict[str, Any] | str] = ...,
+            vary: VarySpec | dict[str, Any] | None = None,
             base_dir: str | os.PathLike[str] = ...,
             source_name: str = "<python>",
             source_text: str | None = None,

@@ -151,7 +151,9 @@ def test_a_folder_reproduces_the_run_also_when_it_is_moved_with_its_sources(
     assert reduced.parts.faults == (FAULTS[1],)
     assert reduced.parts.without == (0,)
     folder = robot / "found" / "first"
-    text = write_small(JobSource(str(robot / "job.yaml")), reduced, folder).read_text()
+    decides = write_small(JobSource(str(robot / "job.yaml")), reduced, folder)
+    assert "subscription /b of /last: lost in a" in decides
+    text = (folder / "README.md").read_text()
     assert "two is last" in text
     assert "- the fault {drop: /b, message: 3}\n" in text
     assert "- it needs no idle\n" in text
@@ -182,3 +184,33 @@ def test_a_folder_reproduces_the_run_also_when_it_is_moved_with_its_sources(
     (tmp_path / "gone.py").rename(robot / "more" / "nodes_under_search.py")
     assert done.returncode == 0, done.stdout
     assert "1 passed" in done.stdout
+
+
+@pytest.mark.long
+def test_the_command_searches_faults_and_makes_what_it_finds_small(
+    robot: Path, command: Callable[..., Any], tmp_path: Path
+) -> None:
+    folder = tmp_path / "found"
+    words = ["explore", robot / "job.yaml", "--strategy", "faults", "--jobs", 1, "-o", folder]
+    done = command(*words, "--budget", 30, "--stop-at-first", "--small")
+    assert done.returncode == 1, done.stderr
+    readme = Path(done.stdout.partition("made small: two is last: ")[2].splitlines()[0])
+    assert readme.is_file()
+    assert "- the fault {" in readme.read_text()
+    assert "faults: " in done.stdout
+    repeated = command("record", readme.parent / "job.yaml", "-q", "-o", tmp_path / "again.mcap")
+    assert repeated.returncode == 1
+
+
+def test_the_command_tries_each_combination_of_settings(
+    write_job: Callable[[str, str], Path], tmp_path: Path, command: Callable[..., Any]
+) -> None:
+    text = ORDER_JOB.replace("more/last.yaml", "").replace("search_path: [., more]\n", "")
+    text = text.replace("parameter_files: []", "name: last").replace("0.65s", "0.15s")
+    text += "vary: {method: grid, settings: {nodes.two.parameters.value: [1, 2, 3]}}\n"
+    job = write_job("settings", text)
+    done = command("explore", job, "--strategy", "vary", "--jobs", 1, "-o", tmp_path / "found")
+    assert done.returncode == 1, done.stderr
+    assert "4 runs, 3 different digests, 2 failed of 1 cause" in done.stdout
+    assert "settings (grid): 3 of 3 combinations of nodes.two.parameters.value" in done.stdout
+    assert "nothing is left to try" in done.stdout

@@ -267,6 +267,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "checks": [],
         "faults": [],
         "metrics": {},
+        "vary": None,
         "hooks": {"before": None, "after": None},
         "progress": None,
         "guard": {

@@ -34,7 +34,7 @@ from rsltrace.words.phrases import at_time
 _NO_DRAW = "none"
 _QOS_EVENT = "new qos event "
 _NO_CALLBACKS = (EntityKind.MAIN.label, EntityKind.THREAD.label)
-_DRAWN_FROM = ("delay", "execution", "seed", "clocks")
+_DRAWN_FROM = ("delay", "faults", "execution", "seed", "clocks")
 """Keys of a job that decide whether something is drawn."""
 _OF_BAGS = ("bags", "start", "construct_time", "min_time_step")
 """Keys of a job that decide when a bag's message is played."""

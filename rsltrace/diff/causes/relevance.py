@@ -21,7 +21,7 @@ from rsltrace.model.finding import Mode, Source
 from rsltrace.model.printable import printable
 from rsltrace.trace.reader import Trace
 
-_NEVER = frozenset(("record", "checks", "metrics", "livelock_limit", "stop", "vars"))
+_NEVER = frozenset(("record", "checks", "metrics", "vary", "livelock_limit", "stop", "vars"))
 _WHEN = frozenset(
     ("timer_ties", "policy", "faults", "execution", "delay", "min_time_step", "executors", "bags")
 )

@@ -24,8 +24,9 @@ _OF_FOLDER = re.compile(r"[^\s()]*/((?:failing|passing)\.mcap)")
 
 def write_small(
     source: JobSource, reduced: Reduced, folder: Path, *, timeout_s: float | None = None
-) -> Path:
-    """Write a reduced trial to ``folder``, which is made; return the path of its README.
+) -> str:
+    """Write a reduced trial to ``folder``, which is made; return in a sentence where it parts from
+    the nearest run that passes, "" if there is none.
 
     The job in it is the whole job with what sets the trial apart, and names the same sources, bags
     and files as the original, relative to the folder. Its run has been made from that very file.
@@ -40,7 +41,7 @@ def write_small(
         raise ExploreError(f"{error.filename or folder}: {error.strerror}") from None
 
 
-def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float | None) -> Path:
+def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float | None) -> str:
     job = moved_job(source, reduced.parts, folder)
     _put(folder / JOB, job.to_yaml())
     failing = _recorded(JobSource(str(folder / JOB)), job, folder / FAILING, timeout_s)
@@ -49,15 +50,18 @@ def _write(source: JobSource, reduced: Reduced, folder: Path, timeout_s: float |
             f"{folder / JOB} does not do what the trial did (digest {failing.digest}, not "
             f"{reduced.result.digest}): what differs is not in the job"
         )
-    passing = None
+    passing, decides = None, ""
+    for name in (PASSING, DIFF):
+        (folder / name).unlink(missing_ok=True)  # of an earlier one
     if reduced.passing is not None:
         text = moved_job(source, reduced.passing, folder).to_yaml()
         passing_source = JobSource(str(folder / JOB), (), text, str(folder))
         passing = _recorded(passing_source, job, folder / PASSING, timeout_s)
-        _put(folder / DIFF, _diff(folder))
+        report, decides = _diff(folder)
+        _put(folder / DIFF, report)
     _put(folder / TEST, test_module(failing))
     _put(folder / README, readme(reduced, failing, passing))
-    return folder / README
+    return decides
 
 
 def moved_job(source: JobSource, parts: Parts, folder: Path) -> Job:
@@ -92,15 +96,15 @@ def _recorded(source: JobSource, job: Job, path: Path, timeout_s: float | None) 
         return worker.run(Trial(0, {}), path, Wants(keep=True), timeout_s)
 
 
-def _diff(folder: Path) -> str:
-    """Return what differs between the two traces, which are named as in the folder."""
+def _diff(folder: Path) -> tuple[str, str]:
+    """Return what differs between the two traces, named as in the folder: all, and a sentence."""
     from rsltrace.diff import diff_files
     from rsltrace.diff.options import DiffOptions
     from rsltrace.diff.report import render
 
     found: Any = diff_files(folder / FAILING, folder / PASSING)
     text: str = render(found, "text", DiffOptions())
-    return _OF_FOLDER.sub(r"\1", text)
+    return _OF_FOLDER.sub(r"\1", text), found.sentence
 
 
 def _put(path: Path, text: str) -> None:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rsltrace.explore.strategies.faults import FaultWalk
 from rsltrace.explore.strategies.feedback import Feedback
 from rsltrace.explore.strategies.strategy import Proposal, Strategy
 from rsltrace.explore.strategies.systematic import Systematic
+from rsltrace.explore.strategies.vary import VaryWalk
 from rsltrace.explore.strategies.walks import PctWalk, RandomWalk
 from rsltrace.explore.trial import TrialResult
 from rsltrace.job import Job
 
-NAMES = ("mixed", "pct", "random", "feedback", "systematic")
+NAMES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 
 
 def strategy_named(name: str, job: Job, *, seed: int = 0, depth: int | None = None) -> Strategy:
@@ -22,6 +24,10 @@ def strategy_named(name: str, job: Job, *, seed: int = 0, depth: int | None = No
     """
     if name == "systematic":
         return Systematic(depth)
+    if name == "faults":
+        return FaultWalk(job, seed)
+    if name == "vary":
+        return VaryWalk(job, seed)
     if name == "feedback":
         return Feedback(seed)
     if name == "random":
