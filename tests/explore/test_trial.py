@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import pytest
+
+from rsltrace.errors import ExploreError
 from rsltrace.explore.outcome import Wants
 from rsltrace.explore.trial import JobSource, Trial, overrides_of, result_of
 from rsltrace.explore.workers import Worker
@@ -48,3 +53,38 @@ def test_texts_are_not_replaced_when_they_are_read_again(searched: Path) -> None
     trial = Trial(0, {"set": {"nodes.0.parameters.said": "$(env HOME) ä\n"}})
     job = load_job(searched / "job.yaml", overrides=list(overrides_of(trial)))
     assert job.nodes[0].parameters["said"] == "$(env HOME) ä\n"
+
+
+@pytest.mark.long
+def test_workers_do_not_grow_and_leave_nobody_behind(searched: Path, tmp_path: Path) -> None:
+    with Worker(JobSource(str(searched / "job.yaml"))) as worker:
+        sizes = []
+        for number in range(60):
+            trial = Trial(number, {"policy": "permutation", "seed": number})
+            worker.run(trial, tmp_path / "run.mcap", Wants(behaviours=True))
+            assert worker._process is not None
+            status = Path(f"/proc/{worker._process.pid}/status").read_text()
+            sizes.append(int(status.split("VmRSS:")[1].split()[0]))
+        children = Path(f"/proc/{worker._process.pid}/task/{worker._process.pid}/children")
+        assert children.read_text() == ""
+        pid = worker._process.pid
+    assert sizes[-1] - sizes[20] < 1024  # kB
+    assert not Path(f"/proc/{pid}").exists()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_worker_that_dies_is_replaced_and_its_trial_made_again(
+    worker: Worker, tmp_path: Path
+) -> None:
+    first = worker.run(Trial(0, {}), tmp_path / "run.mcap", Wants())
+    assert worker._process is not None
+    os.kill(worker._process.pid, signal.SIGKILL)
+    again = worker.run(Trial(1, {}), tmp_path / "run.mcap", Wants())
+    assert again.failure is None
+    assert again.digest == first.digest
+
+
+def test_a_job_that_cannot_run_is_no_result(worker: Worker, tmp_path: Path) -> None:
+    wrong = Trial(5, {"set": {"nodes.0.node": "nodes_under_search:Nobody"}}, "a wrong node")
+    with pytest.raises(ExploreError, match=r"trial 5 \(a wrong node\): .*Nobody"):
+        worker.run(wrong, tmp_path / "run.mcap", Wants())

@@ -226,3 +226,21 @@ def test_mistakes_in_guard_point_at_their_line(
     with pytest.raises(JobError, match=r"job\.yaml:3:") as raised:
         recorded(node_code("pass"), guard)
     assert message in str(raised.value)
+
+
+def test_the_c_library_through_cffi_is_a_finding(recorded: Callable[..., Any]) -> None:
+    pytest.importorskip("cffi")
+    tick = (
+        "ffi = cffi.FFI()\n"
+        'ffi.cdef("long clock(void); int abs(int); extern char **environ;")\n'
+        "lib = ffi.dlopen(None)\n"
+        "lib.clock(), lib.environ\n"
+        "assert lib.abs(-3) == 3"
+    )
+    result = recorded(node_code(tick, imports="import cffi"))
+    assert result.error is None
+    found = [(met.source, met.node, met.call, met.count) for met in result.guarded]
+    assert (Source.CLOCK, "/n", "C library: clock()", 2) in found
+    assert not [call for _, _, call, _ in found if "abs" in call or "environ" in call]
+    refused = recorded(node_code(tick, imports="import cffi"), "{clock: error}", "x").error
+    assert isinstance(refused, GuardError)

@@ -54,7 +54,7 @@ _SOCKETS = {
     "socket.gethostname",
 }
 _ADDRESSES = ("ctypes.addressof", "builtins.id")
-_FOREIGN = {
+FOREIGN = {
     "time": Source.CLOCK,
     "clock": Source.CLOCK,
     "clock_gettime": Source.CLOCK,
@@ -75,7 +75,7 @@ _FOREIGN = {
     "gethostname": Source.ENVIRONMENT,
     "sched_getcpu": Source.ENVIRONMENT,
 }
-"""Functions of the C library that nodes call through ctypes."""
+"""Functions of the C library that nodes call through ctypes or cffi."""
 
 _is_hooked = False
 
@@ -144,7 +144,7 @@ def _content(name: str) -> str:
 
 def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     name = str(arguments[1])
-    source = _FOREIGN.get(name)
+    source = FOREIGN.get(name)
     return None if source is None else (source, f"C library: {name}()", "")
 
 

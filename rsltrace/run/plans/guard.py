@@ -22,6 +22,7 @@ from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
 from rsltrace.guard.virtual.torch_streams import torch_streams
+from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount, Mode, Source
 from rsltrace.trace.format import METADATA_GUARD
@@ -140,6 +141,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
             COMPILES: plain_in_graphs,
+            LOADS_LIBRARIES: lambda: watched_libraries(stack),
             **{name: partial(show_original, name, stack) for name in READERS},
         }
         orders = _orders_sets(job)

@@ -17,6 +17,7 @@ namespace {
 
 bool on = false;
 std::int64_t now = 1'700'000'000'000'000'000;
+std::uint64_t idles = 0;
 
 __attribute__((constructor(101))) void begin() {
   const char *mine = std::getenv("RSLTRACE_LONE");
@@ -36,12 +37,14 @@ std::int64_t real_ns() {
 
 bool linked() { return on; }
 std::int64_t now_ns() { return now; }
+std::uint64_t times_let_go() { return idles; }
 std::int64_t shown_ns(std::uint32_t, bool) { return now; }
 std::uint64_t seed() { return 42; }
 
 void report(const std::string &text) { std::fprintf(stderr, "report: %s\n", text.c_str()); }
 
 void idle(Waiter *const *waiters, std::size_t count, bool outside) {
+  ++idles;
   Waiter *next = nullptr;
   for (std::size_t i = 0; i < count; ++i)
     if (waiters[i]->deadline_ns != NEVER_NS && (next == nullptr || waiters[i]->deadline_ns < next->deadline_ns))

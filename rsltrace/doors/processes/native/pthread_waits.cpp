@@ -146,8 +146,13 @@ std::set<sem_t *> &shared_semaphores() {
   return *set;
 }
 
+// The semaphore that was tried last and not got, if none was got since. Python asks so whether it has
+// a lock itself (`Condition.notify`): only who asks for the same one again and again goes in a loop.
+sem_t *tried;
+
 int wait_for(Thread &thread, sem_t *semaphore, std::int64_t deadline_ns, const char *what) {
   pthread_testcancel();
+  tried = nullptr;
   if (!anyone(semaphore, Kind::SEMAPHORE) && REAL(sem_trywait)(semaphore) == 0) return 0;
   Outcome outcome = Outcome::TIMEOUT;
   if (deadline_ns <= now_ns()) {
@@ -207,9 +212,12 @@ RSLTRACE_EXPORT int sem_clockwait(sem_t *semaphore, clockid_t clock, const times
 RSLTRACE_EXPORT int sem_trywait(sem_t *semaphore) noexcept {
   Thread *thread = me();
   const int result = REAL(sem_trywait)(semaphore);
-  if (thread != nullptr && result != 0) {
+  if (thread == nullptr) return result;
+  const bool again = tried == semaphore;
+  tried = result == 0 ? nullptr : semaphore;
+  if (result != 0) {
     const int error = errno;
-    look(*thread, 100);
+    look(*thread, again ? 100 : 1);
     errno = error;
   }
   return result;

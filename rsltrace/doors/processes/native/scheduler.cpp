@@ -373,16 +373,15 @@ void yield(Thread &thread) {
 }
 
 void look(Thread &thread, unsigned weight) {
-  static std::int64_t instant;
+  static std::uint64_t since;
   static unsigned looks;
-  const std::int64_t now = now_ns();
-  if (now != instant) looks = 0;
-  instant = now;
+  if (times_let_go() != since) looks = 0;  // it has waited: many callbacks at one instant are no loop
+  since = times_let_go();
   looks += weight;
   if (looks < LOOKS_MAX) return;
   looks = 0;
   Inside inside(thread);
-  wait_at(thread, Kind::SLEEP, nullptr, now + LOOK_NS, "a loop that looks and does not wait");
+  wait_at(thread, Kind::SLEEP, nullptr, now_ns() + LOOK_NS, "a loop that looks and does not wait");
 }
 
 void ring(bool semaphores) {
