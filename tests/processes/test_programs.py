@@ -6,6 +6,7 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -83,6 +84,24 @@ def test_a_process_that_says_nothing_is_given_up() -> None:
     child.give_up_after(0.2)
     assert child.receive() is None
     assert child.reap().said == "was killed by SIGKILL"
+
+
+def test_a_process_that_starts_when_rsltrace_is_gone_does_not_run() -> None:
+    """It would run natively, over DDS, and nobody would end it."""
+    try:
+        built = build.library(lambda line: None)
+    except SetupError as error:
+        pytest.skip(str(error))
+    here, there = socket.socketpair()
+    link = f"{there.fileno()}:{1 << 29}:0:0"
+    libraries = os.pathsep.join(map(str, built.ros.libraries))
+    preload = f"{built.path}:{built.python_symbols}"
+    around = {"LD_PRELOAD": preload, "LD_LIBRARY_PATH": libraries, "RSLTRACE_LINK": link}
+    with there:
+        with here:
+            outside = subprocess.run(["/bin/true"], env=around, pass_fds=[there.fileno()])
+        late = subprocess.run(["/bin/true"], env=around, pass_fds=[there.fileno()])
+    assert (outside.returncode, late.returncode) == (0, 120)
 
 
 def test_a_library_that_is_cut_off_is_built_anew(

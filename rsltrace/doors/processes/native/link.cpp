@@ -133,13 +133,21 @@ void forget_environment() {
   }
 }
 
+bool has_no_peer(int fd) {
+  char byte;
+  return syscall(SYS_recvfrom, fd, &byte, 1, MSG_PEEK | MSG_DONTWAIT, nullptr, nullptr) == 0;
+}
+
 __attribute__((constructor(101))) void begin() {
   const char *link = getenv("RSLTRACE_LINK");
   int fd = -1;
   int parent = 0;
   int files[2] = {-1, -1};
   if (link == nullptr || sscanf(link, "%d:%d:%d:%d", &fd, &parent, &files[0], &files[1]) != 4) return;
-  if (getppid() != parent) return;  // started by a process of the run: outside of it
+  if (getppid() != parent) {
+    if (has_no_peer(fd)) lost();  // rsltrace was killed before this process got here
+    return;                       // started by a process of the run: outside of it
+  }
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
   if (!said.open(files[0]) || !told.open(files[1])) leave(120);
   link_fd = fd;
