@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from ruamel.yaml import YAML
 
@@ -23,6 +25,8 @@ class Bug:
     search: str
     native: bool = True
     """Whether its checks can be watched natively."""
+    fault: Mapping[str, Any] = field(default_factory=dict)
+    """The fault that it takes, without when: ``{"restart": "/sensor"}``."""
 
     @property
     def name(self) -> str:
@@ -45,5 +49,6 @@ def all_bugs() -> list[Bug]:
     found = []
     for job in sorted(BUGS.glob("*/*/job.yaml")):
         about = YAML(typ="safe").load(job)["x-bug"]
-        found.append(Bug(job.parent, about["kind"], about["search"], about.get("native", True)))
+        more = {key: about[key] for key in ("native", "fault") if key in about}
+        found.append(Bug(job.parent, about["kind"], about["search"], **more))
     return found

@@ -34,13 +34,12 @@ class Watchdog(Node):
 class LenientWatchdog(Watchdog):
     """Waits for two and a half periods."""
 
-    def __init__(self):
-        super().__init__()
-        self.last = self.get_clock().now()
+    last = None
 
     def on_heartbeat(self, message):
         self.last = self.get_clock().now()
 
     def look(self):
-        silent = self.get_clock().now() - self.last
-        self.publisher.publish(Bool(data=silent.nanoseconds > 250_000_000))
+        now = self.get_clock().now()
+        silent = self.last is not None and (now - self.last).nanoseconds > 250_000_000
+        self.publisher.publish(Bool(data=silent))
