@@ -22,7 +22,6 @@ from rsltrace.mcap.records import RECORD_HEAD
 _INDEX_HEAD = struct.Struct("<BQHI")
 _INDEX_ENTRY_DTYPE = np.dtype([("log_time", "<u8"), ("offset", "<u8")])
 _HEADER_BYTES = MESSAGE_HEADER_DTYPE.itemsize
-_MESSAGE_HEADER = struct.Struct(f"{_HEADER_BYTES}s")
 
 Waiting = list[Any]
 """Messages that wait for their chunk: channel id, sequence, stamp in ns and data of the first, then
@@ -74,7 +73,7 @@ def messages_chunk(waiting: Waiting) -> ChunkBody:
     headers["message_sequence"] = waiting[1::WAITING_FIELDS]
     headers["log_time"] = headers["publish_time"] = times
     pieces = [b""] * (2 * count)
-    pieces[0::2] = [header for (header,) in _MESSAGE_HEADER.iter_unpack(headers.tobytes())]
+    pieces[0::2] = headers.view(f"V{_HEADER_BYTES}").tolist()
     pieces[1::2] = datas
     offsets = np.cumsum(sizes) - sizes
     indexes = []
