@@ -44,6 +44,12 @@ _here = _process_id()
 FINDINGS_PER_EVENT = 100
 """An event that looks at the address of a million objects is one problem, not a million."""
 
+# Python takes longer to find a member of an Enum than all else that is asked of it.
+_ALLOW, _ERROR, _RANDOM = Mode.ALLOW, Mode.ERROR, Source.RANDOM
+_EACH = (Mode.ERROR, Mode.RECORD)
+_AT_LEAST = {Mode.VIRTUAL: Mode.WARN, Mode.RECORD: Mode.WARN}
+"""What can be neither made virtual nor recorded is at least reported."""
+
 _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
 _LOOK_NS = 1_000
@@ -187,8 +193,11 @@ class Guard:
     def drawn(self, call: str, frame: FrameType) -> str:
         """Count a draw that the run makes; return the name of its stream."""
         node = self.context.node()
-        if KINDS[code_of(frame).co_filename] != USER:
-            self.count(Source.RANDOM, call, frame)
+        kind = KINDS[code_of(frame).co_filename]
+        if kind == OURS and node:  # rclpy, for itself: what the two below would find out
+            return node
+        if kind != USER:
+            self.count(_RANDOM, call, frame)
             return self.stream(frame)
         try:
             self._draws[call][node] += 1
@@ -250,7 +259,7 @@ class Guard:
         node = self.context.node()
         self._found[source, mode, node, call] += 1
         event, entity = self.context.place()
-        if self._has_room(event) or mode in (Mode.ERROR, Mode.RECORD):
+        if self._has_room(event) or mode in _EACH:
             user = user_frame(frame, self.packages)
             stack = stack_of(user or frame, self.packages)
             if told is not None:
@@ -258,7 +267,7 @@ class Guard:
             else:
                 text = value if isinstance(value, str) else repr(value)
             self.on_finding(Finding(event, entity, node, source, mode, call, text, stack))
-            if mode is Mode.ERROR:
+            if mode is _ERROR:
                 where = stack.partition("\n")[0] or module_of(frame)
                 raise GuardError(
                     f"{call} at {where}: the job says 'guard: {{{source.value}: error}}'; "
@@ -296,11 +305,9 @@ class Guard:
         if not self.is_for_user(frame):
             return
         mode = self.mode(source, frame)
-        if mode is Mode.ALLOW:
+        if mode is _ALLOW:
             return
-        # What can be neither made virtual nor recorded is at least reported.
-        at_least = Mode.WARN if mode in (Mode.VIRTUAL, Mode.RECORD) else mode
-        self.found(source, at_least, call, value, frame, told)
+        self.found(source, _AT_LEAST.get(mode, mode), call, value, frame, told)
 
     def clock_ns(self, call: str, frame: FrameType, kind: int) -> int:
         """Return what a clock of the node (of the module, where no node runs) shows: now.
@@ -311,7 +318,8 @@ class Guard:
         passed makes it pass. A library that is being imported has a clock of its own.
         ``kind`` says whose file the code of ``frame`` is of.
         """
-        event, node, now_ns = self._look()
+        look = self._look
+        event, node, now_ns = look()
         if kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None):
             try:
                 self._clock_looks[call][node] += 1
@@ -326,7 +334,7 @@ class Guard:
         if self._reads > _READS_PER_EVENT:
             self._passes += 1  # the longer the wait, the longer the steps: about a thousandth
             self.context.pass_time(_BUSY_NS * (1 + self._passes // 100))
-            self._reads_event, node, now_ns = self._look()
+            self._reads_event, node, now_ns = look()
         if kind == STANDARD:
             return now_ns
         who = node or module_of(frame)

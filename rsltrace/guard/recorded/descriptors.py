@@ -25,6 +25,7 @@ from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.guard.waiting import wait_recorded, wait_unrecorded, waiting_guard, when_readable
 from rsltrace.model.finding import Mode, Source
 
+_RECORD = Mode.RECORD
 _MAKES_FILES = os.O_CREAT | os.O_TRUNC | getattr(os, "O_TMPFILE", 0)
 _PLAIN = (
     *("write", "writev", "pread", "fsync", "fdatasync", "ftruncate", "lseek", "isatty"),
@@ -41,7 +42,7 @@ _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 def recording(source: Source, frame: FrameType) -> Guard | None:
     """Return the guard if user code asks and the job records this source."""
     guard = engaged()
-    if guard is None or guard.mode(source, frame) is not Mode.RECORD:
+    if guard is None or guard.mode(source, frame) is not _RECORD:
         return None
     return guard if guard.is_for_user(frame) else None
 

@@ -26,6 +26,7 @@ from rsltrace.guard.recorded.descriptors import (
 from rsltrace.guard.redirect import copy_of, redirect
 from rsltrace.model.finding import Source
 
+_FILE = Source.FILE
 BYTES_MAX = 64 << 20
 
 
@@ -113,13 +114,13 @@ _REAL = {"stat": _real_stat, "lstat": copy_of(os.lstat)}  # type: ignore[arg-typ
 
 def _looking(name: str, plain: Callable[..., Any], real: Callable[..., Any]) -> Any:
     def stat(path: Any, **options: Any) -> Any:
-        path = meant_path(path)
         frame = caller()
         if is_nobodys(frame):  # nor does the watch below have to know
             return plain(path, **options) if options else plain(path)
-        guard = None if isinstance(path, int) else recording(Source.FILE, frame)
+        path = meant_path(path)
+        guard = None if isinstance(path, int) else recording(_FILE, frame)
         if guard is None:
-            return real(path, **options)
+            return real(path, **options) if options else real(path)
         call = f"{name}({os.fsdecode(path)!r})"
         return recorded_stat(guard, Source.FILE, call, lambda: real(path, **options), frame)
 

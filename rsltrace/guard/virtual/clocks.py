@@ -25,6 +25,7 @@ from rsltrace.guard.redirect import Redirected, copy_of, redirect
 from rsltrace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
+_CLOCK, _VIRTUAL = Source.CLOCK, Mode.VIRTUAL
 
 REAL_TIME_MODULES = {
     "hypothesis.internal.conjecture.junkdrawer",  # times the garbage collector, whenever it runs
@@ -68,8 +69,8 @@ def clock_call(
         return virtual(
             guard.recorded(Source.PROCESS, f"{call} of subprocess", _monotonic_ns, frame)
         )
-    mode = guard.mode(Source.CLOCK, frame)
-    if mode is Mode.VIRTUAL:
+    mode = guard.mode(_CLOCK, frame)
+    if mode is _VIRTUAL:
         return virtual(guard.clock_ns(call, frame, KINDS[code_of(frame).co_filename]))
     if mode is Mode.ALLOW:
         return real()

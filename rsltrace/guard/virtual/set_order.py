@@ -28,6 +28,7 @@ from rsltrace.guard.virtual.clocks import numpy_now
 from rsltrace.guard.virtual.original_code import keep_source
 from rsltrace.model.finding import Mode, Source
 
+_ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
 _ORDERED = "__rsltrace_ordered__"
 _SHOWN = "__rsltrace_shown__"
 _POP = "__rsltrace_pop__"
@@ -54,14 +55,14 @@ def ordered(thing: Any) -> Any:
     if guard is None:
         return thing
     frame = caller()
-    mode = guard.mode(Source.ORDER, frame)
+    mode = guard.mode(_ORDER, frame)
     are_texts = _TEXTS.issuperset(map(type, thing))
-    if mode is Mode.ALLOW or not (are_texts or any(map(_has_no_order, thing))):
+    if mode is _ALLOW or not (are_texts or any(map(_has_no_order, thing))):
         return thing
-    if mode is Mode.VIRTUAL:
+    if mode is _VIRTUAL:
         in_order = sorted(thing) if are_texts else _in_order(guard, thing)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
-            guard.count(Source.ORDER, "order of a set", frame)
+            guard.count(_ORDER, "order of a set", frame)
             return _Watched(thing, in_order)
     kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
     guard.watched(

@@ -62,6 +62,7 @@ def _statement(sql: str) -> None:
 
 def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
     made_of = _RECORDED.get(name)
+    is_thread, is_file = source is Source.THREAD, source is Source.FILE
 
     def call(*arguments: Any, **options: Any) -> Any:
         guard = engaged()
@@ -70,10 +71,10 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         frame = caller()
         if not guard.is_for_user(frame):
             return real(*arguments, **options)  # ROS and Python, for themselves
-        if source is not Source.THREAD and asking_module(frame) in _NOT_NEWS:
+        if not is_thread and asking_module(frame) in _NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
-        if source is Source.FILE:
+        if is_file:
             if is_installed(arguments[0] if arguments else options.get("path")):
                 return real(*arguments, **options)
             shown = ", ".join(map(repr, arguments))[:100]
