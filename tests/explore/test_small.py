@@ -90,6 +90,15 @@ search_path: [., more]
 stop: {duration: 0.65s}
 checks: [{name: two is last, always: /last.data == 2}]
 """
+END_JOB = """\
+base: job.yaml
+checks: [{name: six came, function: "at_the_end:six_came"}]
+"""
+AT_THE_END = """\
+def six_came(trace):
+    said = [trace.decode("/last", data).data for _, _, data in trace.messages("/last")]
+    return said.count(2) >= 6
+"""
 FAULTS = [
     {"delay": "/a", "message": 1, "by": "10ms"},
     {"drop": "/b", "message": 3},
@@ -106,17 +115,21 @@ def robot(searched: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(searched / "nodes_under_search.py", home / "more")
     (home / "more" / "last.yaml").write_text("/last: {ros__parameters: {unused: 1}}\n")
     (home / "job.yaml").write_text(ORDER_JOB)
+    (home / "at_the_end.py").write_text(AT_THE_END)
+    (home / "end.yaml").write_text(END_JOB)
     return home
 
 
-def small(robot: Path, overlay: dict[str, Any], **options: Any) -> tuple[TrialResult, Reduced]:
-    source = JobSource(str(robot / "job.yaml"))
+def small(
+    robot: Path, overlay: dict[str, Any], job: str = "job.yaml"
+) -> tuple[TrialResult, Reduced]:
+    source = JobSource(str(robot / job))
     scratch = robot.parent / "scratch"
     scratch.mkdir(exist_ok=True)
     with Worker(source) as worker:
         given = worker.run(Trial(7, overlay, "found"), scratch / "given.mcap", Wants(keep=True))
         assert given.failure is not None, overlay
-        return given, Reduction(source, given, worker, scratch, **options).reduce()
+        return given, Reduction(source, given, worker, scratch).reduce()
 
 
 def failing_seed(robot: Path) -> dict[str, Any]:
@@ -141,6 +154,14 @@ def test_an_order_that_fails_is_reduced_to_the_departures_it_needs(robot: Path) 
     assert reduced.passing is not None
     assert reduced.passing.departures == ()
     assert " before " in reduced.chosen[0]
+
+
+@pytest.mark.long
+def test_a_run_is_not_made_so_short_that_it_fails_for_its_shortness(robot: Path) -> None:
+    _, reduced = small(robot, {"faults": FAULTS}, "end.yaml")
+    assert reduced.parts.faults == (FAULTS[1],)
+    assert reduced.parts.until_ns is None or reduced.parts.until_ns >= 600_000_000
+    assert reduced.passing is not None
 
 
 @pytest.mark.long

@@ -194,15 +194,17 @@ class Reduction:
             return replace(parts, without=tuple(p for p in range(count) if p not in some))
 
         def fails(some: Sequence[int]) -> bool:
-            fewer = with_some(some)
-            return bool(some) and self._fails(fewer) and self._is_to_blame(fewer)
+            return bool(some) and self._fails_for_its_parts(with_some(some))
 
         return with_some(ddmin(present, fails))
 
-    def _is_to_blame(self, parts: Parts) -> bool:
-        """Whether the same nodes pass without what sets the trial apart. Where they do not, they
-        fail because a node is missing, which is something else."""
-        if not parts.one_fewer():
+    def _fails_for_its_parts(self, parts: Parts) -> bool:
+        """Whether a trial fails for the same cause, and the same nodes pass in the same time
+        without what sets it apart. Where they do not, it fails because a node is missing, or
+        because it ends too soon, which is something else."""
+        if not self._fails(parts):
+            return False
+        if parts.seed is None and not parts.one_fewer():
             return True
         plain = Parts(until_ns=parts.until_ns, without=parts.without)
         return self._run(plain).failure is None
@@ -218,14 +220,14 @@ class Reduction:
             event = result.failure.event
             at_ns = end_ns if event is None else trace.event(event).stamp_ns
         at_ns = min(at_ns, end_ns)
-        if at_ns < end_ns and self._fails(replace(parts, until_ns=at_ns)):
+        if at_ns < end_ns and self._fails_for_its_parts(replace(parts, until_ns=at_ns)):
             return replace(parts, until_ns=at_ns)
         passes_ns, fails_ns = max(at_ns, start_ns) if at_ns < end_ns else start_ns, end_ns
         for _ in range(_TIMES_TRIED):
             middle_ns = (passes_ns + fails_ns) // 2
             if middle_ns in (passes_ns, fails_ns):
                 break
-            if self._fails(replace(parts, until_ns=middle_ns)):
+            if self._fails_for_its_parts(replace(parts, until_ns=middle_ns)):
                 fails_ns = middle_ns
             else:
                 passes_ns = middle_ns
