@@ -226,12 +226,14 @@ class Search:
         on_result(result)
 
     def _count(self, result: TrialResult) -> TrialResult:
-        """Count a run; of one cause only the first traces are kept."""
+        """Count a run; of one cause only the first traces are kept, that of the first run among
+        them, whenever it ends."""
         self.tally.add(result)
         failure = result.failure
         if failure is None or result.trace is None or result.trial.number == 0:
             return result
-        if self.tally.failures[failure.key] <= _KEPT_OF_A_CAUSE:
+        is_first = self.tally.first[failure.key] is result
+        if is_first or self.tally.failures[failure.key] <= _KEPT_OF_A_CAUSE:
             return result
         with suppress(OSError):
             Path(result.trace).unlink()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import random
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -12,6 +14,7 @@ from rsltrace.trace.chain import hash64
 
 _TRIES = 20
 _ORDERS_MAX = 2_000
+_NEW_SEEDS = 0.2
 
 
 class Feedback:
@@ -36,36 +39,44 @@ class Feedback:
     def propose(self, number: int) -> Proposal | None:
         chance = random.Random(f"{self._seed} {number}")
         overlay: dict[str, Any] = {}
-        departures: list[tuple[int, int]] = []
         for _ in range(_TRIES):
-            overlay, departures = self._near(chance)
-            mark = hash64(f"{overlay} {departures}".encode())
-            if mark not in self._tried:
-                self._tried.add(mark)
+            overlay = self._near(chance)
+            if self._is_new(overlay):
                 break
-        policy = {"departures": [{"choice": choice, "run": run} for choice, run in departures]}
-        overlay = {**overlay, "policy": policy}
-        return Proposal(overlay, f"near what was new, {len(departures)} departures")
+        words = f"near what was new, {len(overlay['policy']['departures'])} departures"
+        if "seed" in overlay:
+            words += f", seed {overlay['seed']}"
+        return Proposal(overlay, words)
 
-    def _near(self, chance: random.Random) -> tuple[dict[str, Any], list[tuple[int, int]]]:
-        """Return the departures of a run that was kept up to some choice, and one more."""
-        orders = self._orders
-        if not orders:
-            return {}, []
+    def _is_new(self, overlay: Mapping[str, Any]) -> bool:
+        """Say whether this has not been proposed, and remember that it has."""
+        mark = hash64(json.dumps(overlay, sort_keys=True).encode())
+        if mark in self._tried:
+            return False
+        self._tried.add(mark)
+        return True
+
+    def _near(self, chance: random.Random) -> dict[str, Any]:
+        """Return an overlay: the departures of a run that was kept up to some choice, and one more;
+        now and then, and where there is no choice, another seed for what is drawn."""
+        orders = [one for one in self._orders if one[1]]
+        if not orders or chance.random() < _NEW_SEEDS:
+            return {"seed": chance.randrange(1 << 32), "policy": {"departures": []}}
         overlay, order = orders[max(chance.randrange(len(orders)), chance.randrange(len(orders)))]
-        if not order:
-            return overlay, []
         place = chance.randrange(len(order))
         taken, count = order[place]
         other = chance.randrange(count - 1)
         run = other + (other >= taken)
         found = [(choice, one) for choice, (one, _) in enumerate(order[:place]) if one]
-        return overlay, [*found, (place, run)] if run else found
+        departures = [*found, (place, run)] if run else found
+        written = [{"choice": choice, "run": one} for choice, one in departures]
+        return {**overlay, "policy": {"departures": written}}
 
     def learn(self, result: TrialResult) -> TrialResult | None:
         return self._keep(result)
 
     def recall(self, result: TrialResult) -> None:
+        self._is_new(result.trial.overlay)
         self._keep(result)
 
     def _keep(self, result: TrialResult) -> TrialResult | None:

@@ -1,0 +1,63 @@
+"""What strategies propose follows from what they were told, and from nothing else."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rsltrace.explore.strategies.feedback import Feedback
+from rsltrace.explore.strategies.named import NAMES, strategy_named
+from rsltrace.explore.trial import Trial, TrialResult
+from rsltrace.job import Job, NodeSpec
+
+JOB = Job(nodes=[NodeSpec(node="m:N")])
+
+
+def result(number: int, overlay: dict[str, Any], new: int, order: Any) -> TrialResult:
+    trial = Trial(number, overlay)
+    return TrialResult(trial, choices=len(order), entities=3, behaviours=(0, new), order=order)
+
+
+PLAIN = result(0, {"policy": {"departures": []}}, 1, ((0, 2), (0, 3)))
+
+
+@pytest.mark.parametrize("name", sorted({*NAMES} & {"mixed", "pct", "random", "feedback"}))
+def test_a_search_that_is_resumed_proposes_what_it_would_have_proposed(name: str) -> None:
+    one, other = (strategy_named(name, JOB, seed=3) for _ in range(2))
+    one.begin(PLAIN)
+    other.begin(PLAIN)
+    for number in range(1, 30):
+        proposal = one.propose(number)
+        assert proposal is not None
+        ran = result(number, dict(proposal.overlay), number % 7, ((0, 2), (number % 3, 3)))
+        other.recall(one.learn(ran) or ran)
+    assert [one.propose(n) for n in range(30, 40)] == [other.propose(n) for n in range(30, 40)]
+
+
+def test_feedback_departs_once_more_from_what_was_new() -> None:
+    strategy = Feedback()
+    strategy.begin(PLAIN)
+    strategy.learn(result(1, {"seed": 9, "policy": "permutation"}, 2, ((1, 2), (2, 3), (0, 4))))
+    strategy.learn(result(2, {}, 2, ((1, 2), (2, 3), (1, 9))))  # showed nothing new
+    seen = set()
+    for number in range(3, 200):
+        proposal = strategy.propose(number)
+        assert proposal is not None
+        departures = [
+            (one["choice"], one["run"]) for one in proposal.overlay["policy"]["departures"]
+        ]
+        if proposal.overlay.get("seed") == 9:
+            before = [one for one in departures if one in ((0, 1), (1, 2))]
+            assert len(departures) - len(before) <= 1
+            assert departures[: len(before)] == [(0, 1), (1, 2)][: len(before)]
+            seen.add(tuple(departures))
+    assert {((0, 1), (1, 2), (2, run)) for run in (1, 2, 3)} <= seen
+    assert all(choice < 3 and run < 4 for found in seen for choice, run in found)
+
+
+def test_where_there_is_no_choice_feedback_draws_anew() -> None:
+    strategy = Feedback()
+    strategy.begin(result(0, {}, 1, ()))
+    seeds = {str(strategy.propose(number)) for number in range(1, 9)}
+    assert len(seeds) == 8
