@@ -13,14 +13,12 @@ _WAIT_SET = (
     "expects the order in which rclpy walks one wait set (subscriptions before clients); here what "
     "came first runs first"
 )
-_CORES = "expects as many threads as the machine has cores; a run does not depend on the machine"
 _NATIVE = "fails natively, too: it asks a node that does not exist"
 
 _HERE: dict[str, str] = {
     "test/test_action_server.py::TestActionServer::test_different_feedback_type_raises": _WAIT_SET,
     "test/test_action_server.py::TestActionServer::test_feedback": _WAIT_SET,
     "test/test_executor.py::TestExecutor::test_create_task_dependent_coroutines": _NEWEST,
-    "test/test_executor.py::TestExecutor::test_multi_threaded_executor_num_threads": _CORES,
     "test/test_type_description_service.py::TestTypeDescriptionService::"
     "test_get_type_description": _NATIVE,
 }

@@ -137,8 +137,8 @@ class StateMachineHandle(Handle):
                 self._go(start, goal, publish_update)
                 return
         raise self._real.RCLError(
-            "Failed to trigger lifecycle state machine transition: no transition matching "
-            f"{transition} found for current state {_STATES[self._state]}"
+            "Failed to trigger lifecycle state machine transition: Transition is not registered: "
+            f"no transition matching {transition} found for current state {_STATES[self._state]}"
         )
 
     def trigger_transition_by_label(self, label: str, publish_update: bool) -> None:
