@@ -31,7 +31,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 from tests.explore.suite import Bug, all_bugs  # noqa: E402
 
-STRATEGIES = ("pct", "random", "feedback", "systematic")
+STRATEGIES = ("pct", "random", "feedback", "systematic", "faults")
 WAYS = (*STRATEGIES, "native")
 
 Figures = dict[str, Any]
@@ -121,8 +121,8 @@ def main() -> None:
     for bug in bugs:
         mine = kept.setdefault(bug.name, {})
         for way in options.ways:
-            if way in mine:
-                continue
+            if way in mine or (way == "faults") != (bug.search == "faults"):
+                continue  # what takes a fault is found by faults, and nothing else is
             if way == "native":
                 mine[way] = native(bug, options.native)
             else:
