@@ -15,7 +15,7 @@ from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.likely_cause import with_likely_cause
 from rsltrace.diff.causes.lost_messages import lost_message
 from rsltrace.diff.causes.message_differences import message_differences
-from rsltrace.diff.causes.propagation import BUSY, DRAWN, NODE, STUCK, FoundDivergence, Origin
+from rsltrace.diff.causes.propagation import BUSY, DRAWN, MADE, NODE, STUCK, FoundDivergence, Origin
 from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
@@ -364,7 +364,12 @@ def _is_renamed(explainer: Explainer, a: EventView, b: EventView) -> bool:
     return bool(a.entity.type) and alone_a and matching.by_key[b.entity] in matching.only_b
 
 
-_SHARED = {DRAWN: "is drawn otherwise again in", BUSY: "keeps waiting", STUCK: "ended before"}
+_SHARED = {
+    DRAWN: "is drawn otherwise again in",
+    MADE: "made a receiver of",
+    BUSY: "keeps waiting",
+    STUCK: "ended before",
+}
 
 _AGAIN = frozenset((Root.CALLBACK, Root.SCHEDULE, Root.TIMING, Root.EXCEPTION))
 """What recording the job once more tells more about: which of the two runs is the usual one."""

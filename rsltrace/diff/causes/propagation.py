@@ -33,6 +33,7 @@ from rsltrace.trace.reader import Trace
 CAUSE = "cause"
 NODE = "node"
 DRAWN = "drawn"
+MADE = "made"
 BUSY = "busy"
 STUCK = "stuck"
 REACHING = frozenset((OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE))
@@ -101,6 +102,7 @@ class Propagation:
         self._inverted_in: dict[int, int] = {}
         self._sent: dict[str, Origin] = {}
         self._drawn: Origin | None = None
+        self._made: dict[int, Origin] = {}
         self._busy: Origin | None = None
 
     def origin_of(self, item: EventPair) -> Origin | None:
@@ -220,12 +222,14 @@ class Propagation:
             waits = self._busy is not None and a.kind[i] != BAG
             return (BUSY, self._busy) if self._busy is not None and waits else None
         only_drawn = a.input[i] == b.input[j] and a.flags[i] == b.flags[j]
-        if self._drawn is None or not only_drawn or a.state[i] != b.state[j]:
+        if not only_drawn or a.state[i] != b.state[j]:
             return None
         outputs = self._different_outputs(item)
-        if outputs and all(output[0] == _DRAW for output in outputs):
-            return DRAWN, self._drawn
-        return None
+        if not outputs or any(output[0] != _DRAW for output in outputs):
+            return None
+        if all(output[1] in self._made for output in outputs):
+            return MADE, self._made[outputs[0][1]]
+        return (DRAWN, self._drawn) if self._drawn is not None else None
 
     def _is_unwinding(self, item: EventPair) -> bool:
         """Whether an item is what a run did when it had ended."""
@@ -393,6 +397,7 @@ class Propagation:
         found = self.found[origin.root]
         for kind, number, _, _ in outputs:
             if kind == OutputKind.ENTITY:  # the node may be one that only this run has
+                self._made.setdefault(number, origin)
                 self._taint(rows.run.matching.nodes[number], origin)
             elif kind in REACHING:
                 self._reach(found, number, self._first_stamp(item), 0)
