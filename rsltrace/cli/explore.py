@@ -181,7 +181,7 @@ def explore(
         )
         end = _End(search, source, folder, strategy, form)
         interrupted = False
-        with _pool(source, job, jobs, cluster) as pool:
+        with search, _pool(source, job, jobs, cluster) as pool:
             try:
                 with _telling(search, budget, quiet=quiet) as on_result:
                     search.run(pool, on_result)

@@ -79,8 +79,11 @@ class Tally:
 
 
 class Search:
-    """One search. ``run`` goes on until the budget is used up, nothing is left to try, or ``stop``
-    is called; what has ended by then is in the table."""
+    """One search; a context manager, around that of its pool.
+
+    ``run`` goes on until the budget is used up, nothing is left to try, or ``stop`` is called; what
+    has ended by then is in the table.
+    """
 
     def __init__(
         self,
@@ -108,6 +111,15 @@ class Search:
         self._done: set[int] = set()
         self._under_way: set[int] = set()
         self._number = 1
+
+    def __enter__(self) -> Search:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number in self._under_way:  # they have ended with the pool, and have no row
+            path = self._table.trace_of(number)
+            for one in (path, unfinished(path)):
+                one.unlink(missing_ok=True)
 
     def stop(self) -> None:
         """Begin no more trials."""
