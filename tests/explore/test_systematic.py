@@ -19,8 +19,8 @@ RELAY = "{{node: nodes_under_search:Relay, name: {0}, parameters: {{from: {1}, t
 TWO = [SENDER.format("one", 1, "a"), SENDER.format("two", 2, "b")]
 APART = [SENDER.format("one", 1, "c"), SENDER.format("two", 2, "d")]
 RELAYS = [*APART, RELAY.format("three", "c", "a"), RELAY.format("four", "d", "b")]
-GRAPHS = {"apart": (APART, 0.25)}
-LONG = {
+GRAPHS = {
+    "apart": (APART, 0.25),
     "one who minds": ([SENDER.format("one", 1, "a"), LAST], 0.15),
     "two and one who minds": ([*TWO, LAST], 0.15),
     "one topic": ([SENDER.format("one", 1, "a"), SENDER.format("two", 2, "a"), LAST], 0.15),
@@ -64,14 +64,13 @@ def compare(path: Path, tmp_path: Path) -> tuple[Systematic, dict[str, int]]:
     return strategy, ends
 
 
-@pytest.mark.parametrize(
-    "name", [*GRAPHS, *(pytest.param(name, marks=pytest.mark.long) for name in LONG)]
-)
-@pytest.mark.parametrize("state", [False, pytest.param(True, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("name", GRAPHS)
+@pytest.mark.parametrize("state", [False, True])
 def test_every_end_is_come_to(
     write_job: Callable[[str, str], Path], tmp_path: Path, name: str, state: bool
 ) -> None:
-    nodes, duration = {**GRAPHS, **LONG}[name]
+    nodes, duration = GRAPHS[name]
     listed = "\n".join(f"  - {node}" for node in nodes)
     text = f"nodes:\n{listed}\nstop: {{duration: {duration}s}}\n"
     path = write_job("graph", text + ("guard: {state: true}\n" if state else ""))
