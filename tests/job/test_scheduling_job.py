@@ -82,11 +82,13 @@ def test_clocks() -> None:
         (
             "policy: fifoo",
             "job.yaml:2:9: policy: expected fifo or rate_monotonic or permutation, or a mapping "
-            "with priority or recorded or function, got text 'fifoo'; did you mean fifo?",
+            "with priority or departures or pct or recorded or function, got text 'fifoo'; did you "
+            "mean fifo?",
         ),
         (
             "policy: {order: fifo, recorded: job.yaml}",
-            "job.yaml:2:9: policy: give one of order, priority, recorded, function",
+            "job.yaml:2:9: policy: give one of order, priority, departures, pct, recorded, "
+            "function",
         ),
         ("policy: {prio: 5}", "job.yaml:2:10: unknown key 'prio' in policy; did you mean"),
         (

@@ -71,7 +71,7 @@ def _lines(reduced: Reduced, failing: TrialResult, passing: TrialResult | None) 
     yield ""
     if passing is not None:
         yield f"`passing.mcap` is the nearest run that passes: {printable(reduced.passing_words)}."
-        yield "`diff.txt` says where the two part."
+        yield "`diff.txt` says where the two diverge."
     else:
         yield "No run with one part less passes, so there is no `passing.mcap`."
     yield ""
