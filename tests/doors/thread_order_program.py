@@ -269,6 +269,18 @@ def there_and_back(say: Callable[[str], None]) -> None:
 
 
 @scenario
+def lock_that_is_waited_for_in_vain(say: Callable[[str], None]) -> None:
+    lock = threading.Lock()
+    with lock:
+        threads = [started(lambda: say(f"child {lock.acquire(timeout=0.01)}"))]
+        threads.append(started(lambda: (lock.acquire(), say("other child"), lock.release())))
+        time.sleep(0.2)
+        say("parent")
+    for thread in threads:
+        thread.join()
+
+
+@race
 def lock_taken_again(say: Callable[[str], None]) -> None:
     for lock in (threading.Lock(), threading.RLock()):
 
@@ -282,19 +294,6 @@ def lock_taken_again(say: Callable[[str], None]) -> None:
         for _ in range(2):
             with lock:
                 say("parent again")
-        thread.join()
-
-
-@scenario
-def lock_that_is_waited_for_in_vain(say: Callable[[str], None]) -> None:
-    lock = threading.Lock()
-    with lock:
-        threads = [started(lambda: say(f"child {lock.acquire(timeout=0.01)}"))]
-        threads.append(started(lambda: (lock.acquire(), say("other child"), lock.release())))
-    with lock:
-        time.sleep(0.2)
-        say("parent")
-    for thread in threads:
         thread.join()
 
 
