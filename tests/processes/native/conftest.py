@@ -18,7 +18,7 @@ from rsltrace.errors import SetupError
 SOURCES = Path(__file__).parent
 OURS = (
     "real scheduler pthread_lives pthread_locks pthread_waits futex clocks entropy processors "
-    "stacks outside calls files polling timer_files"
+    "stacks outside calls files polling timer_files fortified"
 ).split()
 _WARNINGS = ("-Wall", "-Wextra", "-Werror")
 
@@ -84,12 +84,17 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
         return target
 
     def compile_program(name: str) -> None:
-        words = ["-std=c++20", "-O1", "-rdynamic", str(SOURCES / f"{name}.cpp")]
-        _compile(compiler, [*words, "-o", str(folder / name)])
+        words = ["-std=c++20", "-O1", "-rdynamic", "-U_FORTIFY_SOURCE", "-D_FORTIFY_SOURCE=2"]
+        linked = [f"-L{folder}", f"-Wl,-rpath,{folder}", "-learly"] if name == "early" else []
+        _compile(
+            compiler, [*words, str(SOURCES / f"{name}.cpp"), "-o", str(folder / name), *linked]
+        )
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         objects = list(pool.map(compile_part, parts))
-        list(pool.map(compile_program, ["random_threads", "corner_cases"]))
+        early = ["-shared", "-fPIC", "-DLIBRARY", str(SOURCES / "early.cpp")]
+        _compile(compiler, [*early, "-o", str(folder / "libearly.so")])
+        list(pool.map(compile_program, ["random_threads", "corner_cases", "early", "layout"]))
     _compile(compiler, ["-shared", *objects, "-o", str(folder / "libtry.so"), "-ldl"])
     return Programs(folder)
 

@@ -9,11 +9,13 @@
 #include <sys/epoll.h>
 #include <sys/file.h>
 #include <sys/random.h>
+#include <sys/resource.h>
 #include <sys/select.h>
 #include <sys/socket.h>
 #include <sys/syscall.h>
 #include <sys/sysinfo.h>
 #include <sys/time.h>
+#include <sys/times.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -366,6 +368,47 @@ void inner_files() {
   reader.join();
 }
 
+void fortified() {  // lengths that the compiler does not know
+  volatile nfds_t none = 0;
+  volatile std::size_t two = 2;
+  volatile int reads = O_RDONLY;
+  pollfd list[2];
+  char bytes[8];
+  int ends[2], pair[2];
+  if (pipe(ends) != 0 || socketpair(AF_UNIX, SOCK_STREAM, 0, pair) != 0) std::abort();
+  poll(list, none, 5);
+  say("polled");
+  std::thread writer([&] {
+    for (const int one_of : {ends[1], pair[1], pair[1]}) {
+      std::this_thread::sleep_for(1ms);
+      if (write(one_of, "ab", 2) != 2) std::abort();
+    }
+  });
+  if (read(ends[0], bytes, two) == 2) say("read");
+  if (recv(pair[0], bytes, two, 0) == 2) say("recv");
+  if (recvfrom(pair[0], bytes, two, 0, nullptr, nullptr) == 2) say("recvfrom");
+  writer.join();
+  const timespec pause{0, 1'000'000};
+  ppoll(list, none, &pause, nullptr);
+  say("ppolled");
+  unsigned char drawn[8] = {};
+  if (read(open("/dev/urandom", reads), drawn, 4 * two) == 8)
+    for (const unsigned char byte : drawn) std::printf("%02x", byte);
+  std::puts("");
+}
+
+void processor_time() {
+  rusage used;
+  tms ticks;
+  const clock_t before = times(&ticks);
+  if (getrusage(RUSAGE_SELF, &used) != 0) std::abort();
+  const long begin_s = used.ru_utime.tv_sec;
+  sleep(2);
+  if (getrusage(RUSAGE_SELF, &used) != 0) std::abort();
+  std::printf("%ld %ld %ld\n", used.ru_utime.tv_sec - begin_s, (times(nullptr) - before) / sysconf(_SC_CLK_TCK),
+              used.ru_nvcsw + used.ru_nivcsw);
+}
+
 void crash() {
   std::thread([] { *static_cast<volatile int *>(nullptr) = 1; }).join();
 }
@@ -378,7 +421,8 @@ int main(int, char **argv) {
       {"signal_from_outside", signal_from_outside}, {"thread_signals", thread_signals}, {"cancel", cancel},
       {"destructors", destructors}, {"main_leaves", main_leaves}, {"children", children}, {"entropy", entropy},
       {"processors", processors}, {"clocks", clocks}, {"busy", busy}, {"outside_pipe", outside_pipe},
-      {"outside_unseen", outside_unseen}, {"inner_files", inner_files}, {"crash", crash},
+      {"outside_unseen", outside_unseen}, {"inner_files", inner_files}, {"fortified", fortified},
+      {"processor_time", processor_time}, {"crash", crash},
       {"exit", [] { exits([] { std::exit(3); }); }},
       {"_exit", [] { exits([] { _exit(4); }); }},
   };

@@ -19,7 +19,7 @@ bool on = false;
 std::int64_t now = 1'700'000'000'000'000'000;
 std::uint64_t idles = 0;
 
-__attribute__((constructor(101))) void begin() {
+void begin() {
   const char *mine = std::getenv("RSLTRACE_LONE");
   on = mine != nullptr;
   unsetenv("RSLTRACE_LONE");
@@ -35,7 +35,14 @@ std::int64_t real_ns() {
 
 }  // namespace
 
-bool linked() { return on; }
+__attribute__((constructor(101))) bool linked() {
+  static bool begun = false;
+  if (!begun) {
+    begun = true;
+    begin();
+  }
+  return on;
+}
 std::int64_t now_ns() { return now; }
 std::uint64_t times_let_go() { return idles; }
 std::int64_t shown_ns(std::uint32_t, bool) { return now; }

@@ -114,6 +114,7 @@ def test_a_deadlock_names_who_waits_for_what(corner: Corner, name: str, said: st
         ("processors", "4 4 4 4 0\n", 0),
         ("clocks", f"{' '.join(['1700000000'] * 5)}\n3600\n1000000\n", 0),
         ("busy", "20000 yielded\n30000 looked\n35000 polled\n", 0),
+        ("processor_time", "2 2 0\n", 0),
         ("inner_files", "7000 wrote\n7000 pipe\n14000 socket\n", 0),
     ],
 )
@@ -122,6 +123,32 @@ def test_what_programs_do_with_threads_time_and_signals(
 ) -> None:
     ran = corner(name)
     assert (ran.out, ran.status) == (out, status), ran.err
+
+
+def test_what_is_built_with_checks_of_lengths_is_simulated_too(corner: Corner) -> None:
+    """As most programs of distributions are: libc has functions of other names for them."""
+    ran = corner("fortified")
+    *said, drawn = ran.out.splitlines()
+    assert said == ["5000 polled", "6000 read", "7000 recv", "8000 recvfrom", "9000 ppolled"]
+    assert "outside" not in ran.err
+    assert drawn == corner("fortified").out.splitlines()[-1] != "0" * 16
+
+
+def test_what_libraries_do_when_they_are_loaded_is_part_of_the_run(programs: Programs) -> None:
+    """Their constructors come before those of what is preloaded."""
+    ran = programs.run("early")
+    assert re.fullmatch(r"0 (\d+) 0\n10000000 \1 3\n", ran.out), ran.err
+    assert programs.run("early") == ran
+
+
+@pytest.mark.skipif(shutil.which("setarch") is None, reason="needs setarch")
+def test_where_memory_lies_does_not_depend_on_real_time(programs: Programs) -> None:
+    fixed = ["setarch", "-R"]
+    if subprocess.run([*fixed, "true"], check=False).returncode != 0:
+        pytest.skip("the system does not let addresses be fixed")
+    quick = programs.run("layout", "0", before=fixed)
+    assert quick.out.count("\n") == 20
+    assert programs.run("layout", "600", before=fixed) == quick  # as long as a look from outside
 
 
 def test_chance_comes_from_the_seed_and_every_source_goes_on(corner: Corner) -> None:

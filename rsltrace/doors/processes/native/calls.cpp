@@ -36,9 +36,9 @@ std::string target_of(long descriptor) {
 
 }  // namespace
 
-std::string name_of_call(const std::string &line) {
+std::string name_of_call(const char *line) {
   char *rest = nullptr;
-  const long number = std::strtol(line.c_str(), &rest, 10);
+  const long number = std::strtol(line, &rest, 10);
   for (const Call &call : CALLS)
     if (call.number == number)
       return std::string(call.name) + (call.descriptor ? " (" + target_of(std::strtol(rest, nullptr, 16)) + ")" : "");
@@ -72,9 +72,9 @@ void remember_streams() {
   for (int i = 0; i < 2; ++i) printed_to[i] = stream_of(STDOUT_FILENO + i);
 }
 
-bool prints(const std::string &line) {
+bool prints(const char *line) {
   char *rest = nullptr;
-  const long number = std::strtol(line.c_str(), &rest, 10);
+  const long number = std::strtol(line, &rest, 10);
   return (number == SYS_write || number == SYS_writev) &&
          is_printed_to(static_cast<int>(std::strtoul(rest, nullptr, 16)));
 }

@@ -1,5 +1,6 @@
 // Every clock shows simulated time, and sleeping is waiting for it.
 #include <sched.h>
+#include <sys/resource.h>
 #include <sys/time.h>
 #include <sys/times.h>
 #include <time.h>
@@ -110,6 +111,23 @@ RSLTRACE_EXPORT clock_t clock() noexcept {
   timespec now;
   clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &now);
   return now.tv_sec * CLOCKS_PER_SEC + now.tv_nsec / 1000;
+}
+
+RSLTRACE_EXPORT clock_t times(tms *out) noexcept {
+  if (!linked()) return REAL(times)(out);
+  const clock_t ticks = now_ns() / (SECOND_NS / sysconf(_SC_CLK_TCK));
+  if (out != nullptr) *out = {ticks, 0, 0, 0};
+  return ticks;
+}
+
+RSLTRACE_EXPORT int getrusage(__rusage_who_t who, rusage *out) noexcept {
+  const int result = REAL(getrusage)(who, out);
+  if (result != 0 || !linked()) return result;
+  const long memory = out->ru_maxrss;
+  *out = {};  // how often it waited, or was made to
+  out->ru_maxrss = memory;
+  if (who != RUSAGE_CHILDREN) out->ru_utime = {now_ns() / SECOND_NS, now_ns() % SECOND_NS / 1000};
+  return result;
 }
 
 RSLTRACE_EXPORT int clock_nanosleep(clockid_t clock, int flags, const timespec *when, timespec *left) {

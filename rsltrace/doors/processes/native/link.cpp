@@ -138,7 +138,7 @@ bool has_no_peer(int fd) {
   return syscall(SYS_recvfrom, fd, &byte, 1, MSG_PEEK | MSG_DONTWAIT, nullptr, nullptr) == 0;
 }
 
-__attribute__((constructor(101))) void begin() {
+void begin() {
   const char *link = getenv("RSLTRACE_LINK");
   int fd = -1;
   int parent = 0;
@@ -170,7 +170,15 @@ __attribute__((constructor(101))) void begin() {
 
 }  // namespace
 
-bool linked() { return link_fd >= 0; }
+// By the first who asks: constructors of libraries run before ours, and are part of the run.
+__attribute__((constructor(101))) bool linked() {
+  static bool begun = false;
+  if (__builtin_expect(!begun, 0)) {
+    begun = true;
+    begin();
+  }
+  return link_fd >= 0;
+}
 
 std::int64_t now_ns() { return time_ns; }
 

@@ -1,6 +1,7 @@
 // Threads that block outside of the simulation: in calls that are known to (waiting for a child
 // process), and in others, which a service thread finds. It also idles for the process if the
 // thread that ran last went outside or ended.
+#include <fcntl.h>
 #include <linux/futex.h>
 #include <linux/membarrier.h>
 #include <signal.h>
@@ -9,7 +10,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include <fstream>
+#include <cstring>
 #include <set>
 
 #include "calls.h"
@@ -23,18 +24,37 @@ namespace {
 constexpr long LOOK_EVERY_NS = 250'000'000;
 
 // What a thread does in the kernel, empty if it does not sleep in a call: with how often it has
-// slept so far, so that two equal ones mean that it did not run in between.
-std::string asleep(const Thread &thread) {
-  const std::string folder = "/proc/self/task/" + std::to_string(thread.tid) + "/";
-  std::string call, line, text;
-  std::getline(std::ifstream(folder + "syscall"), call);
-  if (call.empty() || call[0] == 'r' || call[0] == '-' || prints(call)) return "";
-  std::ifstream status(folder + "status");
-  while (std::getline(status, line)) {
-    if (line.rfind("State:\tS", 0) != 0 && line.rfind("State:", 0) == 0) return "";
-    if (line.find("ctxt_switches") != std::string::npos) text += line;
+// slept so far, so that two equal ones mean that it did not run in between. Nothing of this comes
+// from the heap: how often the service thread looks depends on real time, and where the program's
+// memory lies must not.
+struct Sleep {
+  char call[256] = "";
+  char switches[128] = "";
+  bool operator==(const Sleep &other) const {
+    return std::strcmp(call, other.call) == 0 && std::strcmp(switches, other.switches) == 0;
   }
-  return call + "\n" + text;
+};
+
+void read_of(const Thread &thread, const char *name, char *text, std::size_t size) {
+  char path[64];
+  std::snprintf(path, sizeof path, "/proc/self/task/%d/%s", thread.tid, name);
+  const int file = static_cast<int>(REAL(syscall)(SYS_openat, AT_FDCWD, path, O_RDONLY | O_CLOEXEC));
+  const ssize_t length = file < 0 ? 0 : REAL(read)(file, text, size - 1);
+  text[length < 0 ? 0 : length] = '\0';
+  if (file >= 0) REAL(syscall)(SYS_close, file);
+}
+
+Sleep asleep(const Thread &thread) {
+  Sleep sleep;
+  read_of(thread, "syscall", sleep.call, sizeof sleep.call);
+  const char first = sleep.call[0];
+  if (first == '\0' || first == 'r' || first == '-' || prints(sleep.call)) return {};
+  char status[8192];
+  read_of(thread, "status", status, sizeof status);
+  const char *switches = std::strstr(status, "voluntary_ctxt_switches");
+  if (std::strstr(status, "State:\tS") == nullptr || switches == nullptr) return {};
+  std::snprintf(sleep.switches, sizeof sleep.switches, "%s", switches);
+  return sleep;
 }
 
 long membarrier(int command) { return REAL(syscall)(SYS_membarrier, command, 0, 0); }
@@ -42,29 +62,29 @@ long membarrier(int command) { return REAL(syscall)(SYS_membarrier, command, 0, 
 struct Seen {
   Thread *thread = nullptr;
   std::uint64_t turn = 0;
-  std::string sleep;
+  Sleep sleep;
 };
 
 // Take the baton from a thread that sleeps in the kernel for two looks. It may return at any moment:
 // it is marked first, and only if it still sleeps when every processor has seen that is it left
 // behind. A mark it finds when it comes back it takes away itself (enter()).
-bool take_from(Thread &thread, const std::string &sleep) {
+bool take_from(Thread &thread, const Sleep &sleep) {
   if (!thread.open.load()) return false;
   thread.seized.store(1);
   thread.open.store(false);
-  if (membarrier(MEMBARRIER_CMD_PRIVATE_EXPEDITED) != 0 || asleep(thread) != sleep) return false;
+  if (membarrier(MEMBARRIER_CMD_PRIVATE_EXPEDITED) != 0 || !(asleep(thread) == sleep)) return false;
   std::uint8_t marked = 1;
   if (!thread.seized.compare_exchange_strong(marked, 2)) return false;
   seize(thread, "a call that blocks");
-  tell_outside(thread, name_of_call(sleep));
+  tell_outside(thread, name_of_call(sleep.call));
   return true;
 }
 
 bool look_at_holder(Seen &seen) {
   Thread *thread = holder();
   const std::uint64_t turn = turns();
-  const std::string sleep = thread == nullptr || !thread->open.load() ? "" : asleep(*thread);
-  if (!sleep.empty() && seen.thread == thread && seen.turn == turn && seen.sleep == sleep)
+  const Sleep sleep = thread == nullptr || !thread->open.load() ? Sleep{} : asleep(*thread);
+  if (sleep.call[0] != '\0' && seen.thread == thread && seen.turn == turn && seen.sleep == sleep)
     return take_from(*thread, sleep);
   seen = {thread, turn, sleep};
   return false;

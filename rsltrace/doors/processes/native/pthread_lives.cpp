@@ -41,15 +41,8 @@ void only_a_copy() {
   if (self != nullptr) self->open.store(false);
 }
 
-// After the link's constructor (101), before those of the program.
-__attribute__((constructor(102))) void begin() {
-  pthread_key_create(&key, destruct);
-  pthread_atfork(nullptr, nullptr, only_a_copy);
-  if (Thread *main = me()) {
-    pthread_setspecific(key, main);
-    start_service();
-  }
-}
+// If no library's constructor has come to us: before those of the program.
+__attribute__((constructor(102))) void begin() { me(); }
 
 int join(pthread_t handle, void **result, std::int64_t deadline_ns, const char *what) {
   Thread *thread = me();
@@ -84,6 +77,14 @@ int join(pthread_t handle, void **result, std::int64_t deadline_ns, const char *
 }
 
 }  // namespace
+
+void prepare_threads(Thread &main) {
+  pthread_key_create(&key, destruct);
+  pthread_atfork(nullptr, nullptr, only_a_copy);
+  pthread_setspecific(key, &main);
+  start_service();
+}
+
 }  // namespace rsltrace
 
 using namespace rsltrace;

@@ -1,6 +1,7 @@
 #include "scheduler.h"
 
 #include <linux/futex.h>
+#include <malloc.h>
 #include <signal.h>
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
@@ -8,6 +9,8 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <cstdlib>
+#include <cstring>
 #include <deque>
 
 #include "real.h"
@@ -24,6 +27,7 @@ namespace {
 // What many looks at one instant cost, before time passes.
 constexpr unsigned LOOKS_MAX = 10'000;
 constexpr std::int64_t LOOK_NS = 1'000'000;
+constexpr int HEAPS_MAX = 32;
 
 struct Table {
   std::vector<Thread *> threads;  // in the order of creation
@@ -56,7 +60,16 @@ long futex(std::atomic<std::uint32_t> &word, int operation, std::uint32_t value)
   return REAL(syscall)(SYS_futex, &word, operation | FUTEX_PRIVATE_FLAG, value, nullptr, nullptr, 0);
 }
 
+// How many heaps threads share depends on the number of processors, and what they get from them
+// with it: as many as the four have that a process sees.
+void fix_heaps() {
+  const char *tuned = std::getenv("GLIBC_TUNABLES");
+  const bool is_set = tuned != nullptr && std::strstr(tuned, "arena_max") != nullptr;
+  if (!is_set && std::getenv("MALLOC_ARENA_MAX") == nullptr) mallopt(M_ARENA_MAX, HEAPS_MAX);
+}
+
 void set_up() {
+  fix_heaps();
   table = new Table;
   table->eventfd = eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC);
   table->bell = epoll_create1(EPOLL_CLOEXEC);
@@ -181,6 +194,7 @@ void adopt_main(Thread &thread) {
   table->threads.push_back(&thread);
   self = &thread;
   holding.store(&thread);
+  prepare_threads(thread);
   thread.open.store(true);
 }
 

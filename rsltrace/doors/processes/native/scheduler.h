@@ -164,6 +164,7 @@ bool files_wait_for_signals();                       // files.cpp
 void post_semaphores();                              // pthread_waits.cpp
 void unlocked(const pthread_mutex_t *mutex);         // pthread_locks.cpp: keep it for who waits
 void start_service();                                // outside.cpp
+void prepare_threads(Thread &main);                  // pthread_lives.cpp
 void lock_cycle(Thread &thread);                     // stacks.cpp
 void note_frames(Thread &thread);                    // stacks.cpp
 
