@@ -41,6 +41,7 @@ if TYPE_CHECKING:
         TopicStop,
         load_job,
     )
+    from rsltrace.latency.measure import ChainLatency, measure_latencies
     from rsltrace.replay import replay_trace as replay
     from rsltrace.replay.one_node.result import NodeReplayResult
     from rsltrace.replay.result import ReplayResult
@@ -50,6 +51,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "BagDiff": "rsltrace.diff.result.bags",
     "BagSpec": "rsltrace.job",
+    "ChainLatency": "rsltrace.latency.measure",
     "CheckResult": "rsltrace.checks.evaluate",
     "CheckSpec": "rsltrace.job",
     "DebugSession": "rsltrace.debug.client",
@@ -76,12 +78,14 @@ _HOMES = {
     "evaluate_checks": "rsltrace.checks.evaluate",
     "evaluate_metrics": "rsltrace.checks.metrics",
     "load_job": "rsltrace.job",
+    "measure_latencies": "rsltrace.latency.measure",
     "record": "rsltrace.run",
 }
 
 __all__ = [
     "BagDiff",
     "BagSpec",
+    "ChainLatency",
     "CheckResult",
     "CheckSpec",
     "DebugSession",
@@ -110,6 +114,7 @@ __all__ = [
     "evaluate_checks",
     "evaluate_metrics",
     "load_job",
+    "measure_latencies",
     "record",
     "replay",
 ]

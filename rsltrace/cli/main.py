@@ -32,6 +32,7 @@ _COMMANDS = {
     "completion": "Print what bash, zsh or fish needs to complete commands.",
     "info": "Show what is in a trace: digest, counts, nodes, rates.",
     "cat": "Print the events of a trace, one per line.",
+    "latency": "Show how long data takes through chains of nodes.",
     "view": "Look at a trace in the terminal, or at two side by side.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
     "export": "Write the messages of a trace as a plain rosbag2 bag.",

@@ -104,6 +104,8 @@ _TRACES = ("a.mcap", "a2.mcap", f"x{ESCAPES}.mcap")
         *(("cat", trace, "--json", "--payloads") for trace in _TRACES),
         ("cat", "a.mcap", "--node", ESCAPES),
         ("info", "a.mcap", "--check"),
+        *(("latency", "a.mcap", *more) for more in ((), ("--format", "csv"), ("b.mcap",))),
+        ("latency", "a.mcap", "--from", f"/scan{ESCAPES}"),
         ("export", "a2.mcap", "-o", f"out{ESCAPES}"),
         *(
             ("diff", "a.mcap", "b.mcap", "--format", form)

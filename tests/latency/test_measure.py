@@ -1,0 +1,257 @@
+"""Latencies of chains against their definitions, on random graphs and on a run of real nodes."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rsltrace.errors import TraceError
+from rsltrace.latency.figures import figures
+from rsltrace.latency.instances import Parts
+from rsltrace.latency.measure import MEASURES, ChainLatency, measure_latencies
+from rsltrace.latency.paths import Hop
+from rsltrace.model.draw import Draw, encode_draw
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
+from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
+
+NODES, TOPICS = 3, 4
+
+
+@dataclass
+class Sent:
+    """A message: where in the trace, and what it came of by the definition."""
+
+    hop: Hop
+    cause: tuple[int, int]
+    left_ns: int
+    began_ns: int
+    came: Sent | None = None
+    start_ns: int = 0
+    """When the callback began that took ``came``."""
+    delays: dict[int, int] = field(default_factory=dict)
+    last: dict[str, tuple[Sent, int]] = field(default_factory=dict)
+    """By topic, what its node had received last when it was published, and when that began."""
+
+    def hops(self) -> list[Sent]:
+        return [*(self.came.hops() if self.came else ()), self]
+
+
+@dataclass
+class MadeRun:
+    """What of a trace is looked at: entities, and segments of events and outputs."""
+
+    name: str = "made.mcap"
+    entities: dict[int, Entity] = field(default_factory=dict)
+    rows: list[tuple[Any, ...]] = field(default_factory=list)
+    sent: list[tuple[Any, ...]] = field(default_factory=list)
+    cuts: list[int] = field(default_factory=list)
+
+    def entity(self, number: int) -> Entity:
+        return self.entities[number]
+
+    def add(self, kind: EntityKind, name: str, node: int = 0) -> int:
+        number = len(self.entities) + 1
+        self.entities[number] = Entity(number, node or number, kind, name, "", 0, {})
+        return number
+
+    def _cut(self, dtype: Any, columns: dict[str, int], rows: list[Any], of: int) -> Iterator[Any]:
+        for low, high in pairwise((0, *self.cuts, len(self.rows))):
+            own = [row for row in rows if low <= row[of] < high]
+            made = np.zeros(len(own), dtype=dtype)
+            for name, place in columns.items():
+                made[name] = [row[place] for row in own]
+            yield made
+
+    def events(self) -> Iterator[Any]:
+        names = ("index", "stamp", "entity", "kind", "flags", "cause_event", "cause_output")
+        return self._cut(EVENT_DTYPE, {name: n for n, name in enumerate(names)}, self.rows, 0)
+
+    def outputs(self) -> Iterator[Any]:
+        names = ("event", "kind", "entity", "hash")
+        return self._cut(OUTPUT_DTYPE, {name: n for n, name in enumerate(names)}, self.sent, 0)
+
+
+def random_run(seed: int) -> tuple[Any, list[Sent]]:
+    """Return a run in which anything causes anything, and its messages in order."""
+    chance, run = random.Random(seed), MadeRun()
+    nodes = [run.add(EntityKind.NODE, f"/n{n}") for n in range(NODES)]
+    timers = [run.add(EntityKind.TIMER, "tick", node) for node in nodes]
+    topics = [f"/t{t}" for t in range(TOPICS)]
+    publishers = [
+        [(t, run.add(EntityKind.PUBLISHER, t, node)) for t in chance.sample(topics, 2)]
+        for node in nodes
+    ]
+    subscriptions = [
+        {t: run.add(EntityKind.SUBSCRIPTION, t, node) for t in topics} for node in nodes
+    ]
+    messages: list[Sent] = []
+    waiting: dict[int, tuple[Sent, int] | None] = {}
+    last: list[dict[str, tuple[Sent, int]]] = [{} for _ in nodes]
+    now_ns = 1_000
+    for index in range(chance.randint(1, 60)):
+        now_ns += chance.randint(0, 3)
+        node = chance.randrange(NODES)
+        came: tuple[Sent, int] | None = None
+        entity, kind, cause = timers[node], EventKind.TIMER, (NO_EVENT, 0)
+        choice = chance.choice(("receive", "receive", "receive", "resume", "timer"))
+        if choice == "receive" and messages:
+            message = chance.choice(messages[-6:])
+            entity = subscriptions[node][message.hop.topic]
+            now_ns = max(now_ns, message.left_ns + message.delays.get(entity, 0))
+            kind, cause, came = EventKind.SUBSCRIPTION, message.cause, (message, now_ns)
+            last[node][message.hop.topic] = came
+        elif choice == "resume" and waiting:
+            entity = chance.choice(list(waiting))
+            node = nodes.index(run.entities[entity].node)
+            came, kind = waiting.pop(entity), EventKind.RESUME
+        busy_ns = chance.randint(0, 4) if kind != EventKind.RESUME else 0
+        place = 0
+        if busy_ns:
+            draw = encode_draw(Draw.EXECUTION, busy_ns)
+            run.sent.append((index, OutputKind.DRAW, entity, draw))
+            place += 1
+        goes_on = entity not in waiting and chance.random() < 0.3
+        for topic, publisher in publishers[node][: chance.randint(0, 2)]:
+            sent = Sent(Hop(f"/n{node}", topic), (index, place), now_ns + busy_ns, now_ns)
+            run.sent.append((index, OutputKind.MESSAGE, publisher, 7))
+            place += 1
+            if came is not None:
+                sent.came, sent.start_ns = came
+            sent.last = dict(last[node])
+            for other in chance.sample(range(NODES), chance.randint(0, NODES)):
+                receiver, delay_ns = subscriptions[other][topic], chance.randint(0, 5)
+                draw = encode_draw(Draw.DELAY, delay_ns)
+                run.sent.append((index, OutputKind.DRAW, receiver, draw))
+                place += 1
+                sent.delays[receiver] = delay_ns
+            messages.append(sent)
+        if goes_on and not busy_ns:
+            waiting[entity] = came
+        flags = EventFlag.SUSPENDED if goes_on and not busy_ns else EventFlag.NONE
+        run.rows.append((index, now_ns, entity, kind, flags, *cause))
+    run.cuts = sorted(chance.sample(range(len(run.rows)), min(2, len(run.rows))))
+    return run, messages
+
+
+def longest_without_repeats(hops: list[Sent]) -> list[Sent]:
+    for first in range(len(hops)):
+        names = [one.hop for one in hops[first:]]
+        if len(set(names)) == len(names):
+            return hops[first:]
+    return []
+
+
+def expected(outputs: list[list[Sent]], inputs: list[Sent]) -> dict[str, list[int]]:
+    """The definitions of docs/latency.md, one by one and without any thought of speed."""
+    inputs = sorted(inputs, key=lambda one: one.left_ns)  # stable: in the order of publishing
+    rank = {id(one): place for place, one in enumerate(inputs)}
+    outputs = sorted(outputs, key=lambda hops: hops[-1].left_ns)
+    found: dict[str, list[int]] = {name: [] for name in MEASURES}
+    for place, hops in enumerate(outputs):
+        age = hops[-1].left_ns - hops[0].left_ns
+        found["age"].append(age)
+        if all(other[0] is not hops[0] for other in outputs[:place]):
+            found["latency"].append(age)
+        if place + 1 < len(outputs):
+            found["last_age"].append(outputs[place + 1][-1].left_ns - hops[0].left_ns)
+    for place, one in enumerate(inputs):
+        answer = next((hops for hops in outputs if rank[id(hops[0])] >= place), None)
+        if answer is not None:
+            found["reaction"].append(answer[-1].left_ns - one.left_ns)
+            if place:
+                before = inputs[place - 1].left_ns
+                found["worst_reaction"].append(answer[-1].left_ns - before)
+    return found
+
+
+def assert_measured(chain: ChainLatency, outputs: list[list[Sent]], inputs: list[Sent]) -> None:
+    want = expected(outputs, inputs)
+    assert {name: chain.durations(name).tolist() for name in MEASURES} == want
+    for name, durations in want.items():
+        worst = chain.worst(name)
+        assert (worst.duration_ns if worst else None) == max(durations, default=None)
+        if worst is not None:
+            assert worst.output_ns >= worst.input_ns
+    ordered = sorted(outputs, key=lambda hops: hops[-1].left_ns)
+    assert chain.events().tolist() == [[one.cause[0] for one in hops] for hops in ordered]
+    whole = sum(getattr(one, part) for one in chain.parts for part in Parts.__slots__)
+    assert np.array_equal(whole, chain.found.ages_ns())
+    for one in chain.parts:
+        assert all((getattr(one, part) >= 0).all() for part in Parts.__slots__)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**9))
+def test_all_chains_of_random_graphs(seed: int) -> None:
+    run, messages = random_run(seed)
+    came = [longest_without_repeats(one.hops()) for one in messages]
+    names = {tuple(one.hop for one in hops) for hops in came}
+    ends = {n for n in names if len(n) > 1 and not any(o[:-1] == n for o in names)}
+    found = measure_latencies(run)
+    assert {chain.hops for chain in found.chains} == ends
+    for chain in found.chains:
+        outputs = [hops for hops in came if tuple(o.hop for o in hops) == chain.hops]
+        used = [hops[0] for hops in outputs]
+        inputs = [
+            hops[-1]
+            for hops in came
+            if (len(hops) == 1 and hops[0].hop == chain.hops[0])
+            or any(hops[-1] is one for one in used)
+        ]
+        assert_measured(chain, outputs, inputs)
+
+
+def through(message: Sent, topics: list[str], via: str) -> Iterator[list[Sent]]:
+    """Yield the messages that one of the last of ``topics`` came of, by the definition."""
+    if message.hop.topic != topics[-1]:
+        return
+    if len(topics) == 1:
+        yield [message]
+        return
+    parents = [message.came] if message.came is not None else []
+    if message.hop.node == via and (last := message.last.get(topics[-2])) is not None:
+        own = message.came is not None and message.came.hop.topic == topics[-2]
+        parents += [] if own else [last[0]]
+    for parent in parents:
+        for hops in through(parent, topics[:-1], via):
+            yield [*hops, message]
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**9))
+def test_a_chain_through_a_node_that_samples(seed: int) -> None:
+    run, messages = random_run(seed)
+    chance = random.Random(seed)
+    known = sorted({one.name for one in run.entities.values() if one.kind is EntityKind.PUBLISHER})
+    topics, via = chance.choices(known, k=chance.randint(2, 3)), f"/n{chance.randrange(NODES)}"
+    came = [hops for one in messages for hops in through(one, topics, via)]
+    if not came:
+        with pytest.raises(TraceError, match="no message of"):
+            measure_latencies(run, topics=topics, via=[via])
+        return
+    found = measure_latencies(run, topics=topics, via=[via])
+    assert sum(chain.outputs for chain in found.chains) == len(came)
+    for chain in found.chains:
+        outputs = [hops for hops in came if tuple(o.hop for o in hops) == chain.hops]
+        assert_measured(chain, outputs, [one for one in messages if one.hop == chain.hops[0]])
+
+
+@given(st.lists(st.integers(0, 50), min_size=1))
+def test_quantiles_are_durations_that_so_many_do_not_exceed(durations: list[int]) -> None:
+    found = figures(np.array(durations, dtype=np.int64))
+    assert found is not None
+    for value, percent in ((found.p50_ns, 50), (found.p95_ns, 95), (found.p99_ns, 99)):
+        assert value in durations
+        assert sum(one <= value for one in durations) >= math.ceil(percent * len(durations) / 100)
+        assert sum(one < value for one in durations) < math.ceil(percent * len(durations) / 100)
+    assert found.jitter_ns == max(durations) - min(durations)
