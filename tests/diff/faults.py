@@ -211,6 +211,8 @@ def _seed(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
     drawing = {node.name for node in plan.nodes if node.draws}
     for index, node in enumerate(plan.nodes):
         if node.draws_at_start:
+            if any(other.starts_ns for other in plan.nodes):
+                return None
             expected = (Verdict.ENVIRONMENT, Root.JOB, index, [(node.name, node.name)])
             return (plan, other, None, expected) if _first_only(plan, index) else None
     if len(drawing) > 1:
@@ -260,7 +262,7 @@ def _bag_missing(rng: random.Random, plan: Plan, clean: Simulation) -> Made | No
 
 def _end(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
     stamps = sorted({event.stamp_ns for event in clean.log})
-    if len(stamps) < 3:
+    if len(stamps) < 3 or any(node.starts_ns for node in plan.nodes):
         return None
     end_ns = rng.choice(stamps[:-1])
     other = replace(plan, end_ns=end_ns)
@@ -272,6 +274,7 @@ def _end(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
 
 
 def _graph(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
+    plan = _started_at_once(plan)
     where = rng.randrange(len(plan.nodes))
     node = plan.nodes[where]
     more = replace(node, services=(*node.services, "/more"))
@@ -280,10 +283,15 @@ def _graph(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
 
 
 def _node(rng: random.Random, plan: Plan, clean: Simulation) -> Made | None:
+    plan = _started_at_once(plan)
     where = rng.randrange(len(plan.nodes) + 1)
     more = NodePlan("/more", timers=((10 * MS, ()),))
     other = replace(plan, nodes=(*plan.nodes[:where], more, *plan.nodes[where:]))
     return plan, other, None, (Verdict.GRAPH, Root.JOB, where, [("/more", "/more")])
+
+
+def _started_at_once(plan: Plan) -> Plan:
+    return replace(plan, nodes=tuple(replace(node, starts_ns=0) for node in plan.nodes))
 
 
 def _entity_name(clean: Simulation, entity: int) -> tuple[str, str]:

@@ -65,6 +65,7 @@ class NodePlan:
     draws: bool = False
     draws_at_start: bool = False
     hops_max: int = 4
+    starts_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,8 @@ class Simulation:
             self.recorder = Recorder(writer, keep_payload=lambda topic: storage.payloads)
             self._write_job(writer)
             for node in self.plan.nodes:
-                self._construct(node)
+                if not node.starts_ns:
+                    self._construct(node)
             self._loop()
             if not self._raised:
                 self._shut_down()
@@ -231,7 +233,7 @@ class Simulation:
             timer = self._entity(EntityKind.TIMER, "tick", node.id)
             self._actions[timer] = publications
             self._owner[timer] = node
-            self._timers.append([period, timer, timer, period, 0, 0])
+            self._timers.append([self._now + period, timer, timer, period, 0, 0])
         if plan.draws_at_start:
             node.state = self._draw(node)
             self.recorder.output(OutputKind.LOG, node.id, node.state)
@@ -258,11 +260,15 @@ class Simulation:
                 for topic in dict.fromkeys(topic for _, topic, _ in bag)
             }
             self._end_event(EventKind.CONSTRUCT, 0, NO_EVENT, 0, 0)
+        late = deque(sorted((n for n in self.plan.nodes if n.starts_ns), key=_starts_ns))
         while not self._raised:
             due = [timer[0] + timer[4] for timer in self._timers] + ([bag[0][0]] if bag else [])
+            due += [late[0].starts_ns] if late else []
             if not due or min(due) > self.plan.end_ns:
                 return
             self._now = max(min(due), self._now)
+            while late and late[0].starts_ns <= self._now:
+                self._construct(late.popleft())
             while bag and bag[0][0] <= self._now:
                 self._play(*bag.popleft()[1:])
             self._run_step()
@@ -421,8 +427,13 @@ class Simulation:
         self.recorder.end_event(self._now, kind, flags, entity, cause, nth, input_hash)
 
     def _shut_down(self) -> None:
+        self._now = self.plan.end_ns
         for node in self._nodes:
             self._end_event(EventKind.SHUTDOWN, node.id, NO_EVENT, 0, 0)
+
+
+def _starts_ns(node: NodePlan) -> int:
+    return node.starts_ns
 
 
 def random_plan(rng: random.Random) -> Plan:
@@ -451,6 +462,7 @@ def random_plan(rng: random.Random) -> Plan:
                 draws=rng.random() < 0.25,
                 draws_at_start=rng.random() < 0.1,
                 hops_max=rng.choice((1, 2, 3)),
+                starts_ns=rng.choice((0, 0, 0, 20, 35, 60)) * MS if number else 0,
             )
         )
     bag = ()

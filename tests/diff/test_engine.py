@@ -6,13 +6,19 @@ import inspect
 import json
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
+from rsltrace_viewer.model.comparison import Comparison
+from rsltrace_viewer.model.run import Run
+from rsltrace_viewer.model.view import Sign
 
 import rsltrace
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.report import render
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
@@ -285,6 +291,16 @@ def test_a_run_that_was_told_to_stop_earlier(tmp_path: Path) -> None:
     assert compare(tmp_path, a=short, b=PLAN).verdict is Verdict.RAN_LONGER
 
 
+def test_a_last_event_that_is_missing_is_no_earlier_end(tmp_path: Path) -> None:
+    """Both runs last as long as they were told to; one loses a message of the last instant."""
+    diff = compare(tmp_path, Fault("drop", step(100, 5) - 1))
+    assert diff.verdict is Verdict.MISSING
+    assert "subscription /r of /sum at 1.0 s happened only in a" in diff.sentence
+    back = rsltrace.diff(tmp_path / "b.mcap", tmp_path / "a.mcap")
+    assert back.verdict is Verdict.EXTRA
+    assert "happened only in b" in back.sentence
+
+
 def _cut(path: Path, size: int) -> Path:
     path.write_bytes(path.read_bytes()[:size])
     return path
@@ -467,6 +483,26 @@ def test_the_same_swap_again_and_again_is_one_divergence(tmp_path: Path) -> None
 
 
 # -- the Python API ------------------------------------------------------------------------------
+
+
+def test_a_node_that_starts_late_stands_where_it_starts(tmp_path: Path) -> None:
+    """In the text and in the viewer. Its seed, and so its constructor, is another one in b."""
+    late = NodePlan("/late", draws_at_start=True, starts_ns=505 * MS)
+    a = replace(PLAN, nodes=(*PLAN.nodes, late))
+    faults = Fault("bit", step(20, 1)), Fault("bit", step(30, 5))
+    diff = compare(tmp_path, *faults, a=a, b=replace(a, seed=1), everything=True)
+    text = render(diff, "text", options=DiffOptions(everything=True))
+    places = [text.index(event) for event in ("0.200000000 s", "0.300000000 s", "0.505000000 s")]
+    assert places == sorted(places)
+    paths = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    with closing(Run.open(paths[0])) as run_a, closing(Run.open(paths[1])) as run_b:
+        view = Comparison(run_a, run_b)
+        while not view.done:
+            view.advance()
+        constructed = step(51, 0)
+        assert run_a.trace.event(constructed).kind is EventKind.CONSTRUCT
+        assert [view.a(place) for place in range(view.count)] == list(range(run_a.count))
+        assert view.sign(constructed) is Sign.DIFFERS
 
 
 def test_the_function_is_also_the_package(tmp_path: Path) -> None:

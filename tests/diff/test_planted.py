@@ -19,6 +19,9 @@ from diff_simulator import MS, Fault, Simulation
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks
+from rsltrace.diff.alignment.entity_matching import match_entities
+from rsltrace.diff.alignment.rows import Run
 from rsltrace.diff.causes.propagation import Propagation
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
@@ -119,6 +122,26 @@ def test_a_second_fault_outside_of_the_cone_is_found_too(
     assert found == {first.index, second.index}, diff.divergences
 
 
+def _check_order(a: Trace, b: Trace, start: int, window: int) -> None:
+    """All events from ``start`` on are listed once, by the time at which either run did them."""
+    matching = match_entities(a, b)
+    blocks = AlignedBlocks(Run(a, matching, False), Run(b, matching, True), start, window)
+    items = [i for block in blocks if isinstance(block, AlignedBlock) for i in block.items]
+    times_a, times_b = _times(a), _times(b)
+    times = [min(times_a[i.a : i.a + 1] + times_b[i.b : i.b + 1]) for i in items]
+    assert times == sorted(times)
+    for times, mine in ((times_a, [i.a for i in items]), (times_b, [i.b for i in items])):
+        assert sorted(i for i in mine if i >= 0) == list(range(start, len(times)))
+
+
+def _times(trace: Trace) -> list[int]:
+    """Return when the events were, but -1 for the constructors before all others."""
+    events = [event for part in trace.events() for event in part]
+    is_construct = [event["kind"] == EventKind.CONSTRUCT for event in events]
+    first = is_construct.index(False) if False in is_construct else len(events)
+    return [-1] * first + [int(event["stamp"]) for event in events[first:]]
+
+
 def _differs(a: dict[int, object], b: dict[int, object], index: int) -> bool:
     names = ("stamp", "entity", "kind", "input_hash", "output_hash")
     mine, theirs = a.get(index), b.get(index)
@@ -164,6 +187,7 @@ def test_every_event_is_counted_once_whatever_the_runs_are(
     with Trace.open(folder / "a.mcap") as a, Trace.open(folder / "b.mcap") as b:
         diff = diff_traces(a, b, DiffOptions(window=window, everything=True))
         left = a.event_count - diff.agreeing, b.event_count - diff.agreeing
+        _check_order(a, b, diff.agreeing, window)
     if diff.counts:  # not if one run is the beginning of the other
         assert sum(c.matching + c.differing + c.only_a for c in diff.counts) == left[0]
         assert sum(c.matching + c.differing + c.only_b for c in diff.counts) == left[1]

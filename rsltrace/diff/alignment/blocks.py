@@ -122,8 +122,8 @@ class AlignedBlocks:
             kept = {b: a for b, a in past.recent.items() if b >= rows_b.first - self.events}
             past = EarlierPairs(self.start, {**kept, **recent}, past.equal_run)
             first_a, first_b = block.end_a, block.end_b
-            taken_a = {i.a for i in block.items if i.a >= first_a}
-            taken_b = {i.b for i in block.items if i.b >= first_b}
+            taken_a = {a for a in taken_a.union(i.a for i in block.items) if a >= first_a}
+            taken_b = {b for b in taken_b.union(i.b for i in block.items) if b >= first_b}
             if self.skip_equal and not taken_a and not taken_b:
                 run = equal_block(self.run_a, self.run_b, first_a, first_b)
                 if run is not None:
@@ -184,23 +184,15 @@ def equal_block(run_a: Run, run_b: Run, first_a: int, first_b: int) -> EqualBloc
 def _cuts(a: Rows, b: Rows, events: int) -> tuple[int, int]:
     """Return how many events of each belong to the block: all before some common time."""
     limits = []
-    times_a, times_b = _times(a), _times(b)
-    for rows, times in ((a, times_a), (b, times_b)):
+    for rows in (a, b):
+        times = rows.times
         if not (rows.at_end and len(rows) <= events):
             limits.append(times[min(events, len(rows) - 1)])
         if not rows.at_end:
             limits.append(times[-1])
     if not limits:
         return len(a), len(b)
-    return bisect_left(times_a, min(limits)), bisect_left(times_b, min(limits))
-
-
-def _times(rows: Rows) -> list[int]:
-    """Return the stamps, with nodes constructed before all: from there the clock may jump back."""
-    return [
-        -1 if kind == CONSTRUCT else stamp
-        for kind, stamp in zip(rows.kind, rows.stamp, strict=True)
-    ]
+    return bisect_left(a.times, min(limits)), bisect_left(b.times, min(limits))
 
 
 def _items(
@@ -212,8 +204,8 @@ def _items(
     taken_a: set[int],
     taken_b: set[int],
 ) -> list[EventPair]:
-    times_a, times_b = _times(a), _times(b)
-    spine = _spine(a, b, pairs, times_a, times_b)
+    times_a, times_b = a.times, b.times
+    spine = _spine(a, b, pairs)
     keyed: list[tuple[int, float, int, EventPair]] = []
     last = -0.5  # where an event stands that is only in b, or earlier in b: behind the spine so far
     for place in range(end_b):
@@ -245,11 +237,10 @@ def _items(
     return [item for _, _, _, item in keyed]
 
 
-def _spine(
-    a: Rows, b: Rows, pairs: Pairs, times_a: list[int], times_b: list[int]
-) -> frozenset[int]:
+def _spine(a: Rows, b: Rows, pairs: Pairs) -> frozenset[int]:
     """Return the places in b of as many pairs as can be that are in the same order in both runs,
     have the same input and happened at the same time: what the rest is ordered by."""
+    times_a, times_b = a.times, b.times
     return longest_increasing(
         [
             partner

@@ -79,6 +79,21 @@ class Rows:
         """The index behind the last event."""
         return self.first + len(self.stamp)
 
+    @cached_property
+    def times(self) -> list[int]:
+        """When each event happened, never falling: its stamp, but -1 for what is constructed
+        before the run starts. The two runs may have other times for that."""
+        place = 0
+        if self.kind and self.kind[0] == CONSTRUCT and self._is_first:
+            place = next((p for p, k in enumerate(self.kind) if k != CONSTRUCT), len(self))
+        return [-1] * place + self.stamp[place:]
+
+    @property
+    def _is_first(self) -> bool:
+        """Whether nothing but constructors has run before these events."""
+        before = self.run.trace.events(0, self.first)
+        return all(bool((part["kind"] == CONSTRUCT).all()) for part in before)
+
     def outputs(self, index: int) -> list[OutputRow]:
         """Return the outputs of the event with this index, in order."""
         place = index - self.first

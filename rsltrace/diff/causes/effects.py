@@ -117,7 +117,7 @@ def _order(block: AlignedBlock, item: EventPair) -> tuple[int, bool, int, str]:
     for rows, index in ((block.rows_a, item.a), (block.rows_b, item.b)):
         if index >= 0:
             place = index - rows.first
-            stamps.append(-1 if rows.kind[place] == CONSTRUCT else rows.stamp[place])
+            stamps.append(rows.times[place])
             indexes.append(index)
             name = str(rows.run.matching.keys[rows.number[place]])
     return min(stamps), len(indexes) == 2 and not item.inverted, min(indexes), name

@@ -27,15 +27,22 @@ def who_ended(a: Trace, b: Trace, start: int) -> Trace | None:
 
     A run that ends has its mains and nodes end, which are events; when it was killed, its events
     just cease. Two runs that both ended at the same time did not diverge by ending, whatever their
-    nodes did about it.
+    nodes did about it, and neither if one did more at that time and both ended for one reason.
     """
     for trace in (a, b):
         if not trace.complete and start >= trace.event_count:
             return trace
+    if _end_alike(a, b):
+        return None
     over_a, over_b = _is_over(a, b, start), _is_over(b, a, start)
     if over_a and over_b:
         return None if a.end_ns == b.end_ns else a if a.end_ns < b.end_ns else b
     return a if over_a else b if over_b else None
+
+
+def _end_alike(a: Trace, b: Trace) -> bool:
+    ends = [(trace.end_ns, stop_reason(trace), exit_code(trace)) for trace in (a, b)]
+    return a.complete and b.complete and ends[0] == ends[1] and not exit_code(a)
 
 
 def _stops(a: Trace, b: Trace, over: Trace, job: Sequence[Setting]) -> list[Setting]:

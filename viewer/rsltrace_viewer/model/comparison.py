@@ -8,7 +8,7 @@ matched yet stands at the end, unmatched, and says so.
 from __future__ import annotations
 
 from array import array
-from bisect import bisect_left, bisect_right
+from bisect import bisect_left, bisect_right, insort
 from collections.abc import Iterator
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, AlignedBlocks, EventPair
@@ -53,6 +53,7 @@ class Comparison:
         self._divergences: list[int] = []
         """Places where rows begin to differ, after one that does not."""
         self._divergence_stamps: list[int] = []
+        """When that was, in the order of times: one that moved is listed by the earlier of two."""
         self.shifted = False
         """Whether an event is known that both runs have, but not at the same time."""
         self._first_place: int | None = None if first is None else first
@@ -151,7 +152,7 @@ class Comparison:
         plain = sign is Sign.MATCH
         if not plain and (not self._signs or self._signs[-1] == _CODES[Sign.MATCH]):
             self._divergences.append(place)
-            self._divergence_stamps.append(stamp_ns)
+            insort(self._divergence_stamps, stamp_ns)
         self._a.append(item.a)
         self._b.append(item.b)
         self._signs.append(_CODES[sign])
