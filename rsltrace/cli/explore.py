@@ -55,6 +55,20 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
     return Budget(seconds=seconds)
 
 
+def _fork_after(
+    context: click.Context, option: click.Parameter, text: str | None
+) -> tuple[str, int] | None:
+    """Read a simulated time since the start of a run."""
+    from rsltrace.job.values.times import parse_time
+
+    if text is None:
+        return None
+    try:
+        return text, parse_time(text)
+    except ValueError as error:
+        raise click.BadParameter(str(error)) from None
+
+
 @click.command(cls=RosArgsCommand)
 @job_options
 @click.option(
@@ -101,6 +115,13 @@ def _budget(context: click.Context, option: click.Parameter, text: str) -> Budge
 )
 @click.option("--until", metavar="T", help="Stop runs at simulated time T (seconds, or 90s, 5ms).")
 @click.option(
+    "--fork-after",
+    metavar="T",
+    callback=_fork_after,
+    help="Differ from the job as it is only after simulated time T (30s), and go on from there in "
+    "copies of its run.",
+)
+@click.option(
     "--timeout",
     type=click.FloatRange(min=0, min_open=True),
     metavar="S",
@@ -141,6 +162,7 @@ def explore(
     depth: int | None,
     seed: int,
     until: str | None,
+    fork_after: tuple[str, int] | None,
     timeout: float | None,
     cluster: str | None,
     form: str,
@@ -174,10 +196,18 @@ def explore(
         check_vary(source, job)
     folder = output or default_output(named).with_suffix(".explore")
     about = _about(source, job, strategy, seed, depth)
+    if fork_after is not None:
+        about["fork after"] = fork_after[1]
     with terminated(), Table(folder, about, resume=resume) as table:
-        chosen = strategy_named(strategy, job, seed=seed, depth=depth)
+        chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
         search = Search(
-            job, chosen, table, budget=budget, stop_at_first=stop_at_first, timeout_s=timeout
+            job,
+            chosen,
+            table,
+            budget=budget,
+            stop_at_first=stop_at_first,
+            timeout_s=timeout,
+            fork_ns=-1 if fork_after is None else fork_after[1],
         )
         end = _End(search, source, folder, strategy, form)
         interrupted = False

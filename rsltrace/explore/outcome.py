@@ -50,13 +50,15 @@ class Wants:
     """What is asked for of a trial beside how it went.
 
     ``keep``: its trace even if nothing failed. ``strict``: a check that cannot be held against
-    the run is an error, not a failure of the run.
+    the run is an error, not a failure of the run. ``fork_ns``: how much of the run, in simulated
+    time, is that of the job as it is, so that it may be forked from that (-1: nothing).
     """
 
     keep: bool = False
     behaviours: bool = False
     steps: bool = False
     strict: bool = False
+    fork_ns: int = -1
 
 
 def run_trial(
@@ -75,11 +77,19 @@ def run_trial(
     began = time.perf_counter()
     job = source.job(trial)
     with kept_process(), Session(job, trace, force=True) as session:
-        watch = Watch(session, steps=wants.steps)
+        watch = Watch(session, steps=wants.steps, fork_ns=wants.fork_ns)
         session.begin()
         if not session.ended:
             session.go_on()
         ran = session.finish()
+    return result_of_run(job, trial, ran, watch, wants, began)
+
+
+def result_of_run(
+    job: Job, trial: Trial, ran: RunResult, watch: Watch, wants: Wants, began_s: float
+) -> TrialResult:
+    """Return what came of a run that is over, which ``watch`` has seen. It began at ``began_s`` of
+    ``time.perf_counter``. Its trace goes unless it failed, or is wanted."""
     assert ran.path is not None, "it has been recorded"
     with Trace.open(ran.path) as opened:
         failure = _failure(job, ran, opened, wants)
@@ -93,6 +103,7 @@ def run_trial(
             end_ns=ran.end_ns,
             choices=len(watch.order),
             entities=len(watch.entities),
+            choices_before=watch.choices_before,
             failure=failure,
             metrics=metrics,
             final_state=final_state_of(opened),
@@ -103,7 +114,7 @@ def run_trial(
     kept = wants.keep or failure is not None
     if not kept:
         ran.path.unlink(missing_ok=True)
-    wall_s = time.perf_counter() - began
+    wall_s = time.perf_counter() - began_s
     return replace(found, trace=str(ran.path) if kept else None, wall_s=round(wall_s, 6))
 
 

@@ -63,11 +63,18 @@ class Tally:
     first: dict[str, TrialResult] = field(default_factory=dict)
     """The first run of each cause."""
     plain: TrialResult | None = None
+    forked: int = 0
+    """How many runs went on from the prefix that they have in common."""
+    not_forked: Counter[str] = field(default_factory=Counter)
+    """How many should have been, by why they could not."""
 
     def add(self, result: TrialResult) -> None:
         """Count a run."""
         self.runs += 1
         self.events += result.events
+        self.forked += result.is_forked
+        if result.why_not_forked:
+            self.not_forked[result.why_not_forked] += 1
         if result.digest:
             self.digests.add(int(result.digest, 16))
         if result.failure is not None:
@@ -94,7 +101,9 @@ class Search:
         budget: Budget,
         stop_at_first: bool = False,
         timeout_s: float | None = None,
+        fork_ns: int = -1,
     ) -> None:
+        """``fork_ns``: the simulated time after which runs may be forked from the plain one."""
         self.tally = Tally()
         self.strategy = strategy
         self.began_s = time.monotonic()
@@ -107,6 +116,7 @@ class Search:
         self._budget = budget
         self._stop_at_first = stop_at_first
         self._timeout_s = timeout_s
+        self._fork_ns = fork_ns
         self._stopped = False
         self._done: set[int] = set()
         self._under_way: set[int] = set()
@@ -177,7 +187,7 @@ class Search:
 
     def _run_plain(self, pool: Pool, on_result: Callable[[TrialResult], None]) -> None:
         """Run the job as it is."""
-        wants = Wants(True, self.strategy.behaviours, self.strategy.steps, strict=True)
+        wants = replace(self._wants(), keep=True, strict=True)
         self._submit(pool, self._plain, wants)
         found: list[TrialResult] = []
         while not found:
@@ -219,7 +229,8 @@ class Search:
         return Trial(self._number, proposal.overlay, proposal.why)
 
     def _wants(self) -> Wants:
-        return Wants(behaviours=self.strategy.behaviours, steps=self.strategy.steps)
+        strategy = self.strategy
+        return Wants(behaviours=strategy.behaviours, steps=strategy.steps, fork_ns=self._fork_ns)
 
     def _take(self, result: TrialResult, on_result: Callable[[TrialResult], None]) -> None:
         self._keep(result, self.strategy.learn(result), on_result)

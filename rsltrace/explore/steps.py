@@ -54,11 +54,15 @@ class _Lull:
 class Watch:
     """Looks over the shoulder of a run's policy, from before it begins."""
 
-    def __init__(self, session: Session, *, steps: bool) -> None:
+    def __init__(self, session: Session, *, steps: bool, fork_ns: int = -1) -> None:
+        """``fork_ns``: since the start of the run, when others are forked from it (-1: never)."""
         self.order: list[tuple[int, int]] = []
         """Of each choice, which of how many was taken."""
         self.entities: set[int] = set()
         """Whatever could run at some time."""
+        self.choices_before = 0
+        """How many choices there have been up to ``fork_ns``."""
+        self._fork_ns = fork_ns
         self._session = session
         self._asked: list[_Asked] = []
         self._lulls: list[_Lull] = []
@@ -73,6 +77,8 @@ class Watch:
         self.entities.update([one.entity_id for one in ready])
         if len(ready) > 1:
             self.order.append((chosen, len(ready)))
+            if moment.now_ns - self._session.start_ns <= self._fork_ns:
+                self.choices_before += 1
         if not self._keeps:
             return
         what = tuple((one.entity_id, one.kind, one.node, one.entity) for one in ready)

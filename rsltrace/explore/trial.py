@@ -128,7 +128,9 @@ class TrialResult:
     """What came of a trial. Times are simulated nanoseconds, ``wall_s`` is real time.
 
     ``choices`` is how often more than one could run; ``entities`` how many
-    there were that could run.
+    there were that could run, ``choices_before`` how many of the choices there were up to the time
+    after which runs are forked. ``is_forked``: this one was, or else ``why_not_forked`` says why
+    not, if it should have been.
     ``behaviours`` are hashes of what happened (an event with its content and its node's state
     after it, and pairs of events of one node in their order), ``order`` is of each choice which of
     how many was taken, ``steps`` says more of that; they are only there if asked for. ``trace`` is
@@ -141,6 +143,9 @@ class TrialResult:
     end_ns: int = 0
     choices: int = 0
     entities: int = 0
+    choices_before: int = 0
+    is_forked: bool = False
+    why_not_forked: str = ""
     failure: Failure | None = None
     metrics: Mapping[str, float] = field(default_factory=dict)
     wall_s: float = 0.0

@@ -7,7 +7,6 @@ breaks is gone with its process, and so is what it has started.
 
 from __future__ import annotations
 
-import fcntl
 import gc
 import importlib
 import json
@@ -22,15 +21,14 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rsltrace.debug.forking import die_with_parent, end_process, other_threads
+from rsltrace.debug.forking import die_with_parent, other_threads
 from rsltrace.debug.lines import Lines
 from rsltrace.errors import RsltraceError
-from rsltrace.explore.trial import CRASH, TIMEOUT, Failure, JobSource, Trial, TrialResult
+from rsltrace.explore.copies import answer_and_end, source_of, take_ends
+from rsltrace.explore.prefix import Prefixes
+from rsltrace.explore.trial import CRASH, TIMEOUT, Failure, Trial, TrialResult
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.pin import pin
-
-_HIGH = 900
-"""Descriptors from here on are not those that nodes get first."""
 
 _PIECE_BYTES = 1 << 16
 _OUTPUT_MAX = 2000
@@ -56,11 +54,12 @@ def main(words: list[str]) -> None:
     is_warm = "--cold" in words
     gc.collect()
     gc.freeze()
+    prefixes = Prefixes()
     while True:
         task = lines.receive()
         if task is None:
             return
-        answer = _run(task, tells=not is_warm)
+        answer = _run(task, prefixes if is_warm else None)
         libraries = answer.pop("libraries", None)
         lines.send(answer)
         if libraries is not None:
@@ -76,7 +75,7 @@ def _warm_up(task: dict[str, Any], libraries: list[str]) -> None:
     That is no part of a run (``rsltrace.guard.library_imports``); user code is not imported.
     """
     with suppress(RsltraceError):
-        _source(task).job()
+        source_of(task).job()
     for name in libraries:
         with suppress(Exception):
             importlib.import_module(name)
@@ -103,12 +102,26 @@ def _libraries(before: frozenset[str]) -> list[str]:
     return found
 
 
-def _run(task: dict[str, Any], *, tells: bool) -> dict[str, Any]:
-    """Run a trial in a copy of this process; return what came of it, and (``tells``) which
-    libraries it has imported."""
+def _run(task: dict[str, Any], prefixes: Prefixes | None) -> dict[str, Any]:
+    """Run a trial in a copy of this process, or in one of those that stand at the end of a common
+    prefix; return what came of it. Without ``prefixes``, also which libraries it has imported."""
     began = time.perf_counter()
     told, tell = os.pipe()
     said, say = os.pipe()
+    why = ""
+    child: int | None = None
+    if prefixes is not None and task["wants"]["fork_ns"] >= 0:
+        child, why = prefixes.fork(task, tell, say)
+    if child is None:
+        child = _forked(task, (told, tell, said, say), tells=prefixes is None)
+    answer = _answer(task, child, (told, tell, said, say), began)
+    if why and "result" in answer:
+        answer["result"]["why_not_forked"] = why
+    return answer
+
+
+def _forked(task: dict[str, Any], ends: tuple[int, ...], *, tells: bool) -> int:
+    """Begin a trial in a copy of this process; return which one."""
     pid = os.getpid()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # the threads beside do nothing
@@ -116,11 +129,18 @@ def _run(task: dict[str, Any], *, tells: bool) -> dict[str, Any]:
     if child == 0:
         os.setsid()
         die_with_parent(pid)
-        os.dup2(say, 2)
-        high = fcntl.fcntl(tell, fcntl.F_DUPFD_CLOEXEC, _HIGH)
-        for end in (told, tell, said, say):
+        answer_at = take_ends(ends[1], ends[3])
+        for end in ends:
             os.close(end)
-        _make(task, high, tells=tells)
+        _make(task, answer_at, tells=tells)
+    return child
+
+
+def _answer(
+    task: dict[str, Any], child: int, ends: tuple[int, ...], began: float
+) -> dict[str, Any]:
+    """Wait for what a copy answers; it is gone afterwards."""
+    told, tell, said, say = ends
     os.close(tell)
     os.close(say)
     answer, output, in_time = _hear(told, said, task.get("timeout_s"))
@@ -190,46 +210,21 @@ def _timeout(timeout_s: float) -> Failure:
 
 
 def _make(task: dict[str, Any], tell: int, *, tells: bool) -> None:
-    """Run the trial here, and end this process. Never returns."""
+    """Run the trial here, from its beginning, and end this process. Never returns."""
     before = frozenset(sys.modules)
     from rsltrace.explore.outcome import Wants, run_trial
     from rsltrace.run.process import end_with_run
 
-    status = 1
-    try:
+    def run() -> dict[str, Any]:
         end_with_run()
-        answer: dict[str, Any]
-        try:
-            result = run_trial(
-                _source(task),
-                Trial(**task["trial"]),
-                Path(task["trace"]),
-                Wants(**task["wants"]),
-            )
-            answer = {"result": result.as_values()}
-            if tells:
-                answer["libraries"] = _libraries(before)
-        except RsltraceError as error:
-            answer = {"trouble": str(error)}
-        except OSError as error:
-            of = f": {error.filename}" if error.filename else ""
-            answer = {"trouble": f"{error.strerror or error}{of}"}
-        data = json.dumps(answer).encode() + b"\n"
-        while data:
-            data = data[os.write(tell, data) :]
-        status = 0
-    except BaseException:
-        import traceback
+        trial, wants = Trial(**task["trial"]), Wants(**task["wants"])
+        result = run_trial(source_of(task), trial, Path(task["trace"]), wants)
+        answer: dict[str, Any] = {"result": result.as_values()}
+        if tells:
+            answer["libraries"] = _libraries(before)
+        return answer
 
-        with suppress(BaseException):
-            os.write(2, traceback.format_exc().encode())
-    finally:
-        end_process(status)
-
-
-def _source(task: dict[str, Any]) -> JobSource:
-    job = task["job"]
-    return JobSource(**{**job, "overrides": tuple((one, two) for one, two in job["overrides"])})
+    answer_and_end(run, tell)
 
 
 def _lead_nowhere(number: int) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from rsltrace.chance.stream import Stream
 from rsltrace.errors import RunError
-from rsltrace.loop.policy import Candidate, Moment
+from rsltrace.loop.policy import Candidate, Moment, Policy
 from rsltrace.model.stamp import format_seconds
 
 _SHOWN = 5
@@ -71,6 +71,18 @@ def _cannot_depart(departure: Departure, ready: Sequence[Candidate], moment: Mom
         f"{format_seconds(moment.now_ns)} s (event {moment.events}) ready are {names}{more}. "
         "Nodes, job or input differ from those that the departures were made for"
     )
+
+
+class After:
+    """First come, first served up to ``time_ns``; what comes later is for another policy, which is
+    not asked before."""
+
+    def __init__(self, time_ns: int, policy: Policy) -> None:
+        self._time_ns = time_ns
+        self._policy = policy
+
+    def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
+        return 0 if moment.now_ns <= self._time_ns else self._policy.choose(ready, moment)
 
 
 class Pct:

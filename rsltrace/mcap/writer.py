@@ -58,6 +58,15 @@ class McapWriter:
         library: str,
         progress: Callable[[], str],
     ) -> None:
+        self._prepare(compression, progress)
+        self._sink = Sink(path, force=force)
+        try:
+            self._write(MAGIC + record_bytes(Header(profile, library)))
+        except OutputError:
+            self.abort()
+            raise
+
+    def _prepare(self, compression: str, progress: Callable[[], str]) -> None:
         if compression not in ("zstd", ""):
             raise ValueError(f"compression is 'zstd' or '', not {compression!r}")
         self._compression = compression
@@ -68,12 +77,11 @@ class McapWriter:
         self._summary = SummaryBuilder()
         self._schema_ids: dict[tuple[str, str], int] = {}
         self._failure: OutputError | None = None
-        self._sink = Sink(path, force=force)
-        try:
-            self._write(MAGIC + record_bytes(Header(profile, library)))
-        except OutputError:
-            self.abort()
-            raise
+
+    def trust_as(self, other: McapWriter) -> None:
+        """Know of the topics' large messages what another writer knows: what has been packed by it
+        comes before what is packed here."""
+        self._trusted = dict(other._trusted)
 
     @property
     def place(self) -> Path:
@@ -153,8 +161,12 @@ class McapWriter:
 
     def chunk(self, body: ChunkBody) -> tuple[int, int]:
         """Write a chunk and its message indexes. Returns the Chunk record's (offset, length)."""
-        compression, data = self._packed(body)
-        crc = crc_of(body.parts)
+        return self.packed_chunk(body, *self.packed(body))
+
+    def packed_chunk(
+        self, body: ChunkBody, compression: str, data: tuple[bytes, ...], crc: int
+    ) -> tuple[int, int]:
+        """Write a chunk whose data are there as ``packed`` returns them."""
         size = sum(map(len, data))
         head = record_bytes(
             Chunk(
@@ -183,6 +195,10 @@ class McapWriter:
             compressed_size=size,
         )
         return offset, length
+
+    def packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...], int]:
+        """Return the compression of a chunk, its data in parts, and their CRC-32 as they were."""
+        return *self._packed(body), crc_of(body.parts)
 
     def _packed(self, body: ChunkBody) -> tuple[str, tuple[bytes, ...]]:
         """Return the compression of a chunk, and its data in parts.

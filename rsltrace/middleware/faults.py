@@ -26,10 +26,14 @@ class TopicFaults:
 
     def __init__(self, faults: Sequence[MessageFault]) -> None:
         self._by_number: dict[int, list[MessageFault]] = {}
-        for fault in faults:
-            self._by_number.setdefault(fault.number, []).append(fault)
         self.reached = 0
         self._present: list[MessageFault] = []
+        self.add(faults)
+
+    def add(self, faults: Sequence[MessageFault]) -> None:
+        """Have more of them, of messages that are yet to come."""
+        for fault in faults:
+            self._by_number.setdefault(fault.number, []).append(fault)
 
     def begin(self) -> None:
         """Take note that the next message is about to be sent to everybody."""
@@ -53,3 +57,11 @@ class TopicFaults:
             late_ns=sum(fault.late_ns for fault in fitting),
             copy_ns=max(copies, default=-1),
         )
+
+
+class FaultsOfAll(dict[str, TopicFaults]):
+    """Faults of every topic that somebody asks for: there may be some later."""
+
+    def get(self, topic: str, default: object = None) -> TopicFaults:
+        """Return those of a topic, which may be none so far."""
+        return self.setdefault(topic, TopicFaults(()))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from greenlet import getcurrent
 
 from rsltrace.errors import RunError
+from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.stop import quiet_until_ns
 from rsltrace.run.session import Session
 
@@ -30,6 +31,13 @@ class _Who(Enum):
     DRIVER = "driver"
     RUN = "run"
     LISTENER = "listener"
+
+
+def time_of_step(loop: EventLoop, next_ns: int | None) -> int | None:
+    """Return when the next time step of a loop is, at whose gate ``next_ns`` is due next."""
+    if next_ns is not None and loop.min_step_ns and next_ns > loop.now_ns:
+        return loop.stepped(next_ns, quiet_until_ns(loop.stop_conditions))
+    return next_ns
 
 
 class Driver:
@@ -141,8 +149,7 @@ class Driver:
 
     def _may_advance(self, next_ns: int | None) -> bool:
         until_ns, end_ns = self._until_ns, self.session.end_ns
-        if next_ns is not None and self.loop.min_step_ns and next_ns > self.loop.now_ns:
-            next_ns = self.loop.stepped(next_ns, quiet_until_ns(self.loop.stop_conditions))
+        next_ns = time_of_step(self.loop, next_ns)
         if next_ns is not None and (until_ns is None or next_ns <= until_ns):
             return True
         if until_ns is None:

@@ -23,6 +23,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.events.census import Census
+from rsltrace.middleware.faults import FaultsOfAll
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
@@ -45,7 +46,13 @@ from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.processes import process_door
 from rsltrace.run.plans.recorded_order import keep_choices, note_choices, recorded_run
-from rsltrace.run.plans.scheduling import is_ordered, scheduling_plan, unmet_departures
+from rsltrace.run.plans.scheduling import (
+    going_on,
+    is_ordered,
+    policy_of_job,
+    scheduling_plan,
+    unmet_departures,
+)
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import end_ns_of, stop_at_size, stop_conditions, stop_with
 from rsltrace.run.process import (
@@ -124,6 +131,8 @@ class Session:
     start_ns: int
     end_ns: int | None
     """The latest simulated time the job lets the run reach, if time ends it."""
+    may_become = False
+    """Whether the run of another job may go on from it (``becomes``). Set before it is entered."""
     whole_graph = False
     """Whether entries that would start later are constructed with the others, to be seen."""
 
@@ -265,7 +274,9 @@ class Session:
         self._plan = network_plan(job, self.start_ns)
         if self._plan is not None:
             world.use_network(self._plan)
-        arm_topics(job, world)
+        if self.may_become:
+            world.domain.transport.faults = FaultsOfAll()
+        arm_topics(job.faults, world)
         world.domain.entities.census = Census() if has_rules(job) else None
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
@@ -416,6 +427,28 @@ class Session:
             failed = error if isinstance(error, RunError) else RunError(str(error))
             self.world.domain.outcome.error = failed
             self.stop = Stop(str(error).splitlines()[0], failed.exit_code)
+
+    def becomes(self, job: Job, path: Path) -> None:
+        """Go on as the run of another job, which is like this one's but for what is yet to come:
+        its policy, and faults beside those of this one's. ``why_not`` of ``rsltrace.run.branching``
+        says if that can be. What the ``writer`` has been given so far goes to ``path``.
+
+        :raises JobError: its policy cannot be made.
+        :raises OutputError: the trace cannot be written.
+        """
+        writer, old = self._recorded_by, self.job
+        assert writer is not None, "it has no trace of its own"
+        self.job = job = without_launch_files(job).job
+        if isinstance(self.loop, OrderedLoop) and job.policy != old.policy:
+            with self._guarded.engaged():
+                self.loop.policy = going_on(policy_of_job(job, self.start_ns), self.loop.policy)
+        faults = job.faults[len(old.faults) :]
+        arm_topics(faults, self.world)
+        self._faults = arm_nodes(job, self.world, self.start_ns)
+        check_output(job, path, None)
+        write_job(writer, job)
+        writer.settle(path, force=self._force)
+        self._writer = self._stack.enter_context(writer)
 
     def unused(self, *, lasted: bool = False) -> tuple[str, ...]:
         """Return what in the job had nothing to do so far; ``lasted``: the run is over."""

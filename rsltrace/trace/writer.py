@@ -19,6 +19,7 @@ import numpy.typing as npt
 from rsltrace._version import __version__
 from rsltrace.errors import OutputError
 from rsltrace.mcap.chunk_body import Waiting, messages_chunk
+from rsltrace.mcap.deferred import DeferredWriter
 from rsltrace.mcap.limits import MESSAGE_BYTES_MAX
 from rsltrace.mcap.records import MESSAGE_HEAD
 from rsltrace.mcap.writer import McapWriter
@@ -83,13 +84,14 @@ class TraceWriter:
 
     def __init__(
         self,
-        path: Path,
+        path: Path | None,
         *,
         force: bool,
         compression: str = "zstd",
         events_per_segment: int | None = None,
     ) -> None:
         """Create the file. ``compression`` is ``zstd`` or empty; None is the usual segment.
+        Without a ``path`` everything waits for ``settle``.
 
         Raises OutputError if ``path`` exists and ``force`` is false, if it is a folder, or if it
         cannot be created; a missing folder is not made, since it is more often a typing mistake.
@@ -112,13 +114,13 @@ class TraceWriter:
         self._outputs_written = 0
         self._last_chain_hash = 0
         self._ros_distro = ""
-        self._stream = McapWriter(
-            path,
-            force=force,
-            compression=compression,
-            profile=PROFILE,
-            library=f"{LIBRARY} {__version__}",
-            progress=lambda: f"{self._events_written} events",
+        about = {"profile": PROFILE, "library": f"{LIBRARY} {__version__}"}
+        self._stream = (
+            DeferredWriter(compression=compression, **about)
+            if path is None
+            else McapWriter(
+                path, force=force, compression=compression, progress=self._progress, **about
+            )
         )
         try:
             self.add_metadata(
@@ -142,6 +144,23 @@ class TraceWriter:
         traceback: TracebackType | None,
     ) -> None:
         self.abort()
+
+    def _progress(self) -> str:
+        return f"{self._events_written} events"
+
+    def settle(self, path: Path, *, force: bool) -> None:
+        """Create the file, with all that there is so far. Once, where there was no path before.
+
+        :raises OutputError: as when a trace is created.
+        """
+        deferred = self._stream
+        assert isinstance(deferred, DeferredWriter), "it has no place yet"
+        self._stream, chunks_at = deferred.pour(path, force=force, progress=self._progress)
+        rows = np.frombuffer(b"".join(self._segments), dtype=SEGMENT_DTYPE).copy()
+        for row in rows:
+            for what in ("events", "outputs") if row["outputs"] else ("events",):
+                row[f"{what}_offset"], row[f"{what}_length"] = chunks_at[row[f"{what}_offset"]]
+        self._segments = [row.tobytes() for row in rows]
 
     @property
     def place(self) -> Path:

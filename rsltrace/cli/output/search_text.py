@@ -29,6 +29,10 @@ def search_lines(search: Search, source: JobSource, folder: Path) -> Iterator[st
     if more > 0:
         yield f"and {_counted(more, 'more cause')}"
     yield from search.strategy.coverage()
+    if tally.forked:
+        yield f"{_counted(tally.forked, 'run')} forked from the plain one"
+    for why, count in tally.not_forked.most_common():
+        yield f"{_counted(count, 'run')} made from the beginning: {why}"
     if search.is_exhausted:
         yield "nothing is left to try"
     yield f"results: {folder}, as a page: {folder / 'report.html'}"

@@ -34,12 +34,16 @@ class FaultWalk:
     behaviours = False
     steps = False
 
-    def __init__(self, job: Job, seed: int = 0) -> None:
+    def __init__(self, job: Job, seed: int = 0, *, fork_ns: int = -1) -> None:
+        """``fork_ns``: the simulated time up to which nothing is disturbed."""
         self._own = [plain_part(fault) for fault in job.faults]
         self._seed = seed
-        self._topics: dict[str, int] = {}
+        self._fork_ns = fork_ns
+        self._topics: dict[str, range] = {}
+        """Of each topic the messages that may be disturbed."""
         self._nodes: dict[str, bool] = {}
-        self._events = self._longest_ns = 1
+        self._events = range(1)
+        self._longest_ns = 1
         self._kinds: Counter[str] = Counter()
         self._tried = 0
 
@@ -49,17 +53,21 @@ class FaultWalk:
             raise ExploreError("the run of the job as it is has no trace: nothing to disturb")
         with Trace.open(plain.trace) as trace:
             self._longest_ns = max(trace.end_ns - trace.start_ns, 2 * _SHORTEST_NS)
-            self._events = max(trace.ended_after or trace.event_count, 1)
-            sent: Counter[int] = Counter()
-            for rows in trace.outputs():
-                wanted = rows["entity"][rows["kind"] == OutputKind.MESSAGE]
-                numbers, counts = np.unique(wanted, return_counts=True)
-                sent.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+            first, first_output = _first_after(trace, self._fork_ns)
+            self._events = range(first, max(trace.ended_after or trace.event_count, 1))
+            before, after = _sent(trace, first_output)
+            names: dict[str, tuple[int, int]] = {}
             for entity in trace.entities.values():
                 if entity.kind is EntityKind.NODE and entity.name != f"/{PLAYER}":
                     self._nodes[entity.name] = bool(entity.type)  # others have a real process
-                elif sent[entity.id] and entity.name not in QUIET_TOPICS:
-                    self._topics[entity.name] = self._topics.get(entity.name, 0) + sent[entity.id]
+                elif before[entity.id] + after[entity.id] and entity.name not in QUIET_TOPICS:
+                    one, two = names.get(entity.name, (0, 0))
+                    names[entity.name] = one + before[entity.id], two + after[entity.id]
+        self._topics = {
+            name: range(1 + one, 1 + one + two) for name, (one, two) in names.items() if two
+        }
+        if not self._events:
+            raise ExploreError("the run of the job as it is ends before runs would be forked")
         if not self._nodes and not self._topics:
             raise ExploreError("there are neither nodes nor messages that could be disturbed")
 
@@ -81,7 +89,7 @@ class FaultWalk:
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(self._kinds.items()))
         return [
             f"faults: {self._tried} runs with up to {_MOST} each ({kinds}), among "
-            f"{sum(self._topics.values())} messages of {len(self._topics)} topics and "
+            f"{sum(map(len, self._topics.values()))} messages of {len(self._topics)} topics and "
             f"{len(self._nodes)} nodes"
         ]
 
@@ -93,15 +101,46 @@ class FaultWalk:
         if self._topics and (not self._nodes or draw.below(2)):
             topic = list(self._topics)[draw.below(len(self._topics))]
             kind = _OF_MESSAGES[draw.below(len(_OF_MESSAGES))]
-            fault = {kind: topic, "message": 1 + draw.below(self._topics[topic])}
+            messages = self._topics[topic]
+            fault = {kind: topic, "message": messages[draw.below(len(messages))]}
             return fault if kind == "drop" else {**fault, "by": self._time(draw)}
         node = list(self._nodes)[draw.below(len(self._nodes))]
         kinds = ("crash", "restart", "hang") if self._nodes[node] else ("crash", "restart")
         kind = kinds[draw.below(len(kinds))]
-        fault = {kind: node, "event": draw.below(self._events)}
+        fault = {kind: node, "event": self._events[draw.below(len(self._events))]}
         return fault if kind == "crash" else {**fault, "for": self._time(draw)}
 
     def _time(self, draw: Stream) -> str:
         """Draw how long something lasts, evenly in its logarithm, in whole milliseconds."""
         ratio = self._longest_ns / _SHORTEST_NS
         return f"{max(round(math.exp(draw.uniform() * math.log(ratio))), 1)}ms"
+
+
+def _first_after(trace: Trace, fork_ns: int) -> tuple[int, int]:
+    """Return which event is the first after a time since the start of the run, and how many outputs
+    there are before."""
+    if fork_ns < 0:
+        return 0, 0
+    events = outputs = 0
+    for rows in trace.events():
+        stamps = rows["stamp"]
+        count = int(np.searchsorted(stamps, trace.start_ns + fork_ns, side="right"))
+        events += count
+        outputs += int(rows["outputs"][:count].sum())
+        if count < len(stamps):
+            break
+    return events, outputs
+
+
+def _sent(trace: Trace, first_output: int) -> tuple[Counter[int], Counter[int]]:
+    """Return how many messages each publisher has sent among the first outputs, and after them."""
+    sent: tuple[Counter[int], Counter[int]] = Counter(), Counter()
+    seen = 0
+    for rows in trace.outputs():
+        place = min(max(first_output - seen, 0), len(rows))
+        for counter, some in zip(sent, (rows[:place], rows[place:]), strict=True):
+            wanted = some["entity"][some["kind"] == OutputKind.MESSAGE]
+            numbers, counts = np.unique(wanted, return_counts=True)
+            counter.update(dict(zip(numbers.tolist(), counts.tolist(), strict=True)))
+        seen += len(rows)
+    return sent

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from rsltrace.explore.strategies.strategy import Proposal
+from rsltrace.explore.strategies.strategy import Proposal, choices_left
 from rsltrace.explore.trial import TrialResult
 from rsltrace.trace.chain import hash64
 
@@ -25,8 +25,11 @@ class Feedback:
     behaviours = True
     steps = False
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0, *, is_forked: bool = False) -> None:
+        """``is_forked``: runs begin as the plain one, with its seed."""
         self._seed = seed
+        self._is_forked = is_forked
+        self._first = 0
         self._seen: set[int] = set()
         self._orders: list[tuple[dict[str, Any], tuple[tuple[int, int], ...]]] = []
         """What else sets a run apart (its seed, say), and of each choice which of how many."""
@@ -34,6 +37,8 @@ class Feedback:
         self._runs = self._new_runs = 0
 
     def begin(self, plain: TrialResult) -> None:
+        choices_left(plain)
+        self._first = plain.choices_before
         self._keep(plain)
 
     def propose(self, number: int) -> Proposal | None:
@@ -59,11 +64,13 @@ class Feedback:
     def _near(self, chance: random.Random) -> dict[str, Any]:
         """Return an overlay: the departures of a run that was kept up to some choice, and one more;
         now and then, and where there is no choice, another seed for what is drawn."""
-        orders = [one for one in self._orders if one[1]]
-        if not orders or chance.random() < _NEW_SEEDS:
+        orders = [one for one in self._orders if len(one[1]) > self._first]
+        if self._is_forked and not orders:
+            return {"policy": {"departures": []}}
+        if not self._is_forked and (not orders or chance.random() < _NEW_SEEDS):
             return {"seed": chance.randrange(1 << 32), "policy": {"departures": []}}
         overlay, order = orders[max(chance.randrange(len(orders)), chance.randrange(len(orders)))]
-        place = chance.randrange(len(order))
+        place = chance.randrange(self._first, len(order))
         taken, count = order[place]
         other = chance.randrange(count - 1)
         run = other + (other >= taken)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from rsltrace.errors import ExploreError
 from rsltrace.explore.strategies.faults import FaultWalk
 from rsltrace.explore.strategies.feedback import Feedback
 from rsltrace.explore.strategies.strategy import Proposal, Strategy
@@ -11,29 +12,54 @@ from rsltrace.explore.strategies.systematic import Systematic
 from rsltrace.explore.strategies.vary import VaryWalk
 from rsltrace.explore.strategies.walks import PctWalk, RandomWalk
 from rsltrace.explore.trial import TrialResult
-from rsltrace.job import Job
+from rsltrace.job import Job, locate
 
 NAMES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 
 
-def strategy_named(name: str, job: Job, *, seed: int = 0, depth: int | None = None) -> Strategy:
+def strategy_named(
+    name: str,
+    job: Job,
+    *,
+    seed: int = 0,
+    depth: int | None = None,
+    fork_after: tuple[str, int] | None = None,
+) -> Strategy:
     """Return a new strategy. ``depth`` is the depth of bugs that PCT looks for (up to 3), or how
-    many departures from the plain order the systematic search makes (any number).
+    many departures from the plain order the systematic search makes (any number). ``fork_after``:
+    its runs begin as the plain one up to this simulated time, given as a job has it, and in ns.
 
     :raises ExploreError: it cannot be applied to the job.
     """
+    after, fork_ns = fork_after or (None, -1)
+    if after is not None:
+        _check_forks(name, job)
     if name == "systematic":
         return Systematic(depth)
     if name == "faults":
-        return FaultWalk(job, seed)
+        return FaultWalk(job, seed, fork_ns=fork_ns)
     if name == "vary":
         return VaryWalk(job, seed)
     if name == "feedback":
-        return Feedback(seed)
+        return Feedback(seed, is_forked=after is not None)
     if name == "random":
-        return RandomWalk(seed)
-    pct = PctWalk(depth or 3, seed)
-    return pct if name == "pct" else Mixed([pct, Feedback(seed), RandomWalk(seed)])
+        return RandomWalk(seed, after)
+    pct = PctWalk(depth or 3, seed, after)
+    if name == "pct":
+        return pct
+    return Mixed([pct, Feedback(seed, is_forked=after is not None), RandomWalk(seed, after)])
+
+
+def _check_forks(name: str, job: Job) -> None:
+    if name == "vary":
+        raise ExploreError(
+            "--fork-after: runs with other settings differ from their beginning; leave it out"
+        )
+    if name != "faults" and job.policy is not None and job.policy.order != "fifo":
+        raise ExploreError(
+            f"--fork-after: {locate(job, ('policy',))}: up to that time the order has to be the "
+            "plain one; leave the policy out of the job, or --fork-after"
+        )
 
 
 class Mixed:

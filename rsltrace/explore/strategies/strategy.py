@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
+from rsltrace.errors import ExploreError
 from rsltrace.explore.trial import TrialResult
 
 
@@ -41,3 +42,16 @@ class Strategy(Protocol):
 
     def coverage(self) -> list[str]:
         """Say for people what was tried, and what that means."""
+
+
+def choices_left(plain: TrialResult) -> int:
+    """Return how many choices of the plain run other runs may make differently.
+
+    :raises ExploreError: there are none after the time at which runs are forked.
+    """
+    if plain.choices and plain.choices == plain.choices_before:
+        raise ExploreError(
+            "--fork-after: the job as it is has no choice of what runs next after that time; give "
+            "an earlier one"
+        )
+    return plain.choices - plain.choices_before

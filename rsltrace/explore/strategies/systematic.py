@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from rsltrace.explore.steps import EVERYTHING
-from rsltrace.explore.strategies.strategy import Proposal
+from rsltrace.explore.strategies.strategy import Proposal, choices_left
 from rsltrace.explore.trial import Step, TrialResult
 
 Touches = Mapping[str, bool]
@@ -72,6 +72,8 @@ class Systematic:
 
     def __init__(self, departures_max: int | None = None) -> None:
         self._max = departures_max
+        self._first = 0
+        """The first choice that may be another one."""
         self._count = itertools.count()
         self._waiting: list[tuple[int, int, _Node, str]] = []
         self._under_way: dict[str, _Item] = {}
@@ -87,6 +89,8 @@ class Systematic:
 
     def begin(self, plain: TrialResult) -> None:
         """Find in the plain run what is to be tried."""
+        choices_left(plain)
+        self._first = plain.choices_before
         self.runs += 1
         self.finals.add(plain.final_state)
         self._follow(plain.steps, None)
@@ -143,6 +147,8 @@ class Systematic:
             "were another order of one before"
         ]
         left = len(self._waiting) + len(self._under_way)
+        if self._first:
+            lines.append(f"not covered: other orders of the first {self._first} choices")
         if self.beyond:
             lines.append(f"not covered: {self.beyond} orders with more than {self._max} departures")
         lines.append(f"not covered: {left} orders yet to try" if left else "covered: all others")
@@ -164,6 +170,8 @@ class Systematic:
                     if step.chosen:
                         departures.append((choice, step.chosen))
                     choice += 1
+            if choice <= self._first and self._first:
+                continue  # it is the same in all runs
             if not is_beyond:
                 assert item is not None
                 is_beyond = first <= item.node.choice < choice
@@ -219,7 +227,7 @@ class Systematic:
             self._try(node, others[0])
 
     def _try(self, node: _Node, key: str) -> None:
-        if key not in node.begun and len(node.ready) > 1:
+        if key not in node.begun and len(node.ready) > 1 and node.choice >= self._first:
             node.begun.add(key)
             index = node.ready.index(key)
             count = len(node.departures) + (index > 0)

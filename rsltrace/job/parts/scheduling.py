@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, ClassVar
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
@@ -15,6 +16,7 @@ from rsltrace.job.values.names import check_node_glob
 from rsltrace.job.values.paths import check_path
 from rsltrace.job.values.problem import Problem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
+from rsltrace.job.values.times import TimeLike, parse_time
 
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
@@ -83,9 +85,10 @@ class PctSpec(Part):
 
 
 class PolicySpec(Part):
-    """Which of the callbacks that are ready runs next. Exactly one of the keys; a word alone is an
-    ``order``."""
+    """Which of the callbacks that are ready runs next. Exactly one of the keys but ``after`` and
+    ``seed``; a word alone is an ``order``."""
 
+    TIMES: ClassVar[dict[str, str]] = {"after": "after_ns"}
     ONE_OF: ClassVar[tuple[str, ...]] = (
         "order",
         "priority",
@@ -130,12 +133,45 @@ class PolicySpec(Part):
         description="A class of your own, called without arguments: see docs/policies.md.",
         examples=["my_robot.policy:LongestQueue"],
     )
+    after_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
+        default=None,
+        alias="after",
+        description="Up to this time, since the start of the run, it is first come, first served: "
+        "with `order`, `priority`, `pct` and `function`.",
+        examples=["30s"],
+    )
+    seed: Annotated[int | None, check(whole(0), optional=True)] = Field(
+        default=None,
+        description="What `permutation` and `pct` draw from, instead of the job's `seed`: another "
+        "order, with the same delays, losses and the like.",
+        examples=[7],
+    )
+
+    if TYPE_CHECKING:
+
+        def __init__(
+            self,
+            *,
+            order: str | None = None,
+            priority: Sequence[PriorityRuleSpec | dict[str, Any]] | None = None,
+            departures: Sequence[DepartureSpec | dict[str, Any]] | None = None,
+            pct: PctSpec | dict[str, Any] | int | None = None,
+            recorded: str | None = None,
+            function: Any = None,
+            after_ns: TimeLike | None = None,
+            seed: int | None = None,
+        ) -> None: ...
 
     @model_validator(mode="after")
     def _one(self) -> PolicySpec:
         given = [key for key in self.ONE_OF if getattr(self, key) is not None]
         if len(given) != 1:
             raise Problem(f"give one of {', '.join(self.ONE_OF)}")
+        if self.after_ns is not None and given[0] in ("departures", "recorded"):
+            raise Problem(f"{given[0]} say themselves from when on", ("after",), at_key=True)
+        draws = self.pct is not None or self.order == "permutation"
+        if self.seed is not None and not draws:
+            raise Problem("only permutation and pct draw anything", ("seed",), at_key=True)
         choices: set[int] = set()
         for index, departure in enumerate(self.departures or ()):
             if departure.choice in choices:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from rsltrace.job import Job, locate
@@ -14,14 +14,15 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.world import World
 
 
-def arm_topics(job: Job, world: World) -> None:
-    """Let single messages go wrong. Before the first node is made."""
+def arm_topics(faults: Sequence[FaultSpec], world: World) -> None:
+    """Let single messages go wrong. Before the first node is made, or later where
+    ``FaultsOfAll`` have been there from the beginning."""
     by_topic: dict[str, list[MessageFault]] = {}
-    for spec in job.faults:
+    for spec in faults:
         if not spec.of_node:
             by_topic.setdefault(spec.name, []).append(_message_fault(spec))
-    for topic, faults in by_topic.items():
-        world.domain.transport.faults[topic] = TopicFaults(faults)
+    for topic, found in by_topic.items():
+        world.domain.transport.faults.setdefault(topic, TopicFaults(())).add(found)
 
 
 def arm_nodes(job: Job, world: World, start_ns: int) -> NodeFaults | None:

@@ -95,6 +95,9 @@ def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None]
 
 def _same_policy(spec: dict[str, Any], seed: int) -> Policy | None:
     """Return the policy of a resolved job, None if it cannot be made."""
+    if spec.get("after_ns") is not None:
+        return None  # where a run that was cut off began is not known
+    seed = seed if spec.get("seed") is None else int(spec["seed"])
     if spec.get("priority") is not None:
         return Priority([PriorityRule(**rule) for rule in spec["priority"]])
     if spec.get("departures") is not None:

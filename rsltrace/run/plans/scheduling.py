@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.chance.stream import Stream
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
+from rsltrace.job.parts.scheduling import PolicySpec
 from rsltrace.loop.policy import (
     Fifo,
     Permutation,
@@ -16,7 +17,7 @@ from rsltrace.loop.policy import (
     PriorityRule,
     RateMonotonic,
 )
-from rsltrace.loop.search_policies import Departure, Departures, Pct
+from rsltrace.loop.search_policies import After, Departure, Departures, Pct
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.run.plans.target import load_target
 
@@ -47,7 +48,7 @@ def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> Schedulin
         if job.execution.default is not None:
             rules.append(ExecutionRule("*", None, distribution_of(job, job.execution.default)))
     return SchedulingPlan(
-        policy=policy or _policy(job),
+        policy=policy or policy_of_job(job, start_ns),
         executors=tuple(ExecutorRule(spec.nodes, spec.workers) for spec in job.executors or ()),
         occupies=job.executors is not None or job.execution is not None,
         execution=tuple(rules),
@@ -56,12 +57,29 @@ def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> Schedulin
     )
 
 
-def _policy(job: Job) -> Policy:
+def policy_of_job(job: Job, start_ns: int) -> Policy:
+    """Return the policy of a job, at its beginning.
+
+    :raises JobError: if the policy's class cannot be made.
+    """
     spec = job.policy
     if spec is None:
         return Fifo()
+    policy = _policy(job, spec)
+    return policy if spec.after_ns is None else After(start_ns + spec.after_ns, policy)
+
+
+def going_on(policy: Policy, before: Policy) -> Policy:
+    """Return a policy that goes on in the middle of a run, in the place of another one."""
+    if isinstance(policy, Departures) and isinstance(before, Departures):
+        policy.choices = before.choices
+    return policy
+
+
+def _policy(job: Job, spec: PolicySpec) -> Policy:
+    seed = job.seed if spec.seed is None else spec.seed
     if spec.order is not None:
-        policy = of_order(spec.order, job.seed)
+        policy = of_order(spec.order, seed)
         assert policy is not None, "the job has been checked"
         return policy
     if spec.priority is not None:
@@ -70,7 +88,7 @@ def _policy(job: Job) -> Policy:
     if spec.departures is not None:
         return Departures(Departure(one.choice, one.run, one.of) for one in spec.departures)
     if spec.pct is not None:
-        return Pct(Stream(job.seed, "pct"), spec.pct.depth, spec.pct.choices)
+        return Pct(Stream(seed, "pct"), spec.pct.depth, spec.pct.choices)
     return own_policy(spec.function, locate(job, ("policy", "function")))
 
 

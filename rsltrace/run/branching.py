@@ -1,0 +1,81 @@
+"""Standing still in the middle of a run, from where the runs of other jobs go on.
+
+These differ in nothing but what comes later (``Session.becomes``), so each is what it would have
+been from the beginning. See ``rsltrace.explore.prefix`` for who makes the copies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from greenlet import getcurrent
+
+from rsltrace.job import Job
+from rsltrace.job.parts.fault import FaultSpec
+from rsltrace.loop.search_policies import Departures
+from rsltrace.model.stamp import format_seconds
+from rsltrace.run.driver import time_of_step
+from rsltrace.run.session import Session
+
+
+def run_up_to(session: Session, time_ns: int) -> bool:
+    """Run up to and including a simulated time; return whether anything is to come after it."""
+    loop, runners = session.loop, session.world.stacks.runners
+
+    def gate(next_ns: int | None) -> bool:
+        coming_ns = time_of_step(loop, next_ns)
+        if coming_ns is not None and coming_ns <= time_ns:
+            return False
+        loop.gate = None
+        runners.waiting.append(getcurrent())
+        assert runners.main is not None
+        runners.main.switch()
+        return False
+
+    loop.gate = gate
+    session.begin()
+    if not session.ended:
+        session.go_on()
+    return not session.ended
+
+
+def why_never(job: Job) -> str:
+    """Return why no other run can go on from one of a job, "" if others can."""
+    if job.stop.size is not None:
+        return "how large the trace is ends the run (stop.size)"
+    if any(fault.of_node for fault in job.faults):
+        return "the job itself has faults of nodes"
+    return ""
+
+
+def why_not(session: Session, job: Job) -> str:
+    """Return why the run of a job cannot go on from where a session stands, "" if it can."""
+    first = next(_obstacles(session, job), "")
+    at = format_seconds(session.loop.now_ns - session.start_ns)
+    return first and f"{first} up to {at} s"
+
+
+def _obstacles(session: Session, job: Job) -> Iterator[str]:
+    """Yield what is different already."""
+    old, loop = session.job, session.loop
+    before = getattr(loop, "policy", None)
+    policy = job.policy
+    if policy != old.policy and policy is not None:
+        if policy.departures is not None:
+            done = before.choices if isinstance(before, Departures) else 0
+            if any(one.choice < done for one in policy.departures):
+                yield "its order departs from the plain one"
+        elif policy.after_ns is None or session.start_ns + policy.after_ns < loop.now_ns:
+            yield "its policy chooses"
+    own = len(old.faults)
+    if job.faults[:own] != old.faults:
+        yield "it is without faults of the job"
+    if not all(_is_to_come(fault, session) for fault in job.faults[own:]):
+        yield "it has a fault"
+
+
+def _is_to_come(fault: FaultSpec, session: Session) -> bool:
+    if fault.of_node:  # of those that come at a time, the order among what is due then is another
+        return fault.event is not None and fault.event >= session.loop.events
+    reached = session.world.domain.transport.faults.get(fault.name)
+    return fault.message is not None and (reached is None or fault.message > reached.reached)
