@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from rsltrace.checks.conditions import compared, condition, opposite, plain, topic_of
 from rsltrace.checks.functions import violations
+from rsltrace.checks.latency import LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
 from rsltrace.checks.trace_events import TraceEvent, events_of
 from rsltrace.debug.conditions.condition import Armed, Condition
@@ -50,6 +51,8 @@ def title(spec: CheckSpec) -> str:
         return spec.name
     if spec.function is not None:
         return f"function {target_text(spec.function)}"
+    if spec.latency is not None:
+        return latency_title(spec.latency)
     words = f"{spec.kind} {getattr(spec, spec.kind)}"
     for key, bound in (("at least", spec.at_least), ("at most", spec.at_most)):
         words += f" {key} {bound:g} Hz" if bound is not None else ""
@@ -67,7 +70,7 @@ def wrong_checks(job: Job, names: Names) -> Iterator[str]:
     """Yield, with its line, what is wrong with each check that speaks of what is not there."""
     for index, spec in enumerate(job.checks):
         try:
-            _rate_topic(job, index, spec, names)
+            _wrong_names(job, index, spec, names)
             _conditions(job, index, spec, names)
         except JobError as error:
             yield str(error)
@@ -110,7 +113,7 @@ def evaluating(
     properties = [one for one in held if one is not None]
     if properties:
         topics: set[str] | None = set()
-        for spec in job.checks:
+        for spec in (one for one in job.checks if one.latency is None):
             topics = _with_topics(topics, spec)
         last = trace.ended_after
         for event in events_of(trace, topics):
@@ -121,10 +124,19 @@ def evaluating(
             yield []
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
-    yield [
-        _result(spec, one) if one is not None else _of_function(trace, spec, load)
-        for spec, one in zip(job.checks, held, strict=True)
-    ]
+    results = []
+    for spec, held_one in zip(job.checks, held, strict=True):
+        if held_one is not None:
+            results.append(_result(spec, held_one))
+        elif spec.latency is None:
+            results.append(_of_function(trace, spec, load))
+        else:
+            for found in check_latency(trace, spec.latency):
+                if found is None:
+                    yield []
+                else:
+                    results.append(_of_latency(spec, found))
+    yield results
 
 
 def _see(one: Property, event: TraceEvent) -> None:
@@ -150,12 +162,13 @@ def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:
 
 
 def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | None:
-    """Return what a check of a job says, ready to be told of events; None for a function."""
+    """Return what a check of a job says, ready to be told of events; None for a function, or a
+    latency."""
     spec = job.checks[index]
-    if spec.function is not None:
+    _wrong_names(job, index, spec, names)
+    if spec.function is not None or spec.latency is not None:
         return None
     if spec.rate is not None:
-        _rate_topic(job, index, spec, names)
         return Rate(
             spec.rate, spec.at_least, spec.at_most, spec.over_ns or NS_PER_S, trace.start_ns
         )
@@ -180,10 +193,21 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
     )
 
 
-def _rate_topic(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
-    """Raise JobError if a rate is that of a topic which is not there."""
-    if spec.rate is not None and (wrong := names.unknown(spec.rate, names.topics, "topic")):
-        raise JobError(wrong, where=locate(job, ("checks", index, "rate")))
+def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
+    """Raise JobError if a rate, or a latency, is of what is not there."""
+    named: list[tuple[tuple[str | int, ...], str]] = []
+    if spec.rate is not None:
+        named.append((("rate",), spec.rate))
+    if (of := spec.latency) is not None:
+        ends = (("from", of.start), ("to", of.end))
+        named += [(("latency", key), topic) for key, topic in ends if topic is not None]
+        named += [(("latency", "chain", at), topic) for at, topic in enumerate(of.chain)]
+        for at, node in enumerate(of.via):
+            if wrong := names.unknown(node, names.nodes, "node"):
+                raise JobError(wrong, where=locate(job, ("checks", index, "latency", "via", at)))
+    for keys, topic in named:
+        if wrong := names.unknown(topic, names.topics, "topic"):
+            raise JobError(wrong, where=locate(job, ("checks", index, *keys)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +248,11 @@ def _located(job: Job, index: int, key: str) -> Iterator[None]:
 def _result(spec: CheckSpec, one: Property) -> CheckResult:
     verdict = VIOLATED if one.count else UNDECIDED if one.undecided else PASSED
     return CheckResult(title(spec), verdict, one.count, tuple(one.found), one.note)
+
+
+def _of_latency(spec: CheckSpec, found: LatencyResult) -> CheckResult:
+    verdict = VIOLATED if found.count else UNDECIDED if found.undecided else PASSED
+    return CheckResult(title(spec), verdict, found.count, found.violations, found.note)
 
 
 def _of_function(trace: Trace, spec: CheckSpec, load: LoadFunction | None) -> CheckResult:

@@ -16,7 +16,7 @@ from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds
 
 _SHOWN_MAX = 3
-_KEPT_MAX = 1000
+KEPT_MAX = 1000
 """So many violations of one check are kept; of the rest only the number."""
 
 
@@ -50,7 +50,7 @@ class Property(ABC):
 
     def _violated(self, event: int | None, stamp_ns: int, text: str) -> None:
         self.count += 1
-        if len(self.found) < _KEPT_MAX:
+        if len(self.found) < KEPT_MAX:
             self.found.append(Violation(event, stamp_ns, text))
 
 
@@ -90,7 +90,7 @@ class Never(Property):
 
     def _values(self, event: TraceEvent) -> str:
         """Return what was compared, of the messages that the event has sent: `` (x = 0.31)``."""
-        if self.value is None or self.count >= _KEPT_MAX:
+        if self.value is None or self.count >= KEPT_MAX:
             return ""
         values = []
         for sent in event.sent():

@@ -15,17 +15,16 @@ _Graph = dict[str, list[Hop]]
 
 def where_broken(flow: Flow, wanted: Wanted) -> str:
     """Return why nothing came through the chain that is wanted, in a sentence."""
-    name = flow.trace.name
     first, last = wanted.first, wanted.last
     graph = _graph(flow)
     if wanted.topics:
-        return f"{name}: {_of_topics(flow, wanted, graph)}"
+        return _of_topics(flow, wanted, graph)
     if first is None or last is None:
         if first is not None:
-            return f"{name}: no message was caused by one of {first}{_stored(flow, graph, first)}"
-        return f"{name}: no message of {last} was caused by another one"
+            return f"no message was caused by one of {first}{_stored(flow, graph, first)}"
+        return f"no message of {last} was caused by another one"
     way = _way(graph, first, last)
-    said = f"{name}: no message of {last} came of one of {first}"
+    said = f"no message of {last} came of one of {first}"
     if not way:
         return f"{said}: no way leads there, from subscription to publisher"
     reached = {hop for path in flow.paths.hops for hop in path}

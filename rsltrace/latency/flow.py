@@ -262,14 +262,3 @@ class Flow:
         if received:
             own = "" if taken == NONE else self._topic(self.taken["message"][taken])
             yield from (one for topic, one in received.items() if topic != own)
-
-
-def follow(trace: Trace, wanted: Wanted) -> Flow:
-    """Read all events of a trace, a segment at a time.
-
-    :raises TraceError: the trace is damaged.
-    """
-    flow = Flow(trace, wanted)
-    for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
-        flow.read(events, outputs)
-    return flow

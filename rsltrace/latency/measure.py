@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
 from rsltrace.errors import TraceError, nearest
 from rsltrace.latency.broken import samplers, where_broken
 from rsltrace.latency.figures import Durations, Figures, figures
-from rsltrace.latency.flow import Flow, follow
+from rsltrace.latency.flow import Flow
 from rsltrace.latency.instances import (
     Instances,
     Parts,
@@ -27,6 +28,12 @@ from rsltrace.words.matching import is_named
 
 MEASURES = ("latency", "age", "last_age", "reaction", "worst_reaction")
 """What is measured of a chain: see ``ChainLatency``."""
+
+
+MOMENT_DTYPE = np.dtype(
+    [(name, "<i8") for name in ("duration", "input_event", "input_ns", "output_event", "output_ns")]
+)
+"""Durations as in ``Moment``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,20 +100,31 @@ class ChainLatency:
 
     def worst(self, measure: str) -> Moment | None:
         """Return the first of the longest durations of one of ``MEASURES``."""
-        durations = self.durations(measure)
-        return self.moment(measure, int(durations.argmax())) if len(durations) else None
+        moments = self.moments(measure)
+        if not len(moments):
+            return None
+        return Moment(*map(int, moments[moments["duration"].argmax()]))
 
-    def moment(self, measure: str, place: int) -> Moment:
-        """Return one of the ``durations`` of a measure with its events."""
+    def moments(self, measure: str) -> npt.NDArray[np.void]:
+        """Return the ``durations`` of a measure with their events: MOMENT_DTYPE."""
         durations, sources, outputs = self._measured(measure)
-        found, source, output = self.found, int(sources[place]), int(outputs[place])
-        return Moment(
-            int(durations[place]),
-            self._flow.event_of(int(found.input_rows[source])),
-            int(found.input_ns[source]),
-            self._flow.event_of(int(found.came[output, -1])),
-            int(found.output_ns[output]),
-        )
+        found, flow = self.found, self._flow
+        moments = np.zeros(len(durations), dtype=MOMENT_DTYPE)
+        moments["duration"] = durations
+        moments["input_event"] = flow.events_of(found.input_rows)[sources]
+        moments["input_ns"] = found.input_ns[sources]
+        moments["output_event"] = flow.events_of(found.came[:, -1])[outputs]
+        moments["output_ns"] = found.output_ns[outputs]
+        return moments
+
+    def unanswered(self) -> npt.NDArray[np.void]:
+        """Return the inputs that no output came of, or of a later one: MOMENT_DTYPE, without a
+        duration and an output."""
+        answered, found = len(self.found.answers()), self.found
+        moments = np.zeros(len(found.input_ns) - answered, dtype=MOMENT_DTYPE)
+        moments["input_event"] = self._flow.events_of(found.input_rows[answered:])
+        moments["input_ns"] = found.input_ns[answered:]
+        return moments
 
     def events(self) -> Durations:
         """Return the indexes of the events that each output came through, shape (outputs, hops)."""
@@ -133,10 +151,11 @@ class ChainLatency:
 @dataclass(frozen=True, slots=True)
 class Latencies:
     """The chains of a trace, those with the most outputs first. ``notes`` say what to know of
-    them: where a node takes messages and publishes without one as its cause."""
+    them; ``missing`` says why there is no chain of those that were asked for."""
 
     chains: tuple[ChainLatency, ...]
     notes: tuple[str, ...] = ()
+    missing: str = ""
 
 
 def measure_latencies(
@@ -155,11 +174,38 @@ def measure_latencies(
     :raises TraceError: the trace is damaged, there is no such topic or node, or nothing came
         through such a chain.
     """
-    wanted = _wanted(trace, start, end, topics, via)
-    flow = follow(trace, wanted)
+    *_, found = measuring(trace, start=start, end=end, topics=topics, via=via)
+    assert found is not None
+    if found.missing:
+        raise TraceError(f"{trace.name}: {found.missing}")
+    return found
+
+
+def measuring(
+    trace: Trace,
+    *,
+    start: str | None = None,
+    end: str | None = None,
+    topics: Sequence[str] = (),
+    via: Collection[str] = (),
+) -> Iterator[Latencies | None]:
+    """Read a trace: yield None after each segment, and in the end its chains.
+
+    :raises TraceError: the trace is damaged.
+    """
+    chosen = nodes_called(trace, via)
+    missing = _not_there(trace, start, end, topics, via)
+    if missing:
+        yield Latencies((), missing=missing)
+        return
+    wanted = Wanted(start, end, tuple(topics), chosen)
+    flow = Flow(trace, wanted)
+    for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
+        flow.read(events, outputs)
+        yield None
     chains = [ChainLatency(flow, path) for path in flow.paths.ends()]
     if not chains and (wanted.first is not None or wanted.last is not None):
-        raise TraceError(where_broken(flow, wanted))
+        missing = where_broken(flow, wanted)
     chains.sort(key=lambda one: (-one.outputs, one.name, one.hops))
     notes = [
         f"what {node} publishes is taken to come of the last message that it received of each topic"
@@ -167,31 +213,34 @@ def measure_latencies(
     ]
     if wanted.first is None and wanted.last is None:
         notes += [said for node, said in samplers(flow) if node not in wanted.via]
-    return Latencies(tuple(chains), tuple(notes))
+    yield Latencies(tuple(chains), tuple(notes), missing)
 
 
-def _wanted(
+def nodes_called(trace: Trace, names: Collection[str]) -> tuple[str, ...]:
+    """Return the nodes of a trace that are meant by names and globs."""
+    return tuple(node for node in _nodes(trace) if any(is_named(one, node) for one in names))
+
+
+def _nodes(trace: Trace) -> list[str]:
+    of_nodes = (one.name for one in trace.entities.values() if one.kind is EntityKind.NODE)
+    return list(dict.fromkeys(of_nodes))
+
+
+def _not_there(
     trace: Trace, start: str | None, end: str | None, topics: Sequence[str], via: Collection[str]
-) -> Wanted:
-    sent, nodes = set(), []
-    for entity in trace.entities.values():
-        if entity.kind is EntityKind.PUBLISHER:
-            sent.add(entity.name)
-        elif entity.kind is EntityKind.NODE:
-            nodes.append(entity.name)
-    known = sorted(sent)
-    for topic in dict.fromkeys(one for one in (start, end, *topics) if one is not None):
-        if topic not in sent:
-            raise TraceError(f"{trace.name}: nobody publishes {topic}" + _near(topic, known))
+) -> str:
+    """Return what there is not, of what is asked for."""
+    entities = trace.entities.values()
+    sent = sorted({one.name for one in entities if one.kind is EntityKind.PUBLISHER})
+    for topic in (start, end, *topics):
+        if topic is not None and topic not in sent:
+            return f"nobody publishes {topic}" + _near(topic, sent)
     if start is not None and start == end:
-        raise TraceError(f"{start} is both ends of the chain; name a loop by its topics (--chain)")
-    chosen: list[str] = []
+        return f"{start} is both ends of the chain; name a loop by its topics (--chain)"
     for one in via:
-        found = [node for node in nodes if is_named(one, node)]
-        if not found:
-            raise TraceError(f"{trace.name}: no node is called {one}" + _near(one, nodes))
-        chosen += found
-    return Wanted(start, end, tuple(topics), tuple(dict.fromkeys(chosen)))
+        if not nodes_called(trace, [one]):
+            return f"no node is called {one}" + _near(one, _nodes(trace))
+    return ""
 
 
 def _near(name: str, names: Sequence[str]) -> str:

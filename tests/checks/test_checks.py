@@ -13,7 +13,15 @@ from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace import CheckResult, Job, NodeSpec, Trace, evaluate_checks, load_job
+from rsltrace import (
+    CheckResult,
+    Job,
+    NodeSpec,
+    Trace,
+    evaluate_checks,
+    load_job,
+    measure_latencies,
+)
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
 from rsltrace.cli.main import cli
 from rsltrace.debug.conditions.condition import Armed
@@ -61,6 +69,61 @@ def test_what_has_to_follow_in_time() -> None:
     assert late.violations[0].event is not None
     assert "within 90 ms of event" in late.violations[0].text
     assert (rare.verdict, rare.violations[0].event) == ("violated", None)
+
+
+ROVER = SAMPLE.parent / "delayed_input" / "b.mcap"
+POSE = {"from": "/odom", "to": "/pose", "via": ["/localizer"]}
+
+
+@pytest.mark.parametrize("measure", ["latency", "age", "last_age", "reaction", "worst_reaction"])
+def test_latencies(measure: str) -> None:
+    below_ms, percent = [1, 9, 19, 39, 49, 1000], [None, 50, 99]
+    with Trace.open(ROVER) as trace:
+        given = [
+            {"latency": {**POSE, "measure": measure, "below": f"{ms}ms", "quantile": of}}
+            for ms in below_ms
+            for of in percent
+        ]
+        found = evaluate_checks(trace, Job(nodes=[NodeSpec(node="m:N")], checks=given))
+        (chain,) = measure_latencies(trace, start="/odom", end="/pose", via=["/localizer"]).chains
+        measured = sorted(chain.durations(measure).tolist())
+        sent = set(chain.events()[:, -1].tolist())
+        for one, check in zip(found, given, strict=True):
+            limit, of = (
+                int(check["latency"]["below"][:-2]) * S // 1000,
+                check["latency"]["quantile"],
+            )
+            over = [ns for ns in measured if ns >= limit]
+            at_most = measured[-1 if of is None else math.ceil(of / 100 * len(measured)) - 1]
+            assert (one.verdict == "violated") == (at_most >= limit)
+            if one.verdict == "violated":
+                assert one.count == len(over)
+                assert {v.event for v in one.violations} <= sent
+                stamps = {v.stamp_ns for v in one.violations}
+                assert stamps <= set(chain.found.output_ns.tolist())
+    assert {one.verdict for one in found} == {"passed", "violated"}
+
+
+def test_latencies_of_what_is_not_there() -> None:
+    never, gone = checked(
+        {"latency": {"from": "/cmd_vel", "to": "/scan", "below": 1}},
+        {"latency": {"chain": ["/scan", "/cmd_vel"], "below": 1}},
+    )
+    assert (never.verdict, never.violations[0].event) == ("violated", None)
+    assert "no way leads there" in never.violations[0].text
+    assert "/push may belong in between" in gone.violations[0].text
+    with pytest.raises(JobError, match="no topic is called '/scn'; did you mean '/scan'"):
+        checked({"latency": {"from": "/scn", "to": "/push", "below": 1}})
+    with pytest.raises(JobError, match="no node is called '/diver'; did you mean '/driver'"):
+        checked({"latency": {"from": "/scan", "to": "/push", "below": 1, "via": ["/diver"]}})
+    for wrong, said in (
+        ({"from": "/scan", "below": 1}, "which chain"),
+        ({"chain": ["/scan"], "below": 1}, "two topics"),
+        ({"chain": ["/scan", "/push"], "to": "/push", "below": 1}, "either chain"),
+        ({"from": "/scan", "to": "/push"}, "'below' is missing"),
+    ):
+        with pytest.raises(JobError, match=said):
+            checked({"latency": wrong})
 
 
 def test_rates() -> None:

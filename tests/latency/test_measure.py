@@ -14,7 +14,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rsltrace.checks.latency import check_latency
 from rsltrace.errors import TraceError
+from rsltrace.job.parts.latency import LatencySpec
 from rsltrace.latency.figures import figures
 from rsltrace.latency.instances import Parts
 from rsltrace.latency.measure import MEASURES, ChainLatency, measure_latencies
@@ -55,6 +57,9 @@ class MadeRun:
     rows: list[tuple[Any, ...]] = field(default_factory=list)
     sent: list[tuple[Any, ...]] = field(default_factory=list)
     cuts: list[int] = field(default_factory=list)
+    complete: bool = True
+    end_ns: int = 0
+    ended_after: int | None = None
 
     def entity(self, number: int) -> Entity:
         return self.entities[number]
@@ -244,6 +249,38 @@ def test_a_chain_through_a_node_that_samples(seed: int) -> None:
     for chain in found.chains:
         outputs = [hops for hops in came if tuple(o.hop for o in hops) == chain.hops]
         assert_measured(chain, outputs, [one for one in messages if one.hop == chain.hops[0]])
+
+
+def test_an_input_without_an_answer_is_too_late_once_its_time_is_up() -> None:
+    run: Any = MadeRun(end_ns=250)
+    one, other = (run.add(EntityKind.NODE, name) for name in ("/one", "/other"))
+    sends, receives, answers = (
+        run.add(kind, topic, node)
+        for kind, topic, node in (
+            (EntityKind.PUBLISHER, "/a", one),
+            (EntityKind.SUBSCRIPTION, "/a", other),
+            (EntityKind.PUBLISHER, "/b", other),
+        )
+    )
+    for index, (now_ns, cause) in enumerate(((0, None), (10, 0), (100, None), (200, None))):
+        kind = EventKind.TIMER if cause is None else EventKind.SUBSCRIPTION
+        entity = sends if cause is None else receives
+        run.rows.append((index, now_ns, entity, kind, 0, NO_EVENT if cause is None else cause, 0))
+        publisher = sends if cause is None else answers
+        run.sent.append((index, OutputKind.MESSAGE, publisher, 7))
+    of = {"from": "/a", "to": "/b", "measure": "reaction"}
+    for below_ns, late in ((5, [1, 2, 3]), (100, [2]), (200, [])):
+        *_, found = check_latency(run, LatencySpec(**of, below_ns=below_ns))
+        assert found is not None
+        assert [one.event for one in found.violations] == late
+    *_, found = check_latency(run, LatencySpec(**of, below_ns=100, quantile=50))
+    assert found is not None
+    assert found.count == 0, "one of two is answered in time"
+    run.ended_after = 1
+    *_, found = check_latency(run, LatencySpec(**of, below_ns=5))
+    assert found is not None
+    assert found.count == 0
+    assert found.undecided, "the run had ended"
 
 
 @given(st.lists(st.integers(0, 50), min_size=1))

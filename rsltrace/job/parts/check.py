@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
+from rsltrace.job.parts.latency import LatencySpec
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import attach, check, number, positive_time, text
+from rsltrace.job.values.checks import attach, check, given, number, positive_time, text
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.problem import Problem, describe
 from rsltrace.job.values.target import Target, check_callable_target
@@ -45,10 +46,17 @@ Condition = Annotated[str | None, check(text(), optional=True)]
 
 class CheckSpec(Part):
     """One thing that has to be true of a run. Exactly one of ``always``, ``never``,
-    ``eventually``, ``rate`` and ``function``."""
+    ``eventually``, ``rate``, ``latency`` and ``function``."""
 
     TIMES: ClassVar[dict[str, str]] = {"within": "within_ns", "over": "over_ns"}
-    KINDS: ClassVar[tuple[str, ...]] = ("always", "never", "eventually", "rate", "function")
+    KINDS: ClassVar[tuple[str, ...]] = (
+        "always",
+        "never",
+        "eventually",
+        "rate",
+        "latency",
+        "function",
+    )
 
     name: Annotated[str | None, check(text(), optional=True)] = Field(
         default=None,
@@ -78,6 +86,11 @@ class CheckSpec(Part):
         description="Topic whose messages come `at_least` or `at_most` so often, counted `over` a "
         "time after each message.",
         examples=["/scan"],
+    )
+    latency: Annotated[LatencySpec | None, given] = Field(
+        default=None,
+        description="How long data may take through a chain of topics: see `docs/latency.md`.",
+        examples=[{"from": "/scan", "to": "/cmd_vel", "below": "50ms", "quantile": 99}],
     )
     function: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
@@ -120,6 +133,7 @@ class CheckSpec(Part):
             never: str | None = None,
             eventually: str | None = None,
             rate: str | None = None,
+            latency: LatencySpec | dict[str, Any] | None = None,
             function: Target | None = None,
             after: str | None = None,
             within: TimeLike | None = None,

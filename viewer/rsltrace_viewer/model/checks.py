@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 from rsltrace.errors import RsltraceError
@@ -12,7 +13,7 @@ from rsltrace_viewer.model.run import Run
 if TYPE_CHECKING:
     from rsltrace.checks.evaluate import CheckResult
 
-_STEP = 256
+_STEP_S = 0.01
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,11 +35,13 @@ def read_checks(run: Run) -> Iterator[Checks]:
     from rsltrace.checks.evaluate import PASSED, VIOLATED, evaluating, job_of_checks
 
     try:
-        for number, results in enumerate(evaluating(run.trace, job_of_checks(run.trace))):
+        last = perf_counter()
+        for results in evaluating(run.trace, job_of_checks(run.trace)):
             if results:
                 violated = tuple(one for one in results if one.verdict == VIOLATED)
                 yield Checks(violated, sum(one.verdict == PASSED for one in results))
-            elif number % _STEP == 0:
+            elif perf_counter() - last > _STEP_S:
                 yield Checks()
+                last = perf_counter()
     except RsltraceError as error:
         yield Checks(error=str(error).splitlines()[0])
