@@ -15,6 +15,8 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib import import_module
+from types import ModuleType
 
 _MARK = "RSLTRACE_PINNED"
 """Environment variable through which the second start learns what was there before the first."""
@@ -34,6 +36,8 @@ PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 _LIBRARIES = "LD_LIBRARY_PATH"
 _BY_WHEELS = "_ROS_WHEELS_BOOTSTRAP_COMPLETE"
 """Set by ROS's wheels once they have started Python again with their folders."""
+
+_DUPLICATES = "KMP_DUPLICATE_LIB_OK"
 
 _ADDR_NO_RANDOMIZE = 0x0040000
 _ASK = 0xFFFFFFFF
@@ -120,6 +124,16 @@ def _personality(value: int) -> int:
         return -1
 
 
+def thread_pools() -> ModuleType:
+    """Return threadpoolctl. What it sets for OpenMP is not for the processes that a run starts:
+    those of the first run would have one variable more than those of the next."""
+    before = os.environ.get(_DUPLICATES)
+    found = import_module("threadpoolctl")
+    if before is None:
+        os.environ.pop(_DUPLICATES, None)
+    return found
+
+
 @contextmanager
 def pinned_place() -> Iterator[None]:
     """Pin what can be pinned from within: time zone, locale and numerical threads."""
@@ -127,9 +141,7 @@ def pinned_place() -> Iterator[None]:
     if before == PLACE and all(os.environ.get(name) == "1" for name in THREADS):
         yield
         return
-    from threadpoolctl import threadpool_limits
-
-    with threadpool_limits(limits=1):
+    with thread_pools().threadpool_limits(limits=1):
         os.environ.update(PLACE)
         time.tzset()
         try:

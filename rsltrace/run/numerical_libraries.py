@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from types import CodeType, FunctionType, ModuleType
 
 from rsltrace.guard.callers import is_own, is_user_file
+from rsltrace.guard.pin import thread_pools
 from rsltrace.job import Job
 from rsltrace.run.process import user_modules
 
@@ -48,11 +49,10 @@ class LateLibraries:
 
 
 def _kernels() -> str:
-    from threadpoolctl import threadpool_info
-
     keys = ("internal_api", "version", "architecture")
     found = {
-        " ".join(str(pool[key]) for key in keys if pool.get(key)) for pool in threadpool_info()
+        " ".join(str(pool[key]) for key in keys if pool.get(key))
+        for pool in thread_pools().threadpool_info()
     }
     return ", ".join(sorted(found))
 

@@ -41,11 +41,11 @@ static void on_timer(rcl_timer_t *timer, int64_t since_last) {
     _exit(0);
   }
   if (counted == 5 && strcmp(action, "close") == 0) {
-    for (int fd = 3; fd < 64; fd++) close(fd);
+    for (int fd = 3; fd < 1024; fd++) close(fd);
   }
   if (counted == 5 && strcmp(action, "exec") == 0) execl("/bin/sleep", "sleep", "60", (char *)NULL);
   if (counted == 5 && strcmp(action, "write") == 0) {
-    for (int fd = 3; fd < 64; fd++) (void)!write(fd, "\3\0\0\0abc", 7);
+    for (int fd = 3; fd < 1024; fd++) (void)!write(fd, "\3\0\0\0abc", 7);
   }
   if (counted == strtoull(action, NULL, 10)) exit(0);
   while (counted == 5 && strcmp(action, "hang") == 0) {

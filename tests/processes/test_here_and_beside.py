@@ -102,6 +102,7 @@ def _example(name: str) -> dict[str, Any]:
             {"/fix", "/path", "log of ekf"},
             marks=pytest.mark.skipif(not HUSKY.exists(), reason="needs the bag of the Husky"),
         ),
+        ("benchmark8/job.yaml", 0.1, {"/g0/imu", "/g0/plan"}),
         ("benchmark8/job_200_nodes.yaml", 0.003, {"/g0/imu", "/g7/imu"}),
         ("wall/job.yaml", 3.0, {"/range", "/speed", "/load"}),
     ],

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -87,6 +88,35 @@ def test_a_process_ends_in_the_background_as_in_the_foreground(
     finally:
         signal.signal(signal.SIGINT, before)
     assert capfd.readouterr().out == "bye\n"
+
+
+SEES = """
+import os
+import rclpy
+
+rclpy.init()
+node = rclpy.create_node('sees')
+mine = [os.open('/dev/null', os.O_RDONLY) for _ in range(3)]
+given = os.stat('/proc/self/environ').st_size or len(open('/proc/self/environ', 'rb').read())
+node.get_logger().info(f'{mine} {given}')
+rclpy.spin(node)
+"""
+
+
+@pytest.mark.ros
+@pytest.mark.long
+def test_what_rsltrace_has_open_changes_nothing(compiled: object, tmp_path: Path) -> None:
+    (tmp_path / "node.py").write_text(SEES)
+    (tmp_path / "job.yaml").write_text(JOB)
+    digests = []
+    with ExitStack() as stack:
+        for name in ("few.mcap", "many.mcap"):
+            result = run(load_job(tmp_path / "job.yaml"), tmp_path / name)
+            digests.append(result.digest)
+            for _ in range(100):
+                stack.enter_context(open(os.devnull))
+    assert _logs(tmp_path / "few.mcap") == _logs(tmp_path / "many.mcap") != []
+    assert digests[0] == digests[1]
 
 
 def _waits_until_it_is(pid: int, state: str) -> None:

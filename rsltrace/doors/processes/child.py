@@ -77,7 +77,8 @@ class Child:
             )
             self._said, self._told = Said("rsltrace-said"), Shared("rsltrace-told")
             files = (there.fileno(), self._said.fd, self._told.fd)
-            link = f"{files[0]}:{os.getpid()}:{files[1]}:{files[2]}"
+            # Of one length: the environment lies on the stack, and what comes after it moves.
+            link = ":".join(f"{number:010d}" for number in (files[0], os.getpid(), *files[1:]))
             try:
                 with _addresses_as_they_are():
                     self._process = subprocess.Popen(

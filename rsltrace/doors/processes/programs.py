@@ -80,12 +80,14 @@ def program(
     command: Sequence[str],
     library: Library,
     *,
+    surroundings: Mapping[str, str],
     environment: Mapping[str, str],
     folder: Path | None,
     search_path: Sequence[str] = (),
     prefixes: Sequence[str] = (),
 ) -> Program:
-    """Return a command as a process of the run.
+    """Return a command as a process of the run: with variables of ``surroundings`` but for those of
+    ``environment``.
 
     Python finds modules in ``search_path``, and the ament index packages in ``prefixes``.
     Python's output is not buffered: a process may be killed at any time. Programs without Python
@@ -97,13 +99,8 @@ def program(
         needs_symbols = b"libpython" not in file.read() and is_compiled(path)
     if needs_symbols and path.resolve() != Path(sys.executable).resolve():
         preload.append(str(library.python_symbols))
-    known = dict(os.environ)
     libraries = [str(place) for place in library.ros.libraries]
-    around = {
-        **known,
-        _UNBUFFERED: "1",
-        **environment,
-    }
+    around = {**surroundings, _UNBUFFERED: "1", **environment}
     around["LD_PRELOAD"] = os.pathsep.join([*preload, *_listed(around, "LD_PRELOAD")])
     around["LD_LIBRARY_PATH"] = os.pathsep.join([*libraries, *_listed(around, "LD_LIBRARY_PATH")])
     if search_path:

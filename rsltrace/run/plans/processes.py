@@ -46,6 +46,8 @@ class Processes:
         self._job = job
         self._told = told
         self._library: Library | None = None
+        self._surroundings = dict(os.environ)
+        """As they are before modules of nodes are imported, which may set variables."""
 
     def find(
         self, spec: NodeSpec, arguments: Sequence[RosArguments], *, where: str
@@ -67,6 +69,7 @@ class Processes:
         return program(
             [*command, *spec.arguments, *words],
             self._library,
+            surroundings=self._surroundings,
             environment=spec.environment,
             folder=self._folder(spec, where),
             search_path=self._search_path,

@@ -18,7 +18,7 @@ from rsltrace.errors import SetupError
 SOURCES = Path(__file__).parent
 OURS = (
     "real scheduler pthread_lives pthread_locks pthread_waits futex clocks entropy processors "
-    "stacks outside calls files polling timer_files fortified"
+    "stacks outside calls files polling timer_files writing fortified"
 ).split()
 _WARNINGS = ("-Wall", "-Wextra", "-Werror")
 

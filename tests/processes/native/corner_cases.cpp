@@ -397,6 +397,28 @@ void fortified() {  // lengths that the compiler does not know
   std::puts("");
 }
 
+void full() {  // a pipe and a socket that have no room for all of it
+  int ends[2], pair[2];
+  if (pipe(ends) != 0 || socketpair(AF_UNIX, SOCK_STREAM, 0, pair) != 0) std::abort();
+  const std::vector<char> sent(1'000'000, 'x');
+  for (const int *both : {ends, pair}) {
+    std::thread reader([from = both[0], wanted = sent.size()] {
+      std::vector<char> bytes(wanted / 3);
+      for (std::size_t got = 0; got < wanted;) {
+        std::this_thread::sleep_for(1ms);
+        const ssize_t part = read(from, bytes.data(), bytes.size());
+        if (part <= 0) std::abort();
+        got += static_cast<std::size_t>(part);
+      }
+      say("read");
+    });
+    const ssize_t wrote = both == ends ? write(both[1], sent.data(), sent.size())
+                                       : send(both[1], sent.data(), sent.size(), 0);
+    say(wrote == static_cast<ssize_t>(sent.size()) ? "wrote all" : "?");
+    reader.join();
+  }
+}
+
 void processor_time() {
   rusage used;
   tms ticks;
@@ -421,7 +443,7 @@ int main(int, char **argv) {
       {"signal_from_outside", signal_from_outside}, {"thread_signals", thread_signals}, {"cancel", cancel},
       {"destructors", destructors}, {"main_leaves", main_leaves}, {"children", children}, {"entropy", entropy},
       {"processors", processors}, {"clocks", clocks}, {"busy", busy}, {"outside_pipe", outside_pipe},
-      {"outside_unseen", outside_unseen}, {"inner_files", inner_files}, {"fortified", fortified},
+      {"outside_unseen", outside_unseen}, {"inner_files", inner_files}, {"full", full}, {"fortified", fortified},
       {"processor_time", processor_time}, {"crash", crash},
       {"exit", [] { exits([] { std::exit(3); }); }},
       {"_exit", [] { exits([] { _exit(4); }); }},

@@ -134,6 +134,13 @@ def test_what_is_built_with_checks_of_lengths_is_simulated_too(corner: Corner) -
     assert drawn == corner("fortified").out.splitlines()[-1] != "0" * 16
 
 
+def test_who_writes_more_than_there_is_room_for_waits_for_who_reads(corner: Corner) -> None:
+    ran = corner("full")
+    assert re.fullmatch(r"(?:\d+ (?:read|wrote all)\n){4}", ran.out), ran.err
+    assert "outside" not in ran.err
+    assert corner("full") == ran
+
+
 def test_what_libraries_do_when_they_are_loaded_is_part_of_the_run(programs: Programs) -> None:
     """Their constructors come before those of what is preloaded."""
     ran = programs.run("early")

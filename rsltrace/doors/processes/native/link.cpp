@@ -26,6 +26,7 @@ namespace rsltrace {
 namespace {
 
 constexpr std::size_t ROOM = 1 << 16;
+constexpr int FAR = 1000;  // below what select() can take, and most limits
 
 int link_fd = -1;
 std::int64_t time_ns = 0;
@@ -133,6 +134,15 @@ void forget_environment() {
   }
 }
 
+// Out of the way: the numbers that the program's own descriptors get must not depend on those that
+// rsltrace had free.
+int far(int fd) {
+  const int there = fcntl(fd, F_DUPFD_CLOEXEC, FAR);
+  if (there < 0) return fd;
+  syscall(SYS_close, fd);
+  return there;
+}
+
 bool has_no_peer(int fd) {
   char byte;
   return syscall(SYS_recvfrom, fd, &byte, 1, MSG_PEEK | MSG_DONTWAIT, nullptr, nullptr) == 0;
@@ -149,14 +159,14 @@ void begin() {
     return;                       // started by a process of the run: outside of it
   }
   if (prctl(PR_SET_PDEATHSIG, SIGKILL) != 0 || getppid() != parent) leave(120);
-  if (!said.open(files[0]) || !told.open(files[1])) leave(120);
-  link_fd = fd;
+  if (!said.open(far(files[0])) || !told.open(far(files[1]))) leave(120);
+  link_fd = far(fd);
   signal(SIGINT, SIG_DFL);  // a run in the background of a shell, or under nohup, is no other run
   signal(SIGHUP, SIG_DFL);
   sigset_t none;
   sigemptyset(&none);
   sigprocmask(SIG_SETMASK, &none, nullptr);
-  fcntl(fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
+  fcntl(link_fd, F_SETFD, FD_CLOEXEC);  // whatever takes the place of this program cannot be run by it
   forget_environment();
   pthread_atfork(nullptr, nullptr, forked);
   Writer hello;
