@@ -14,6 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration
+from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.history import History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
@@ -86,6 +87,8 @@ class Session:
         """What is counted of each run so far, once counting was asked for."""
         self.checks: dict[str, Checks] = {}
         """What came of the checks of each run that has some (nothing while that is found out)."""
+        self.chains: dict[str, tuple[Chain, ...]] = {}
+        """The chains of each run, as far as they are found."""
 
     @property
     def runs(self) -> dict[str, Run]:
@@ -122,7 +125,11 @@ class Session:
         self.rows = AllRows(run.count)
         self.lane_window.replace_run(run)
         self.logs.clear()
-        self.overviews, self.checks = {}, {}  # others: the old are still filled for a moment
+        self.overviews, self.checks, self.chains = (
+            {},
+            {},
+            {},
+        )  # others: the old are still filled for a moment
         old.close()
 
     def next_side(self) -> str:
@@ -278,15 +285,21 @@ class Session:
             self.logs[name] = logs
 
     def survey(self) -> Iterator[float]:
-        """Count each run for its overview, a segment at a time, and hold its checks against it;
+        """Count each run for its overview, a segment at a time, hold its checks against it and
+        find its chains;
         nothing if that is done, or under way. The lanes are filled on the way. Yields the part of
         a run that is read."""
         if self.overviews:
             return iter(())
         self.overviews.update((name, Overview()) for name in self.runs)
-        return self._survey(self.overviews, self.checks)
+        return self._survey(self.overviews, self.checks, self.chains)
 
-    def _survey(self, overviews: dict[str, Overview], checks: dict[str, Checks]) -> Iterator[float]:
+    def _survey(
+        self,
+        overviews: dict[str, Overview],
+        checks: dict[str, Checks],
+        chains: dict[str, tuple[Chain, ...]],
+    ) -> Iterator[float]:
         for (name, run), maker in zip(self.runs.items(), self.lane_window.makers, strict=True):
             for number, overviews[name] in enumerate(read_overview(run)):
                 if number < len(run.segments):
@@ -294,6 +307,9 @@ class Session:
                 yield overviews[name].share
         for name, run in self.runs.items():
             for checks[name] in read_checks(run):
+                yield 1.0
+        for name, run in self.runs.items():
+            for chains[name] in read_chains(run):
                 yield 1.0
 
     def _in_lanes(self) -> tuple[int, int] | None:
@@ -401,6 +417,7 @@ class Session:
             stamp_ns=None if self.empty else self.stamp(),
             base_ns=self.base_ns,
             diff=self.comparison.diff if self.comparison is not None else None,
+            chains=[one.name for found in self.chains.values() for one in found],
         )
 
     def mode(self) -> str:

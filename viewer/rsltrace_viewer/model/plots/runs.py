@@ -9,6 +9,8 @@ import numpy as np
 from rsltrace.diff.result.traces import Diff
 from rsltrace.model.built_in import NODE_TOPICS
 from rsltrace_viewer.model.plots.series import (
+    CHAIN_AGE,
+    CHAIN_LATENCY,
     Series,
     Source,
     fields_of,
@@ -20,7 +22,8 @@ from rsltrace_viewer.model.run import Run
 
 
 class RunPlots:
-    """What can be plotted of ``runs``. ``topic`` is that of the selected event, or empty."""
+    """What can be plotted of ``runs``. ``topic`` is that of the selected event, or empty;
+    ``chains`` are the names of those that are known."""
 
     def __init__(
         self,
@@ -31,6 +34,7 @@ class RunPlots:
         stamp_ns: int | None,
         base_ns: int = 0,
         diff: Diff | None = None,
+        chains: Sequence[str] = (),
     ) -> None:
         self._runs = runs
         self._title = title
@@ -38,6 +42,7 @@ class RunPlots:
         self._stamp_ns = stamp_ns
         self._base_ns = base_ns
         self._diff = diff
+        self._chains = list(dict.fromkeys(chains))
 
     def title(self) -> str:
         """Return the names of the runs."""
@@ -48,8 +53,10 @@ class RunPlots:
         return topics_with_messages(self._runs[0])
 
     def others(self) -> list[Source]:
-        """Return rates and latencies."""
-        return sources_of(self._runs[0])
+        """Return rates, latencies, and what is known of chains."""
+        kinds = (CHAIN_LATENCY, CHAIN_AGE)
+        chains = [Source(kind, name) for name in self._chains for kind in kinds]
+        return [*sources_of(self._runs[0]), *chains]
 
     def fields(self, topic: str) -> list[Source]:
         """Return the numeric fields of a topic. Raises TraceError."""

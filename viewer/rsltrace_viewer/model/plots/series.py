@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.latency.measure import measuring
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, Output, OutputKind
+from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 
 SAMPLES_MAX = 1500
@@ -23,6 +25,11 @@ _NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgty
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 _NUMBERS_MAX = 16
 """Items of an array that are offered one by one."""
+
+
+CHAIN_LATENCY, CHAIN_AGE = "chain latency", "data age at the end"
+_MEASURES = {CHAIN_LATENCY: "latency", CHAIN_AGE: "age"}
+_UNITS = {"rate": "Hz", "latency": "ms", CHAIN_LATENCY: "ms", CHAIN_AGE: "ms"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +50,7 @@ class Source:
     @property
     def unit(self) -> str:
         """The unit of the values, where it is known."""
-        return {"rate": "Hz", "latency": "ms"}.get(self.kind, "")
+        return _UNITS.get(self.kind, "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +105,8 @@ def series_of(run: Run, source: Source) -> Iterator[Series]:
         yield from _field_series(run, source)
     elif source.kind == "rate":
         yield from _rate_series(run, source.name)
+    elif source.kind in _MEASURES:
+        yield from _chain_series(run, source.name, _MEASURES[source.kind])
     else:
         topic, _, node = source.name.partition(" → ")
         yield from _latency_series(run, topic, node)
@@ -229,3 +238,18 @@ def _latency_series(run: Run, topic: str, node: str) -> Iterator[Series]:
         yield Series(np.concatenate(times), np.concatenate(values), f"{total:,} messages")
     else:
         yield Series(_NO_POINTS, _NO_POINTS)
+
+
+def _chain_series(run: Run, name: str, measure: str) -> Iterator[Series]:
+    """Yield what a chain took, at the time of each output."""
+    topics, _, nodes = name.partition(VIA)
+    via = nodes.split(", ") if nodes else ()
+    for number, found in enumerate(measuring(run.trace, topics=topics.split(ARROW), via=via)):
+        if found is None:
+            yield Series(_NO_POINTS, _NO_POINTS, f"{(number + 1) / len(run.segments):.0%} read")
+            continue
+        moments = [one.moments(measure) for one in found.chains]
+        times = np.concatenate([_NO_POINTS, *(one["output_ns"] / 1e9 for one in moments)])
+        values = np.concatenate([_NO_POINTS, *(one["duration"] / 1e6 for one in moments)])
+        order = np.argsort(times, kind="stable")
+        yield Series(times[order], values[order], found.missing or f"{len(times):,} outputs")

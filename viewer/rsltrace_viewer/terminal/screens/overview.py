@@ -16,6 +16,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
 from rsltrace_viewer.model.cells import cells, fit, wrap
+from rsltrace_viewer.model.chains import Chain
 from rsltrace_viewer.model.checks import Checks
 from rsltrace_viewer.model.overview import (
     Overview,
@@ -42,6 +43,7 @@ _WIDTH_MAX = 140
 _NAMES_LEAST = 26
 _LINES_LEAST = 5
 _OTHER_LINES = 16
+_CHAIN, _CHAINS_MOST = 32, 12
 _UNTIMED = "Callbacks take no simulated time in this job (execution: gives them some)."
 _FIRST = "↓↑ Enter shows the events of a line   Esc all events   ? keys   q quits"
 _LATER = "↓↑ Enter shows the events of a line   Esc closes"
@@ -127,7 +129,14 @@ class OverviewScreen(Screen[Choice | None]):
             lines=0,
             width=self.app.size.width,
         )
-        parts = (self._verdict(), self._troubles(runs), iter([((), None)]), self._tables(runs))
+        nothing: Iterator[_Line] = iter([((), None)])
+        parts = (
+            self._verdict(),
+            self._troubles(runs),
+            nothing,
+            self._tables(runs),
+            self._chains(),
+        )
         self._lines = [line for part in parts for line in self._readable(part)]
         self.query_one(ListView).show(lambda line: self._lines[line][0], len(self._lines))
 
@@ -195,6 +204,35 @@ class OverviewScreen(Screen[Choice | None]):
             yield (), None
         if not timed and all(overview.share >= 1 for _, overview in runs):
             yield ((_UNTIMED, "muted"),), None
+
+    def _chains(self) -> Iterator[_Line]:
+        """Yield the chains with their latencies; a line leads to the slowest one of run a."""
+        known = [
+            {(one.hops, one.via): one for one in self._session.chains.get(name, ())}
+            for name in self._session.runs
+        ]
+        keys = list(dict.fromkeys(key for one in known for key in one))
+        if not keys:
+            return
+        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
+        names = max(width - _CHAIN * len(known), _NAMES_LEAST)
+        yield (), None
+        heads = [(fit(f"chains  {len(keys)}", names), "title")]
+        for name in "ab"[: len(known)]:
+            what = "latency: p50, max, age" + (f" {name}" if len(known) > 1 else "")
+            heads.append((f"{what:>{_CHAIN}}", "muted"))
+        yield heads, None
+        most = len(keys) if "chain" in self._whole else _CHAINS_MOST
+        for key in keys[:most]:
+            row = [one.get(key) for one in known]
+            name = next(printable(one.name) for one in row if one is not None)
+            pieces = [(fit(name, names), "plain")]
+            pieces += [(f"{_latency(one):>{_CHAIN}}", "muted") for one in row]
+            slowest = row[0].slowest if row[0] is not None else None
+            yield pieces, None if slowest is None else ("event", str(slowest))
+        if len(keys) > most:
+            more = f"… and {len(keys) - most} more: Enter shows them"
+            yield ((more, "muted"),), ("more", "chain")
 
     def _table(self, title: str, field: str, rows: Sequence[_Row], names: int) -> Iterator[_Line]:
         runs = 1 if self._session.b is None else 2
@@ -267,6 +305,14 @@ def _of_checks(checks: Checks, of_run: str) -> Iterator[tuple[str, str, int | No
     if checks.passed:
         number = "1 check" if checks.passed == 1 else f"{checks.passed} checks"
         yield f"{number}{of_run} passed", "good", None
+
+
+def _latency(chain: Chain | None) -> str:
+    """Return the latency of a chain, usual and longest, and how old its data gets."""
+    if chain is None or chain.latency is None:
+        return "-"
+    times = (chain.latency.p50_ns, chain.latency.max_ns, chain.oldest_ns)
+    return ", ".join("-" if one is None else _short(one) for one in times)
 
 
 def _ending(run: Run, name: str) -> Pieces:
