@@ -23,7 +23,7 @@ from rsltrace.model.finding import READ_BY, Source
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
-from rsltrace.words.silent_topics import silent_topics
+from rsltrace.words.silent_topics import silent_topics, without_server
 
 if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked
@@ -215,17 +215,18 @@ def _note(text: str) -> None:
 
 
 def _silent_topics(result: RunResult) -> list[str]:
-    """Return who listens to what nobody publishes."""
+    """Return who listens to what nobody publishes, and who is a client of what nobody serves."""
     if result.path is None or result.error is not None or not result.path.is_file():
         return []
     from rsltrace.trace.reader import Trace
 
     try:
         with Trace.open(result.path) as trace:
-            found = silent_topics(trace.entities.values())
+            entities = trace.entities.values()
+            found = [silent_topics(entities), without_server(entities)]
     except RsltraceError:
         return []  # somebody took it away meanwhile
-    return [f"{found}; rsltrace check tells who talks to whom"] if found else []
+    return [f"{text}; rsltrace check tells who talks to whom" for text in found if text]
 
 
 def _checked(job: Job, result: RunResult) -> tuple[Checked | None, int]:

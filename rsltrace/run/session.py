@@ -461,8 +461,8 @@ class Session:
         census = domain.entities.census
         if census is not None:
             rules += unused_rules(self.job, census, self._plan, lasted_ns)
-            rules += unused_ros_parameters(self.job, census, parameters)
-        parameter_notes = unused_parameters(self.job, parameters)
+            rules += unused_ros_parameters(self.job, census, parameters, lasted=lasted)
+        parameter_notes = unused_parameters(self.job, parameters, lasted=lasted)
         if not lasted:
             return (*rules, *parameter_notes)
         starts = missed_starts(self.job, self.world.starts.missed())

@@ -70,10 +70,11 @@ def unused_rules(
                 )
 
 
-def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
+def unused_parameters(job: Job, nodes: dict[str, Parameters], *, lasted: bool) -> Iterator[str]:
     """Yield the parameters in ``parameters:`` of an entry that none of its nodes has declared.
 
     What a launch file gives several nodes alike (``<set_parameter>``) is meant for who has it.
+    Until the run has ``lasted``, an unconfigured node is passed over: it may still declare them.
     """
     entries = []
     used_alike: set[tuple[str, str]] = set()
@@ -93,6 +94,8 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
             given = {node: found for node, found in made.items() if name in found.unused}
             if not given or any(name in found.declared for found in made.values()):
                 continue
+            if not lasted and any(found.unconfigured for found in given.values()):
+                continue
             if spec.origin and (name, repr(value)) in used_alike:
                 continue
             declared = [other for found in given.values() for other in found.declared]
@@ -104,8 +107,13 @@ def unused_parameters(job: Job, nodes: dict[str, Parameters]) -> Iterator[str]:
             )
 
 
-def unused_ros_parameters(job: Job, census: Census, nodes: dict[str, Parameters]) -> Iterator[str]:
-    """Yield the parameters among ``ros_arguments`` that no node which gets them has declared."""
+def unused_ros_parameters(
+    job: Job, census: Census, nodes: dict[str, Parameters], *, lasted: bool
+) -> Iterator[str]:
+    """Yield the parameters among ``ros_arguments`` that no node which gets them has declared.
+
+    Unconfigured nodes are passed over as ``unused_parameters`` does it.
+    """
     words = job.ros_arguments
     for index, word in enumerate(words[1:], start=1):
         if words[index - 1] not in ("-p", "--param"):
@@ -120,6 +128,8 @@ def unused_ros_parameters(job: Job, census: Census, nodes: dict[str, Parameters]
             continue
         who_gets = [node for node, found in given.items() if found]
         if any(node not in nodes or name in nodes[node].declared for node in who_gets):
+            continue
+        if not lasted and any(nodes[node].unconfigured for node in who_gets):
             continue
         near = did_you_mean(name, [other for node in who_gets for other in nodes[node].declared])
         who = ", ".join(who_gets[:3]) + (", …" if len(who_gets) > 3 else "")

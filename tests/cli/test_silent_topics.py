@@ -1,4 +1,5 @@
-"""Who listens to what nobody publishes is told once, after a recording."""
+"""Who listens to what nobody publishes, or is a client of what nobody serves, is told once, after
+a recording."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rsltrace.model.entity import Entity, EntityKind
-from rsltrace.words.silent_topics import silent_topics
+from rsltrace.words.silent_topics import silent_topics, without_server
 
 
 def entities(*ends: tuple[str, EntityKind, str]) -> list[Entity]:
@@ -43,14 +44,31 @@ def test_nothing_is_said_of_what_nodes_listen_to_in_case_there_is_some(topic: st
     assert silent_topics(entities(("/b", SUB, topic))) == ""
 
 
+def test_what_is_said_of_clients() -> None:
+    calls, serves = EntityKind.CLIENT, EntityKind.SERVICE
+    assert without_server(entities(("/a", calls, "/s"), ("/b", serves, "/s"))) == ""
+    assert without_server(entities(("/a", calls, "/s"), ("/b", serves, "/S"))) == (
+        "nobody serves /s, of which /a is a client"
+    )
+    both = without_server(entities(("/a", calls, "/s"), ("/b", calls, "/s")))
+    assert both == "nobody serves /s, of which /a and /b are clients"
+    assert without_server(entities(*(("/b", calls, f"/s{n}") for n in range(4)))) == (
+        "nobody serves what there are clients of: /s0 (for /b), /s1 (for /b), /s2 (for /b) and 1 "
+        "more services"
+    )
+
+
 @pytest.mark.ros
 def test_record_tells_it(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     (tmp_path / "listening.py").write_text(
-        "from rclpy.node import Node\nfrom std_msgs.msg import Empty\n\n\nclass Base(Node):\n"
+        "from rclpy.action import ActionClient\nfrom rclpy.node import Node\n"
+        "from std_msgs.msg import Empty\nfrom test_msgs.action import Fibonacci\n\n\n"
+        "class Base(Node):\n"
         "    def __init__(self):\n        super().__init__('base')\n"
         "        self.create_subscription(Empty, 'cmd_wel', lambda message: None, 1)\n"
         "        self.create_subscription(Empty, 'tf', lambda message: None, 1)\n"
+        "        self.dock = ActionClient(self, Fibonacci, 'dock')\n"
     )
     (tmp_path / "job.yaml").write_text("nodes: [{node: listening:Base}]\nstop: {duration: 1s}\n")
     done = subprocess.run(
@@ -61,8 +79,9 @@ def test_record_tells_it(tmp_path: Path) -> None:
         timeout=300,
         check=True,
     )
-    told = [line for line in done.stderr.splitlines() if "nobody publishes" in line]
+    told = [line for line in done.stderr.splitlines() if "nobody" in line]
+    whom = "rsltrace check tells who talks to whom"
     assert told == [
-        "note: nobody publishes /cmd_wel, which /base listens to; rsltrace check tells who talks "
-        "to whom"
+        f"note: nobody publishes /cmd_wel, which /base listens to; {whom}",
+        f"note: nobody serves /dock, of which /base is a client; {whom}",
     ]

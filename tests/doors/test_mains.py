@@ -269,6 +269,17 @@ def test_a_service_call_on_ones_own_single_threaded_executor_is_a_deadlock(simul
         simulate(main_spec(program))
 
 
+def test_a_rate_of_a_node_that_nobody_spins_is_a_deadlock_that_says_so(simulate: Any) -> None:
+    """As natively: its timer is nobody's."""
+
+    def program() -> None:
+        rclpy.init()
+        Node("alone").create_rate(5.0).sleep()
+
+    with pytest.raises(DeadlockError, match=r"a Rate, .*: an executor has to spin the node mean"):
+        simulate(main_spec(program))
+
+
 def test_an_executor_class_of_the_users_own(simulate: Any) -> None:
     order: list[str] = []
 

@@ -215,10 +215,10 @@ def test_what_cannot_be_simulated_is_listed_with_the_reason(
         "  a.launch.xml:3:3: demo/script: demo/script is a script for /bin/sh (script): rsltrace "
         "runs Python nodes only; leave it out, or feed the graph what it publishes from a bag",
         "  a.launch.xml:4:3: demo/taker: package 'demo' has no executable 'taker'; did you mean "
-        "'talker'?: it has compiled, listener, script, talker",
+        "'talker'? It has compiled, listener, script, talker",
         "  a.launch.xml:5:3: no_such_package/x (n): there is no package 'no_such_package': install "
-        "it for this Python (pip install), source the workspace it is built in, or name its "
-        "function with 'main:'",
+        "it for this Python (pip install), add its sources to search_path, source the workspace it "
+        "is built in, or name its function with 'main:'",
         "  a.launch.xml:6:3: process './program': it belongs to no package (pkg=)",
         "  a.launch.xml:7:3: process 'rviz2 -d x': other programs do not run in a simulation",
         "  a.launch.xml:9:3: shutdown: a run ends by the job's stop: conditions",

@@ -207,8 +207,8 @@ def test_a_main_that_exits_is_reported_and_the_others_go_on(
         ("executable: my_dmo/talker", "there is no package 'my_dmo'; did you mean 'my_demo'?"),
         (
             "executable: my_demo/taker",
-            "package 'my_demo' has no executable 'taker'; did you mean 'talker'?: "
-            "it has broken, defaults, listener, quitter, talker",
+            "package 'my_demo' has no executable 'taker'; did you mean 'talker'? "
+            "It has broken, defaults, listener, quitter, talker",
         ),
         ("executable: my_demo/broken", "my_demo_nodes:not_callable is a int, not callable"),
         ("executable: my_scripts/compiled", "my_scripts/compiled is a program for another machine"),

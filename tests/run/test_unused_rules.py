@@ -177,6 +177,31 @@ class Failing(Node):
     assert "note: job.yaml:2:17: no node fits '/talkr'; did you mean '/talker'?\n" in done.stderr
 
 
+def test_check_waits_with_what_a_managed_node_declares_when_it_is_configured(
+    command: Any, job_file: Callable[..., Path]
+) -> None:
+    code = """
+import rclpy
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+
+class Arm(LifecycleNode):
+    def __init__(self):
+        super().__init__('arm')
+        self.create_timer(0.5, self.trigger_configure).reset()
+
+    def on_configure(self, state):
+        self.declare_parameter('rate', 1.0)
+        return TransitionCallbackReturn.SUCCESS
+"""
+    yaml = "nodes: [{node: nodes_under_test:Arm, parameters: {rate: 5.0, ratee: 5.0}}]\n"
+    job_file(yaml + "stop: {duration: 700ms}\n", code)
+    done = command("check", "job.yaml")
+    assert "nothing looks wrong" in done.stdout
+    done = command("record", "job.yaml", "-o", "run.mcap")
+    (note,) = [line for line in done.stderr.splitlines() if "declared" in line]
+    assert "/arm has not declared the parameter 'ratee', so it has no effect; did you" in note
+
+
 def test_a_parameter_that_only_a_node_of_another_entry_declares_is_named(
     record_job: Callable[..., Any],
 ) -> None:

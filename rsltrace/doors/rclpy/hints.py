@@ -49,9 +49,11 @@ def where_to_get(package: str) -> str:
     if package in _WHEELS:
         return f"Source the ROS 2 workspace that holds it, or: pip install {debian}"
     return (
-        "There is no wheel of it that we know of: source the ROS 2 workspace that holds it (one of "
-        f"ROS's own: apt install {debian}, then source /opt/ros/{distro}/setup.bash), and run "
-        "rsltrace with the Python that it is built for"
+        "There is no wheel of it that we know of: put its sources (package.xml, .msg, .srv and "
+        ".action files) into a folder of search_path, and its classes are made from them; or "
+        f"source the ROS 2 workspace that holds it (one of ROS's own: apt install {debian}, then "
+        f"source /opt/ros/{distro}/setup.bash), and run rsltrace with the Python that it is built "
+        "for"
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 from rsltrace.doors.rclpy.handles.node import NodeHandle
@@ -13,11 +14,14 @@ class Parameters:
     """The parameters of a node: those it has declared, and those it was given besides.
 
     ``entry_key`` is the key of the job's entry that made the node, empty if none did.
+    ``unconfigured``: a managed node that nobody has configured yet, which is when such a node
+    declares its parameters.
     """
 
     entry_key: str
     declared: tuple[str, ...]
     unused: tuple[str, ...]
+    unconfigured: bool = False
 
 
 def parameters_of(graph: Graph) -> dict[str, Parameters]:
@@ -31,5 +35,14 @@ def parameters_of(graph: Graph) -> dict[str, Parameters]:
             continue
         declared = tuple(node._parameters)
         unused = tuple(name for name in node._parameter_overrides if name not in node._parameters)
-        found[handle.key] = Parameters(handle.entry_key, declared, unused)
+        found[handle.key] = Parameters(handle.entry_key, declared, unused, _is_unconfigured(node))
     return found
+
+
+def _is_unconfigured(node: object) -> bool:
+    """Say whether a node is a managed one in the state in which such nodes begin."""
+    lifecycle = sys.modules.get("rclpy.lifecycle")
+    if lifecycle is None or not isinstance(node, lifecycle.LifecycleNodeMixin):
+        return False
+    machine = getattr(node, "_state_machine", None)  # there unless it was made without
+    return machine is not None and bool(machine.current_state[1] == "unconfigured")

@@ -146,8 +146,9 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     known = _packages() | unbuilt_names()
     if not scripts and not files and package not in known:
         raise JobError(
-            f"there is no package {package!r}{_near(package, known)}: install it for this Python "
-            "(pip install), source the workspace it is built in, or name its function with 'main:'",
+            f"there is no package {package!r}{_near(package, known, 'install')} it for this Python "
+            "(pip install), add its sources to search_path, source the workspace it is built in, "
+            "or name its function with 'main:'",
             where=where,
         )
     available = sorted({*scripts, *files, *sources})
@@ -158,12 +159,12 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
             "(colcon build) and source its workspace (install/setup.bash)",
             where=where,
         )
-    has = f"it has {', '.join(available[:10])}" if available else "it has none"
+    has = f"has {', '.join(available[:10])}" if available else "has none"
     if compiled:
         listed = ", ".join(sorted(compiled)[:10])
         has += f"; once it is built (colcon build): {listed}"
-    near = _near(name, {*available, *compiled})
-    raise JobError(f"package {package!r} has no executable {name!r}{near}: {has}", where=where)
+    it = _near(name, {*available, *compiled}, "it")
+    raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 
 
 def compiled_file(target: str) -> Path | None:
@@ -242,9 +243,12 @@ def _packages() -> set[str]:
     return names
 
 
-def _near(name: str, names: Iterable[str]) -> str:
+def _near(name: str, names: Iterable[str], word: str) -> str:
+    """Return ``; did you mean 'talker'? It``, or ``: it`` if no name is near, to go on from."""
     near = nearest(name, sorted(names))
-    return f"; did you mean {near!r}?" if near not in (None, name) else ""
+    if near in (None, name):
+        return f": {word}"
+    return f"; did you mean {near!r}? {word.capitalize()}"
 
 
 def _python_script(path: Path, target: str, where: str) -> MainProgram:

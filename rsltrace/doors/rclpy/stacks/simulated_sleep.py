@@ -24,6 +24,10 @@ from rsltrace.model.stamp import patience_ns
 
 _SHUTDOWN_NS = 10_000_000_000
 _SHORTEST_SLEEP_NS = 1_000_000
+_RATE = (
+    "the next period of a Rate, which is a timer of its node: an executor has to spin the node "
+    "meanwhile, in another thread"
+)
 _real_sleep = copy_of(time.sleep)  # type: ignore[arg-type]
 _world: list[Stacks] = []
 
@@ -81,7 +85,7 @@ def simulated_waiting(stacks: Stacks, seed: int) -> Iterator[None]:
         (rclpy.node, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "time", SimpleNamespace(time=now, monotonic=now, sleep=_sleep)),
         (rclpy.client, "threading", _threading(stacks, "the response to a service call")),
-        (rclpy.timer, "threading", _threading(stacks, "the next period of a Rate")),
+        (rclpy.timer, "threading", _threading(stacks, _RATE)),
         (rclpy.action.client, "threading", _threading(stacks, "an answer of an action server")),
         (rclpy.task, "threading", SimpleNamespace(Lock=threading.Lock)),  # never held while waiting
         (rclpy.action.client, "uuid", SimpleNamespace(uuid4=_goal_ids(stacks.event, seed))),
