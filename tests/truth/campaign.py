@@ -177,6 +177,7 @@ FAMILIES = {
     "lifecycle": "lifecycle nodes",
     "mains": "programs: mains, threads, executors, launch files",
     "timing": "timers and clocks",
+    "starts": "nodes that start while others run, or start again",
     "settings": "settings and code",
     "rules": "links, drawn orders, clocks, bags and parameters of the job",
     "delivery": "queues and QoS",

@@ -178,6 +178,8 @@ def _construction(case: Case) -> Judgement:
         sentence = f"the graphs differ: {a.entity.name} in a is renamed to {b.entity.name} in b"
     elif case.inverted:
         sentence = "the nodes are constructed in another order"
+    elif a.stamp_ns != b.stamp_ns and all(map(_is_stamp_of_parameters, case.messages)):
+        return _timing(case, a, b)
     else:
         changed = a_first([m for m in case.messages if m.kind is OutputKind.ENTITY])
         if changed:
@@ -204,6 +206,12 @@ def _construction(case: Case) -> Judgement:
                 "and environment"
             )
     return Judgement(verdict, root, sentence, because or _why_constructed(case), a, b)
+
+
+def _is_stamp_of_parameters(message: MessageDifference) -> bool:
+    """Whether parameters that are the same were declared at another time."""
+    paths = [field.path for field in message.fields]
+    return message.topic == PARAMETER_EVENTS and paths == ["stamp"] and not message.more_fields
 
 
 def _why_constructed(case: Case) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 from rsltrace.diff.alignment.blocks import AlignedBlock, EventPair, mark_inverted
@@ -327,7 +327,7 @@ class Propagation:
         a, b = self._block.rows_a, self._block.rows_b
         rows, index = self._rows(item)
         place = index - rows.first
-        by_node = None if rows.kind[place] == CONSTRUCT else self._owners.get(rows.owner[place])
+        by_node = self._owners.get(self._acting(rows, place))
         if item.a >= 0 and item.b >= 0 and not item.inverted:
             i, j = item.a - a.first, item.b - b.first
             if a.input[i] == b.input[j] and a.stamp[i] == b.stamp[j]:
@@ -340,6 +340,15 @@ class Propagation:
             if origin is not None and self._passes_on(origin, side, at, item):
                 return CAUSE, origin
         return (NODE, by_node) if by_node is not None else (None, None)
+
+    def _acting(self, rows: Rows, place: int) -> int:
+        """Return whose doing an event is: of a constructor, the node that it starts again (0: it
+        starts it for the first time)."""
+        matching = rows.run.matching
+        key = matching.keys[rows.number[place]]
+        if rows.kind[place] != CONSTRUCT:
+            return rows.owner[place]
+        return matching.by_key.get(replace(key, ordinal=key.ordinal - 1), 0)
 
     def _passes_on(self, origin: Origin, rows: Rows, at: int, item: EventPair) -> bool:
         """Whether the difference of a cause is one that the event it caused can have got.

@@ -30,6 +30,7 @@ def load() -> None:
         rules,
         sensors,
         settings,
+        starts,
         systems,
         timing,
         unrelated,
@@ -39,6 +40,6 @@ def load() -> None:
     families = (
         *(bags, behaviour, delivery, endings, equal, graphs, messages, origins, outside, pairs),
         *(recordings, rules, settings, waiting, actions, lifecycle, mains, timing),
-        *(answers, sensors, unrelated, systems, mixed, programs),
+        *(answers, sensors, unrelated, systems, mixed, programs, starts),
     )
     assert all(families)
