@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -61,3 +64,16 @@ def test_where_there_is_no_choice_feedback_draws_anew() -> None:
     strategy.begin(result(0, {}, 1, ()))
     seeds = {str(strategy.propose(number)) for number in range(1, 9)}
     assert len(seeds) == 8
+
+
+@pytest.mark.long
+def test_pct_meets_planted_orders_no_less_often_than_its_bound() -> None:
+    script = Path(__file__).resolve().parents[2] / "benchmarks" / "explore_pct.py"
+    done = subprocess.run(
+        [sys.executable, script, "--runs", "1000"], capture_output=True, text=True, timeout=600
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = [line.strip("| ").split(" | ") for line in done.stdout.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["1", "2", "3"]
+    for row in rows:
+        assert float(row[5]) >= float(row[3]) > 0
