@@ -199,9 +199,12 @@ def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
     if spec.rate is not None:
         named.append((("rate",), spec.rate))
     if (of := spec.latency) is not None:
-        ends = (("from", of.start), ("to", of.end))
-        named += [(("latency", key), topic) for key, topic in ends if topic is not None]
+        both = (("from", of.start), ("to", of.end))
+        named += [(("latency", key), topic) for key, topic in both if topic is not None]
         named += [(("latency", "chain", at), topic) for at, topic in enumerate(of.chain)]
+        last = named.pop()
+        if last[1] not in names.nodes:  # a chain may end in a node
+            named.append(last)
         for at, node in enumerate(of.via):
             if wrong := names.unknown(node, names.nodes, "node"):
                 raise JobError(wrong, where=locate(job, ("checks", index, "latency", "via", at)))

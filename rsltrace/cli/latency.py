@@ -32,11 +32,13 @@ if TYPE_CHECKING:
 @click.argument("trace", type=click.Path(path_type=Path))
 @click.argument("other", type=click.Path(path_type=Path), required=False)
 @click.option("--from", "start", metavar="TOPIC", help="Only chains that begin with this topic.")
-@click.option("--to", "end", metavar="TOPIC", help="Only chains that end with this topic.")
+@click.option(
+    "--to", "end", metavar="TOPIC", help="Only chains that end with this topic, or in this node."
+)
 @click.option(
     "--chain",
     metavar="TOPIC,TOPIC,…",
-    help="One chain, by all of its topics: /scan,/objects,/cmd_vel.",
+    help="One chain, by all of its topics: /scan,/objects,/cmd_vel (a node may be the last).",
 )
 @click.option(
     "--via",

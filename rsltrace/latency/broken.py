@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 
 from rsltrace.latency.flow import Flow
-from rsltrace.latency.paths import Hop, Wanted
+from rsltrace.latency.paths import Hop, Wanted, sink_hop
 from rsltrace.model.built_in import NODE_TOPICS
 from rsltrace.model.entity import EntityKind
 
@@ -24,7 +24,8 @@ def where_broken(flow: Flow, wanted: Wanted) -> str:
             return f"no message was caused by one of {first}{_stored(flow, graph, first)}"
         return f"no message of {last} was caused by another one"
     way = _way(graph, first, last)
-    said = f"no message of {last} came of one of {first}"
+    what = f"message of {last}" if flow.sink is None else f"callback of {flow.sink}"
+    said = f"no {what} came of one of {first}"
     if not way:
         return f"{said}: no way leads there, from subscription to publisher"
     reached = {hop for path in flow.paths.hops for hop in path}
@@ -66,16 +67,24 @@ def _of_topics(flow: Flow, wanted: Wanted, graph: _Graph) -> str:
     if not longest:
         return f"there is no message of {wanted.topics[0]}"
     before, topic = wanted.topics[longest - 1 : longest + 1]
-    said = f"no message of {topic} came of one of {before} that came through the chain"
+    at_end = flow.sink is not None and topic == sink_hop(flow.sink).topic
+    what = f"callback of {flow.sink}" if at_end else f"message of {topic}"
+    said = f"no {what} came of one of {before} that came through the chain"
     for hop in graph.get(before, ()):
         if hop.topic == topic:
             return f"{said}: {_break(before, hop)}"
-    nobody = f"{said}: nobody receives the one and publishes the other"
+    nobody = (
+        f"{said}: it receives none"
+        if at_end
+        else f"{said}: nobody receives the one and publishes the other"
+    )
     between = ",".join(hop.topic for hop in _way(graph, before, topic)[:-1])
     return f"{nobody}; {between} may belong in between" if between else nobody
 
 
 def _break(before: str, hop: Hop) -> str:
+    if hop == sink_hop(hop.node):
+        return f"no callback of {hop.node} has taken a message of {before} that came of it"
     return (
         f"{hop.node} receives {before} and publishes {hop.topic}, but nothing that it publishes "
         f"there has such a message as its cause. If it makes use of the last one, as a timer does "
@@ -97,6 +106,8 @@ def _graph(flow: Flow) -> _Graph:
             received.setdefault(entity.name, set()).add(node)
         elif entity.kind is EntityKind.PUBLISHER and entity.name not in NODE_TOPICS:
             sent.setdefault(node, set()).add(entity.name)
+    if flow.sink is not None:
+        sent.setdefault(flow.sink, set()).add(sink_hop(flow.sink).topic)
     return {
         topic: [Hop(node, one) for node in sorted(nodes) for one in sorted(sent.get(node, ()))]
         for topic, nodes in received.items()

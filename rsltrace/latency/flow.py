@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
-from rsltrace.latency.paths import NO_PATH, Hop, Paths, Wanted
+from rsltrace.latency.paths import NO_PATH, Hop, Paths, Wanted, sink_hop
 from rsltrace.model.built_in import NODE_TOPICS
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.entity import EntityKind
@@ -47,22 +47,26 @@ class Table:
 
     def __init__(self, *columns: str) -> None:
         self._columns = {name: array("q") for name in columns}
+        self._appends = [column.append for column in self._columns.values()]
+        self._whole: dict[str, npt.NDArray[np.int64]] = {}
+        self.count = 0
 
     def __getitem__(self, column: str) -> array[int]:
         return self._columns[column]
 
-    def __len__(self) -> int:
-        return len(next(iter(self._columns.values())))
-
     def add(self, *values: int) -> int:
-        """Append a row and return its number."""
-        for column, value in zip(self._columns.values(), values, strict=True):
-            column.append(value)
-        return len(self) - 1
+        """Append a row, a value for each column, and return its number."""
+        for append, value in zip(self._appends, values):  # noqa: B905  # checking takes time
+            append(value)
+        self.count += 1
+        return self.count - 1
 
     def column(self, name: str) -> npt.NDArray[np.int64]:
-        """Return a column as an array of shape (rows,), a copy."""
-        return np.array(self._columns[name], dtype=np.int64)
+        """Return a column as an array of shape (rows,), not to be written to."""
+        whole = self._whole.get(name)
+        if whole is None or len(whole) != self.count:
+            whole = self._whole[name] = np.array(self._columns[name], dtype=np.int64)
+        return whole
 
 
 class Flow:
@@ -97,7 +101,13 @@ class Flow:
             if entity.kind is EntityKind.PUBLISHER and entity.name not in NODE_TOPICS:
                 hop = Hop(self._nodes[entity.id], entity.name)
                 self._hops[entity.id] = self.paths.hop(hop)
+        self._sink = None if wanted.sink is None else self.paths.hop(sink_hop(wanted.sink))
         self._publishers = np.array(sorted(self._hops), dtype=np.uint32)
+
+    @property
+    def sink(self) -> str | None:
+        """The node that chains have to end in, if there is one."""
+        return self._wanted.sink
 
     def event_of(self, row: int) -> int:
         """Return the index of the event that published a message."""
@@ -131,7 +141,8 @@ class Flow:
         sends[owners] = True
         goes_on = (events["flags"] & _SUSPENDED) != 0
         caused = events["cause_event"] != np.uint64(NO_EVENT)
-        chosen = np.flatnonzero(sends | goes_on | caused | (events["kind"] == _RESUME))
+        kinds = np.isin(events["kind"], (_SUBSCRIPTION, _RESUME))
+        chosen = np.flatnonzero(sends | goes_on | caused | kinds)
         bounds = np.searchsorted(owners, np.append(chosen, len(events))).tolist()
         selected = list(
             zip(
@@ -159,10 +170,12 @@ class Flow:
         taken, busy_ns = self._came_of(index, stamp_ns, entity, kind, cause)
         if taken != NONE:
             self._of_events.add(index, taken)
+        if kind == _SUBSCRIPTION and (received := self._last.get(self.node_of(entity))) is not None:
+            received[self.trace.entity(entity).name] = taken  # NONE, too: the one before is gone
         row, follows = NONE, NONE
         for place, what, sender, number in outputs:
             if what == _MESSAGE:
-                key = index << _PLACE_BITS | min(place, (1 << _PLACE_BITS) - 1)
+                key = index << _PLACE_BITS | min(place, (1 << _PLACE_BITS) - 2)
                 row = self._publish(key, sender, stamp_ns, stamp_ns + busy_ns, taken)
                 follows = place
                 continue
@@ -175,8 +188,21 @@ class Flow:
                     self._delays.add(row, sender, value_ns)
                 elif draw in _LOST:
                     self.lost.add(row, sender)
+        done = kind in (_SUBSCRIPTION, _RESUME) and not flags & _SUSPENDED
+        if self.sink is not None and done and taken != NONE and self.node_of(entity) == self.sink:
+            self._end(index, stamp_ns, stamp_ns + busy_ns, taken)
         if flags & _SUSPENDED:
             self._suspended.setdefault(entity, deque()).append((taken, busy_ns))
+
+    def _end(self, index: int, began_ns: int, done_ns: int, taken: int) -> None:
+        """Let the chains end that a callback of the last node has taken a message of."""
+        assert self._sink is not None
+        key = index << _PLACE_BITS | (1 << _PLACE_BITS) - 1
+        first = self.taken["message"][taken]
+        for row in range(first, first + self.taken["rows"][taken]):
+            path = self.paths.extended(self.messages["path"][row], self._sink)
+            if path != NO_PATH:
+                self.messages.add(key, path, row, taken, began_ns, done_ns)
 
     def _came_of(
         self, index: int, stamp_ns: int, entity: int, kind: int, cause: tuple[int, int]
@@ -212,11 +238,7 @@ class Flow:
             last += 1
         if last == row:
             return NONE
-        taken = self.taken.add(row, last - row, entity, stamp_ns, self._delay(row, entity))
-        received = self._last.get(self.node_of(entity))
-        if received is not None:
-            received[self._topic(row)] = taken
-        return taken
+        return self.taken.add(row, last - row, entity, stamp_ns, self._delay(row, entity))
 
     def _topic(self, row: int) -> str:
         return self.paths.known[self.paths.hops[self.messages["path"][row]][-1]].topic
@@ -233,7 +255,7 @@ class Flow:
     def _publish(self, key: int, sender: int, began_ns: int, left_ns: int, taken: int) -> int:
         """Add a message, for each path that it came on; return its first row, if it has one."""
         paths, hop, add = self.paths, self._hops[sender], self.messages.add
-        first = len(self.messages)
+        first = self.messages.count
         if paths.begins(hop):
             add(key, paths.begun(hop), NONE, NONE, began_ns, left_ns)
         came = False
@@ -246,13 +268,13 @@ class Flow:
                     add(key, path, row, one, began_ns, left_ns)
         if self._all and not came:
             add(key, paths.begun(hop), NONE, NONE, began_ns, left_ns)
-        if len(self.messages) - first > _PATHS_MAX:
+        if self.messages.count - first > _PATHS_MAX:
             name = paths.known[hop]
             raise TraceError(
                 f"{self.trace.name}: more than {_PATHS_MAX} chains lead to one message of "
                 f"{name.topic} ({name.node}); name one (--chain), or fewer nodes (--via)"
             )
-        return first if len(self.messages) > first else NONE
+        return first if self.messages.count > first else NONE
 
     def _inputs(self, sender: int, taken: int) -> Iterator[int]:
         """Yield how the messages were received that a message comes of."""
@@ -261,4 +283,4 @@ class Flow:
         received = self._last.get(self.node_of(sender)) if self._last else None
         if received:
             own = "" if taken == NONE else self._topic(self.taken["message"][taken])
-            yield from (one for topic, one in received.items() if topic != own)
+            yield from (one for topic, one in received.items() if topic != own and one != NONE)

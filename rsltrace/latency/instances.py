@@ -75,7 +75,7 @@ def instances(flow: Flow, path: int) -> Instances:
         came.insert(0, parents[came[0]])
     inputs = _rows(flow, paths, path, 1, came[0])
     inputs = inputs[np.argsort(published[inputs], kind="stable")]
-    places = np.zeros(len(messages), dtype=np.int64)
+    places = np.zeros(messages.count, dtype=np.int64)
     places[inputs] = np.arange(len(inputs))
     return Instances(
         inputs, published[inputs], np.stack(came, axis=1), published[last], places[came[0]]

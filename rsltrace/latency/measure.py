@@ -21,7 +21,7 @@ from rsltrace.latency.instances import (
     parts_of,
     passages,
 )
-from rsltrace.latency.paths import Hop, Wanted
+from rsltrace.latency.paths import Hop, Wanted, sink_hop
 from rsltrace.model.entity import EntityKind
 from rsltrace.trace.reader import Trace
 from rsltrace.words.matching import is_named
@@ -168,8 +168,9 @@ def measure_latencies(
 ) -> Latencies:
     """Return the chains of a trace: all, those from and to a topic, or that through ``topics``.
 
-    ``via`` names nodes (or globs of them) that publish what they make of the last message that
-    they received, as a timer does that samples.
+    A node as ``end`` (or last of the topics) stands for the end of its callback that has taken the
+    last message. ``via`` names nodes (or globs of them) that publish what they make of the last
+    message that they received, as a timer does that samples.
 
     :raises TraceError: the trace is damaged, there is no such topic or node, or nothing came
         through such a chain.
@@ -194,11 +195,16 @@ def measuring(
     :raises TraceError: the trace is damaged.
     """
     chosen = nodes_called(trace, via)
-    missing = _not_there(trace, start, end, topics, via)
+    sink = _sink(trace, topics[-1] if topics else end)
+    if sink is not None and topics:
+        topics = (*topics[:-1], sink_hop(sink).topic)
+    elif sink is not None:
+        end = sink_hop(sink).topic
+    missing = _not_there(trace, start, end, topics, via, sink)
     if missing:
         yield Latencies((), missing=missing)
         return
-    wanted = Wanted(start, end, tuple(topics), chosen)
+    wanted = Wanted(start, end, tuple(topics), chosen, sink)
     flow = Flow(trace, wanted)
     for events, outputs in zip(trace.events(), trace.outputs(), strict=True):
         flow.read(events, outputs)
@@ -226,14 +232,33 @@ def _nodes(trace: Trace) -> list[str]:
     return list(dict.fromkeys(of_nodes))
 
 
+def _sink(trace: Trace, last: str | None) -> str | None:
+    """Return the node that a chain is to end in, None if it is to end with a topic."""
+    if last is None:
+        return None
+    if last in _topics(trace):
+        return None
+    return next((node for node in _nodes(trace) if last in (node, sink_hop(node).topic)), None)
+
+
+def _topics(trace: Trace) -> list[str]:
+    entities = trace.entities.values()
+    return sorted({one.name for one in entities if one.kind is EntityKind.PUBLISHER})
+
+
 def _not_there(
-    trace: Trace, start: str | None, end: str | None, topics: Sequence[str], via: Collection[str]
+    trace: Trace,
+    start: str | None,
+    end: str | None,
+    topics: Sequence[str],
+    via: Collection[str],
+    sink: str | None,
 ) -> str:
     """Return what there is not, of what is asked for."""
-    entities = trace.entities.values()
-    sent = sorted({one.name for one in entities if one.kind is EntityKind.PUBLISHER})
+    sent = _topics(trace)
+    ends = () if sink is None else (sink_hop(sink).topic,)
     for topic in (start, end, *topics):
-        if topic is not None and topic not in sent:
+        if topic is not None and topic not in sent and topic not in ends:
             return f"nobody publishes {topic}" + _near(topic, sent)
     if start is not None and start == end:
         return f"{start} is both ends of the chain; name a loop by its topics (--chain)"

@@ -19,14 +19,16 @@ class Hop(NamedTuple):
 class Wanted:
     """Which chains: all that there are, those from and to a topic, or one, by its ``topics``.
 
-    ``via`` are nodes (full names) of which a message that they publish is taken to come of the
-    last message that they received of each topic, whatever the trace says of its cause.
+    With ``sink``, a node, chains end when a callback of it is done that has taken the last message
+    (``sink_hop``). ``via`` are nodes (full names) of which a message that they publish is taken to
+    come of the last message that they received of each topic, whatever the trace says of its cause.
     """
 
     start: str | None = None
     end: str | None = None
     topics: tuple[str, ...] = ()
     via: tuple[str, ...] = ()
+    sink: str | None = None
 
     @property
     def first(self) -> str | None:
@@ -37,6 +39,11 @@ class Wanted:
     def last(self) -> str | None:
         """The topic that chains have to end with, if there is one."""
         return self.topics[-1] if self.topics else self.end
+
+
+def sink_hop(node: str) -> Hop:
+    """Return what stands for the callbacks of a node as the last hop of a chain."""
+    return Hop(node, f"({node})")
 
 
 class Paths:

@@ -22,6 +22,7 @@ from std_srvs.srv import Trigger
 from rsltrace import Job, NodeSpec, StopSpec, Trace, record
 from rsltrace.cli.main import cli
 from rsltrace.latency.measure import ChainLatency, measure_latencies
+from rsltrace.model.event import EventKind
 
 pytestmark = pytest.mark.ros
 MS = 1_000_000
@@ -140,6 +141,25 @@ def test_ages_are_those_that_the_messages_tell(run: Path) -> None:
             assert worst is not None
             assert (worst.input_ns, worst.output_ns) == (taken[number], stamp + more_ns)
             assert trace.event(worst.output_event).stamp_ns == stamp
+
+
+def test_a_chain_that_ends_in_a_node_ends_with_its_callback(run: Path) -> None:
+    with Trace.open(run) as trace:
+        taken, heard = dict(values(trace, "/image")), []
+        for events in trace.events():
+            for event in events.tolist():
+                found = trace.event(event[1])
+                entity = trace.entity(found.entity)
+                node = trace.node_of(entity).name
+                if found.kind is EventKind.SUBSCRIPTION and node == "/controller":
+                    heard.append(found)
+        numbers = [number for number, _ in values(trace, "/objects")]
+        chain = only(trace, start="/image", end="/controller")
+        told = [one.stamp_ns - taken[n] for one, n in zip(heard, numbers, strict=False)]
+        assert chain.name == "/image → /objects → (/controller)"
+        assert len(told) > 15
+        assert chain.durations("age").tolist() == told
+        assert chain.parts[-1].link.max() > 10 * MS
 
 
 def test_where_the_time_goes_and_what_went_no_further(run: Path) -> None:

@@ -31,7 +31,7 @@ class LatencySpec(Part):
     end: Topic = Field(
         default=None,
         alias="to",
-        description="The topic of the outputs.",
+        description="The topic of the outputs, or the node whose callback is the end.",
         examples=["/cmd_vel"],
     )
     chain: Annotated[tuple[str, ...], check(items(text(check_topic)))] = Field(
