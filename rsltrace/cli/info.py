@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 
 import click
 
+from rsltrace.cli.output.native_text import NO_DIGEST, native_json, native_lines, real_time
 from rsltrace.model.built_in import is_built_in
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
@@ -18,6 +19,7 @@ from rsltrace.replay.edits import edits_of
 from rsltrace.terminal import say
 from rsltrace.trace.counts import Counts, count
 from rsltrace.trace.format import EVENTS_PER_SEGMENT, FORMAT_VERSION, METADATA_GUARD
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.words.code import entity_places, places_text
 from rsltrace.words.kinds import kind_label
@@ -41,7 +43,7 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
 
     Two traces with the same digest hold the same run. A rate is that of an entity's events (of
     what it sent, for publishers) from the first to the last, in simulated time. A trace whose run
-    was killed is shown as far as it goes.
+    was killed is shown as far as it goes. A native run has no digest; its times are told instead.
     """
     with Trace.open(trace) as opened:
         if check:
@@ -60,14 +62,18 @@ def info(trace: Path, as_json: bool, show_all: bool, check: bool) -> None:
 
 def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
     start, end = format_seconds(trace.start_ns), format_seconds(trace.end_ns)
+    time = ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})")
+    native = is_native(trace)
+    if native:
+        time = ("recorded", real_time(trace))
     size = f"{trace.size} bytes, format {FORMAT_VERSION}, {printable(trace.header.library)}"
     lines = table(
         (
             ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
             ("state", _state(trace)),
-            *(() if trace.complete else (("next", _CUT_OFF),)),
-            ("digest", trace.digest),
-            ("simulated", f"{start} s to {end} s  ({format_duration(_duration_ns(trace))})"),
+            *(() if trace.complete or native else (("next", _CUT_OFF),)),
+            ("digest", NO_DIGEST if native else trace.digest),
+            time,
             ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
             ("outputs", _by_kind(trace.output_count, counts.output_kinds, OutputKind)),
         )
@@ -76,6 +82,8 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
         if mapping:
             rows = [(f"  {printable(key)}", _short(value)) for key, value in mapping.items()]
             lines += ["", title, *table(rows)]
+    if native:
+        lines += native_lines(trace)
     if edits := edits_of(trace):
         lines += ["", "edits, as a branch of another run", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
@@ -164,7 +172,8 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
         "format_version": FORMAT_VERSION,
         "library": trace.header.library,
         "complete": trace.complete,
-        "digest": trace.digest,
+        "digest": None if is_native(trace) else trace.digest,
+        "native": native_json(trace) if is_native(trace) else None,
         "start_ns": trace.start_ns,
         "end_ns": trace.end_ns,
         "duration_ns": _duration_ns(trace),

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import faulthandler
 import json
-import os
-import signal
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
 from rsltrace.cli.job_source import RosArgsCommand, all_overrides, job_of, job_options
 from rsltrace.cli.output.exit_status import reopen_standard_streams, status_without_output
+from rsltrace.cli.output.watching import interruptible, progress
 from rsltrace.errors import EXIT_USAGE, NodeError, RsltraceError
 from rsltrace.guard.pin import has_fixed_addresses, unpin
 from rsltrace.model.finding import READ_BY, Source
 from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
 from rsltrace.words.silent_topics import silent_topics, without_server
 
@@ -66,6 +64,22 @@ if TYPE_CHECKING:
     is_flag=True,
     help="Keep hash seed, addresses, time zone, locale and numerical threads as they are here.",
 )
+@click.option(
+    "--native",
+    is_flag=True,
+    help="Observe the nodes on rclpy's own executors over DDS, in real time; simulate nothing.",
+)
+@click.option(
+    "--executor",
+    type=click.Choice(("single", "multi")),
+    help="With --native: each entry's executor, single-threaded (default) or multi-threaded.",
+)
+@click.option(
+    "--domain",
+    type=click.IntRange(0, 232),
+    metavar="ID",
+    help="With --native: take part in this DDS domain (default: alone in a free one).",
+)
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
 def record(
     words: tuple[str, ...],
@@ -81,6 +95,9 @@ def record(
     overrides: tuple[str, ...],
     print_job: bool,
     no_pin: bool,
+    native: bool,
+    executor: str | None,
+    domain: int | None,
     quiet: bool,
 ) -> None:
     """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
@@ -88,6 +105,9 @@ def record(
     \b
       rsltrace record job.yaml -o run.mcap --ros-args -p ekf:rate:=20
       rsltrace record --launch robot.launch.xml world:=lab --until 60
+
+    With --native the same nodes run as they do without rsltrace, and what they do is written down
+    in the same format, with its real times. Such a run has no digest (see docs/native.md).
 
     The nodes' log records go to stderr. The last line on stdout is
     "digest <16 hex>  events <n>  sim <seconds>"; two runs with the same digest did the same.
@@ -99,18 +119,31 @@ def record(
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         end_with_run()
+    _check_options(native, executor, domain, replay, seed)
     changes = all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:
         guard = loaded.guard.model_copy(update={"pin": False})
         loaded = loaded.model_copy(update={"guard": guard})
-    if not loaded.guard.pins:
+    if native or not loaded.guard.pins:
         unpin()
     if print_job:
         _print_job(loaded)
         return
     path = output or default_output(named)
     _check_first(loaded, bag, force=force)
+    if native:
+        _record_native(
+            loaded,
+            path,
+            bag,
+            force=force,
+            quiet=quiet,
+            as_json=as_json,
+            executor=executor or "single",
+            domain=domain,
+        )
+        return
     told: list[str] = []
     result = _recorded(
         loaded, path, told, force=force, echo=not quiet, shows=not (quiet or as_json), replay=replay
@@ -118,7 +151,7 @@ def record(
     status = result.exit_code
     reopen_standard_streams()
     try:
-        checked, checks_status = _checked(loaded, result)
+        checked, checks_status = _checked(loaded, result.path)
         status = status or checks_status
         _report(result, told, checked, as_json=as_json)
         if bag is not None:
@@ -126,6 +159,16 @@ def record(
     except OSError as error:
         status = status_without_output(error, status)
     sys.exit(status)
+
+
+def _check_options(
+    native: bool, executor: str | None, domain: int | None, replay: Path | None, seed: int | None
+) -> None:
+    """Raise a usage error for options that make no sense together."""
+    if native and (replay is not None or seed is not None):
+        raise click.UsageError("--native steers nothing: --replay and --seed are of no use with it")
+    if not native and (executor is not None or domain is not None):
+        raise click.UsageError("--executor and --domain are for native runs: add --native")
 
 
 def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
@@ -165,8 +208,7 @@ def _recorded(
     with interruptible() as on_interrupt, progress(quiet=not shows) as on_progress:
 
         def begins(stop: Callable[[Stop], None]) -> None:
-            if not (job.stop.model_fields_set or job.bags):
-                _say_that_it_has_no_end(job)
+            _say_if_it_has_no_end(job)
             on_interrupt(stop)
 
         return run(
@@ -179,6 +221,44 @@ def _recorded(
         )
 
 
+def _record_native(
+    job: Job,
+    path: Path,
+    bag: Path | None,
+    *,
+    force: bool,
+    quiet: bool,
+    as_json: bool,
+    executor: str,
+    domain: int | None,
+) -> None:
+    """Run a job natively, and end the process."""
+    from rsltrace.cli.output.native_run import leave, report_native, run_native
+
+    result = run_native(
+        job,
+        path,
+        force=force,
+        echo=not quiet,
+        shows=not (quiet or as_json),
+        executor=executor,
+        domain=domain,
+        note=_note,
+        begins=lambda: _say_if_it_has_no_end(job),
+    )
+    status = result.exit_code
+    reopen_standard_streams()
+    try:
+        checked, checks_status = _checked(job, result.path)
+        status = status or checks_status
+        report_native(result, checked, as_json=as_json)
+        if bag is not None:
+            _export(result.path, bag, force=force)
+    except OSError as error:
+        status = status_without_output(error, status)
+    leave(result, status)
+
+
 def _export(trace: Path, bag: Path, *, force: bool) -> None:
     from rsltrace.bag.export import export_bag
 
@@ -186,7 +266,9 @@ def _export(trace: Path, bag: Path, *, force: bool) -> None:
     tell(f"wrote {bag}: {count} messages")
 
 
-def _say_that_it_has_no_end(job: Job) -> None:
+def _say_if_it_has_no_end(job: Job) -> None:
+    if job.stop.model_fields_set or job.bags:
+        return
     if job.launch:
         _note("a launch file does not say when a run ends: --until T does, and Ctrl-C")
     elif any(spec.node is not None for spec in job.nodes):  # mains end by themselves
@@ -229,14 +311,14 @@ def _silent_topics(result: RunResult) -> list[str]:
     return [f"{text}; rsltrace check tells who talks to whom" for text in found if text]
 
 
-def _checked(job: Job, result: RunResult) -> tuple[Checked | None, int]:
+def _checked(job: Job, path: Path | None) -> tuple[Checked | None, int]:
     """Hold the job's checks against what was recorded; return what came of it, and a status."""
-    if not (job.checks or job.metrics) or result.path is None:
+    if not (job.checks or job.metrics) or path is None:
         return None, 0
     from rsltrace.cli.output.checks import Checked
 
     try:
-        checked = Checked(job, result.path)
+        checked = Checked(job, path)
     except RsltraceError as error:  # the trace is there all the same
         tell(f"rsltrace: error: {error}")
         return None, EXIT_USAGE
@@ -302,78 +384,3 @@ def _warn(result: RunResult) -> None:
 
 
 _SHOWN_MAX = 8
-
-
-@contextmanager
-def interruptible() -> Iterator[Callable[[Callable[[Stop], None]], None]]:
-    """Turn the first SIGINT, SIGTERM or SIGHUP into a proper end of the run; a second one
-    interrupts whatever callback is stuck."""
-    from rsltrace.loop.stop import Stop
-
-    ends: list[Callable[[Stop], None]] = []
-    old: dict[int, Any] = {}
-    process = os.getpid()
-
-    def handle(number: int, frame: object) -> None:
-        if os.getpid() != process:  # forked by a node: no run to end, so as if nobody had asked
-            signal.signal(number, old[number])
-            os.kill(os.getpid(), number)
-            return
-        if not ends:
-            raise KeyboardInterrupt(128 + number)
-        end, name = ends.pop(), _ENDS[signal.Signals(number)]
-        # Not through sys.stderr: the signal may have come in the middle of a write to it.
-        with suppress(OSError):
-            os.write(2, f"\nrsltrace: {name}, closing the trace (once more to force)\n".encode())
-        end(Stop(name, 128 + number))
-
-    for caught in _ENDS:
-        if caught != signal.SIGHUP or signal.getsignal(caught) != signal.SIG_IGN:  # nohup
-            old[caught] = signal.signal(caught, handle)
-    try:
-        yield ends.append
-    finally:
-        for caught_before, handler in old.items():
-            signal.signal(caught_before, handler)
-
-
-_ENDS = {
-    signal.SIGINT: "interrupted",
-    signal.SIGTERM: "terminated",
-    signal.SIGHUP: "hung up",
-}
-
-
-@contextmanager
-def progress(
-    *, quiet: bool, what: str = "recording"
-) -> Iterator[Callable[[int, int | None, int], None] | None]:
-    """Show a progress bar on a terminal, nothing elsewhere."""
-    if quiet or sys.stderr is None or not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn(what),
-        BarColumn(),
-        TextColumn("{task.fields[sim]} s simulated, {task.fields[events]} events"),
-        TimeElapsedColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=None, sim="0", events=0)
-        first: list[int] = []
-
-        def update(now_ns: int, end_ns: int | None, events: int) -> None:
-            if not first:
-                first.append(now_ns)
-            bar.update(
-                task,
-                total=None if end_ns is None else end_ns - first[0],
-                completed=now_ns - first[0],
-                sim=format_seconds(now_ns)[:-6],
-                events=events,
-            )
-
-        yield update

@@ -16,6 +16,7 @@ from rsltrace.replay.job_folder import folder_of, job_in_trace
 from rsltrace.replay.trust import why_not_trusted
 from rsltrace.run.provenance import environment
 from rsltrace.trace.format import METADATA_SOURCES
+from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 
 Position = int | str
@@ -68,6 +69,7 @@ def prepared(
     if "://" in str(path):
         raise ReplayError(f"{path}: download a trace to replay it")
     with Trace.open(path) as trace:
+        refuse_native(trace, "there is nothing that a replay could do again")
         if trace.event_count == 0:
             raise ReplayError(f"{path} has no events to replay")
         if job is None:

@@ -26,6 +26,7 @@ TOPIC_DETAILS = "/rsltrace/details"
 TOPIC_FINDINGS = "/rsltrace/findings"
 TOPIC_STATES = "/rsltrace/states"
 TOPIC_CODE_LINES = "/rsltrace/code_lines"
+TOPIC_TIMINGS = "/rsltrace/timings"
 TOPIC_ROSOUT = "/rosout"
 PREFIX_OWN = "/rsltrace/"
 PREFIX_REQUEST = "/rsltrace/request"
@@ -42,6 +43,8 @@ METADATA_GUARD = "rsltrace:guard"
 METADATA_EDITS = "rsltrace:edits"
 METADATA_RESULT = "rsltrace:result"
 METADATA_FED = "rsltrace:fed"
+METADATA_NATIVE = "rsltrace:native"
+"""Only in traces of native runs: middleware, executors, clocks. See ``trace.timings``."""
 METADATA_ROSBAG2 = "rosbag2"
 CHECKSUM_KEY = "checksum"
 """In each metadata record of ours: its checksum, so that what is stored is checked when read."""
@@ -72,6 +75,7 @@ SCHEMA_DETAIL = "rsltrace_msgs/msg/Detail"
 SCHEMA_FINDING = "rsltrace_msgs/msg/Finding"
 SCHEMA_STATE = "rsltrace_msgs/msg/StateChange"
 SCHEMA_CODE_LINE = "rsltrace_msgs/msg/CodeLine"
+SCHEMA_TIMING = "rsltrace_msgs/msg/Timing"
 
 SCHEMA_TEXT = {
     SCHEMA_EVENT: """\
@@ -120,6 +124,17 @@ uint32 output        # which output of the event came from here; 2^32-1: what it
 string place         # package/module.py:24
 string function
 """,
+    SCHEMA_TIMING: """\
+uint64 event         # index of the event
+uint64 steady        # steady clock at its start, in nanoseconds
+uint64 wall          # system clock at its start
+uint64 duration      # from its start to its end, in nanoseconds
+uint64 observer      # what observing it took within its thread, in nanoseconds
+uint64 source        # system clock when its input was sent; 0: unknown
+uint64 ready         # system clock when its input was received, or the timer was due; 0: unknown
+uint64 sequence      # of its input, counted by who sent it; 0: unknown
+uint32 thread        # of the process, counted from 1
+""",
     SCHEMA_FINDING: """\
 uint64 event         # index of the event it happened in
 uint32 entity        # id in /rsltrace/entities of what ran
@@ -162,6 +177,23 @@ OUTPUT_CONTENT = struct.Struct("<QII")
 
 OUTPUT_CONTENT_DTYPE = np.dtype([("hash", "<u8"), ("entity", "<u4"), ("kind", "<u4")])
 OUTPUT_DTYPE = np.dtype([("event", "<u8"), *OUTPUT_CONTENT_DTYPE.descr, ("sequence", "<u4")])
+
+TIMING = struct.Struct("<8QI")
+"""A Timing."""
+
+TIMING_DTYPE = np.dtype(
+    [
+        ("event", "<u8"),
+        ("steady", "<u8"),
+        ("wall", "<u8"),
+        ("duration", "<u8"),
+        ("observer", "<u8"),
+        ("source", "<u8"),
+        ("ready", "<u8"),
+        ("sequence", "<u8"),
+        ("thread", "<u4"),
+    ]
+)
 
 EVENT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *EVENT_DTYPE.descr])
 OUTPUT_MESSAGE_DTYPE = np.dtype([*MESSAGE_HEADER_DTYPE.descr, ("cdr", "S4"), *OUTPUT_DTYPE.descr])

@@ -32,6 +32,7 @@ from rsltrace.trace.cdr import pack_code_line, pack_detail, pack_entity, pack_fi
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.format import (
     ATTACHMENT_INDEX,
+    CDR_HEADER,
     CHECKSUM_KEY,
     CHECKSUMS_KEY,
     EVENTS_PER_SEGMENT,
@@ -52,6 +53,7 @@ from rsltrace.trace.format import (
     SCHEMA_OUTPUT,
     SCHEMA_STATE,
     SCHEMA_TEXT,
+    SCHEMA_TIMING,
     SEGMENT_DTYPE,
     TOPIC_CODE_LINES,
     TOPIC_DETAILS,
@@ -60,6 +62,7 @@ from rsltrace.trace.format import (
     TOPIC_FINDINGS,
     TOPIC_OUTPUTS,
     TOPIC_STATES,
+    TOPIC_TIMINGS,
 )
 from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.rosbag2 import KEY, BagTopic, bag_metadata_yaml, normalized_qos
@@ -277,6 +280,11 @@ class TraceWriter:
         """Take what changed in a node's state, as JSON."""
         channel_id = self._own_channel(TOPIC_STATES, SCHEMA_STATE)
         return self.add_payload(channel_id, stamp_ns, pack_detail(event, node, changes))
+
+    def add_timing(self, packed: bytes, stamp_ns: int) -> int:
+        """Take when and for how long the next event ran, packed by ``format.TIMING``."""
+        channel_id = self._own_channel(TOPIC_TIMINGS, SCHEMA_TIMING)
+        return self.add_payload(channel_id, stamp_ns, CDR_HEADER + packed)
 
     def close(self, *, result: Mapping[str, str], replace: bool = True) -> None:
         """Write what is left, then the indexes, and close the file.

@@ -14,6 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration
+from rsltrace.trace.native import is_native, refuse_native
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.history import History, Marks
@@ -60,6 +61,8 @@ class Session:
         self.side = "diff" if b is not None else "a"
         self.view: View = SingleView(a.count)
         if b is not None:
+            for run in (a, b):
+                refuse_native(run.trace, "its events are at times of their own (see rsltrace diff)")
             from rsltrace_viewer.model.comparison import Comparison
 
             self.view = self.comparison = Comparison(a, b)
@@ -445,14 +448,15 @@ class Session:
         reason = trace.result.get("exit_code", "0")
         if self.b is None and reason != "0":
             parts.append(f"exit code {reason}")
-        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} simulated")
+        how = "of real time" if is_native(trace) else "simulated"
+        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} {how}")
         if self.base_ns:
             began = datetime.fromtimestamp(self.base_ns // NS_PER_S, tz=timezone.utc)
             parts.append(f"from {began:%Y-%m-%d %H:%M:%S} UTC")
         nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
         parts.append(f"{nodes} node{'' if nodes == 1 else 's'}")
         if self.b is None:
-            parts.append(f"digest {trace.digest}")
+            parts.append("native" if is_native(trace) else f"digest {trace.digest}")
         return "  ".join(parts)
 
 

@@ -67,6 +67,12 @@ def compare_messages(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
     return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
 
 
+def compare_content(a: Trace, b: Trace, options: DiffOptions) -> BagDiff:
+    """Compare all messages, requests and responses of two traces, topic by topic and in the order
+    of each, whatever their times. Reads all of both. Raises TraceError where they are damaged."""
+    return _Comparison(source_of(a, services=True), source_of(b, services=True), options).run()
+
+
 class _Comparison:
     def __init__(self, a: Source, b: Source, options: DiffOptions) -> None:
         self._a, self._b = a, b

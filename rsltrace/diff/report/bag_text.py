@@ -54,13 +54,13 @@ def bag_report(
     head = head_lines(diff.sentence, sides, verdict, width, good=good)
     sections = [notes_section(diff.notes, width)]
     if diff.first is not None:
-        sections.append(_message(diff.first, width))
+        sections.append(divergence_section(diff.first, width))
         sections.append(_before(diff.first, width))
-    sections.append(_topics(diff, width))
+    sections.append(topics_section(diff, width))
     if options.everything:
         for topic in diff.topics:
             if topic.first is not None and topic.first is not diff.first:
-                sections.append(_message(topic.first, width))
+                sections.append(divergence_section(topic.first, width))
     sections.append(next_section(diff.next_step, width=width))
     return fitted(head, sections, None if options.everything else height)
 
@@ -75,7 +75,8 @@ def _facts(side: Recording) -> list[Piece]:
     ]
 
 
-def _message(found: MessageDivergence, width: int) -> Section:
+def divergence_section(found: MessageDivergence, width: int) -> Section:
+    """Return what differs in a message."""
     title = f"{printable(found.topic)} ({printable(found.type)})"
     rows: list[Line] = []
     cells = []
@@ -111,7 +112,8 @@ def _brief(message: BagMessage) -> Line:
     return line((head, Style.FAINT), printable(message.preview))
 
 
-def _topics(diff: BagDiff, width: int) -> Section:
+def topics_section(diff: BagDiff, width: int) -> Section:
+    """Return a table of the topics: how many messages of each are equal, and so on."""
     columns = [
         (name, attribute)
         for name, attribute in _COLUMNS

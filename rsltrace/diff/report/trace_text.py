@@ -43,6 +43,11 @@ def trace_report(
     hidden = any(note.endswith(_ALL_HINT) for note in diff.notes)
     # First what else to know of the comparison: that the jobs are different ones, or a file cut.
     before = notes_section([note for note in diff.notes if not note.endswith(_ALL_HINT)], width)
+    if diff.native is not None:
+        from rsltrace.diff.report.native_text import native_sections
+
+        found = native_sections(diff.native, options, width)
+        return fitted(head, [before, *found], None if options.everything else height)
     if not diff.divergences:  # identical, cut, or of different jobs
         return fitted(head, [before, _settings(diff, width)], None)
     # Most runs are identical: their report loads no more than this.
@@ -78,11 +83,14 @@ def _head(diff: Diff, width: int) -> list[Line]:
     if diff.agreeing < 2:
         agree = "the first event agrees" if diff.agreeing else "no event before agrees"
     verdict = "" if diff.identical else f"{diff.verdict.value}; {agree}"
+    if diff.native is not None:
+        verdict = f"{diff.verdict.value}; times are not compared, nor fields named stamp"
     verdict += "; shown is the first effect" if diff.effect is not None else ""
     sides = [_facts(side, width) for side in (diff.a, diff.b)]
-    good = diff.identical or (diff.agrees_until_cut and not diff.failed)
+    same = diff.native is not None and diff.within_tolerance
+    good = diff.identical or same or (diff.agrees_until_cut and not diff.failed)
     lines = head_lines(diff.sentence, sides, verdict, width, good=good)
-    return lines + ([] if diff.identical else _tolerance(diff, width))
+    return lines + ([] if diff.identical or diff.native else _tolerance(diff, width))
 
 
 def _tolerance(diff: Diff, width: int) -> list[Line]:
@@ -106,7 +114,7 @@ def _facts(side: Side, width: int) -> list[Piece]:
         (printable(side.path), ""),
         (f"{side.events} events", ""),
         (f"{time} s", ""),
-        (side.digest if narrow else f"digest {side.digest}", ""),
+        (side.digest if narrow else f"digest {side.digest}" if side.digest else "native", ""),
         (printable(ended), Style.FAINT),
     ]
 

@@ -16,6 +16,7 @@ from rsltrace.diff.result.verdicts import Verdict
 if TYPE_CHECKING:  # most runs are identical: their diff loads no more than it needs
     from rsltrace.diff.result.bags import BagDiff
     from rsltrace.diff.result.divergence import Divergence
+    from rsltrace.diff.result.native import NativeComparison
     from rsltrace.words.entities import EntityKey
 
 
@@ -75,6 +76,10 @@ class Diff:
 
     effect: Divergence | None = None
 
+    native: NativeComparison | None = None
+    """What of the difference is content, order and timing, if a run is native. Events are not
+    aligned then."""
+
     @property
     def shown(self) -> Divergence | None:
         """What a report shows first: the first effect, or else the first divergence."""
@@ -93,6 +98,8 @@ class Diff:
     @property
     def within_tolerance(self) -> bool:
         """Whether the runs are not identical, but every message is within what is tolerated."""
+        if self.native is not None:
+            return self.verdict is Verdict.SAME_CONTENT
         return self.tolerance is not None and not self.tolerance.diverged
 
     @property
@@ -114,5 +121,6 @@ class Diff:
         if self.identical:
             return 0
         if self.agrees_until_cut:
-            return 0 if self.as_far_as_they_go and self.agreeing else EXIT_DIVERGED
+            agrees = self.agreeing or (self.native is not None and self.native.compared)
+            return 0 if self.as_far_as_they_go and agrees else EXIT_DIVERGED
         return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED

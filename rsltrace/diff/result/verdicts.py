@@ -26,6 +26,11 @@ class Verdict(Enum):
     """What chance decided about a message: its delay, whether it is lost."""
     GRAPH = "graph"
     ENVIRONMENT = "environment"
+    SAME_CONTENT = "same-content"
+    """A run is native, and all messages say the same but for times: what differs is timing, and
+    perhaps the order of callbacks."""
+    OTHER_CONTENT = "other-content"
+    """A run is native, and messages say something else, or are missing."""
 
 
 class Root(Enum):

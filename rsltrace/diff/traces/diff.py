@@ -13,6 +13,7 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.sides import side
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 
 
@@ -23,6 +24,10 @@ def diff_traces(a: Trace, b: Trace, options: DiffOptions | None = None) -> Diff:
     """
     options = options or DiffOptions()
     start = first_difference(a, b)
+    if start is not None and (is_native(a) or is_native(b)):
+        from rsltrace.diff.traces.native import compare_native
+
+        return compare_native(a, b, options)
     if start is None and a.complete and b.complete and a.event_count:
         return _identical(a, b)
     # Most runs are compared in the hope that they are identical: those load no more than this.
@@ -46,11 +51,12 @@ def _identical(a: Trace, b: Trace) -> Diff:
         if ended_a != ended_b:
             notes.append(f"{what.replace('_', ' ')}: {ended_a} in a, {ended_b} in b")
     events = a.event_count
+    digest = "" if is_native(a) else f", digest {a.digest}"
     return Diff(
         a=side(a),
         b=side(b),
         verdict=Verdict.IDENTICAL,
-        sentence=f"the two runs are identical: {events} events, digest {a.digest}",
+        sentence=f"the two runs are identical: {events} events{digest}",
         agreeing=events,
         aligned_to=(events, events),
         bytes_read=a.bytes_read + b.bytes_read,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from rsltrace.diff.alignment.first_difference import first_difference
+from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 
 
@@ -35,7 +36,11 @@ def reproduction(a: Trace, b: Trace, again: Trace) -> Reproduction:
     """Say which of two runs ``again`` repeats up to and including the event where they diverge.
 
     What comes after that is not looked at: ``again`` may have been recorded with ``--until``.
+
+    :raises TraceError: if one of them is of a native run, which repeats nothing.
     """
+    for trace in (a, b, again):
+        refuse_native(trace, "it repeats no other run")
     place = first_difference(a, b)
     if place is None:
         same = first_difference(a, again) is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rsltrace.diff.result.traces import Side
 from rsltrace.model.stamp import format_seconds
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 
 
@@ -18,7 +19,7 @@ def side(trace: Trace) -> Side:
     """Return what is said of a run as a whole."""
     return Side(
         path=trace.name,
-        digest=trace.digest,
+        digest="" if is_native(trace) else trace.digest,
         events=trace.event_count,
         end_ns=trace.end_ns,
         complete=trace.complete,

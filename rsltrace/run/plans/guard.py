@@ -27,6 +27,7 @@ from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount, Mode, Source
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
+from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -73,6 +74,7 @@ class RunGuard:
             begin_shared(job.seed)
             if replay is not None:
                 with Trace.open(replay) as trace:
+                    refuse_native(trace, "no answers from outside are in it")
                     kept = [one for found in trace.findings.values() for one in found]
                 self.guard.answers.replay(kept, str(replay))
         world.states.policy = policy_of(job.guard)

@@ -19,6 +19,7 @@ from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
 from rsltrace.loop.search_policies import Departure, Departures, Pct
 from rsltrace.model.event import EventKind
 from rsltrace.run.plans.scheduling import of_order, own_policy
+from rsltrace.trace.native import refuse_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
@@ -52,6 +53,7 @@ def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
     where = locate(job, ("policy", "recorded"))
     try:
         trace = stack.enter_context(Trace.open(job.resolve(path)))
+        refuse_native(trace, "its order is not one that a simulation can follow")
         trace.check()
     except TraceError as error:
         raise JobError(str(error), where=where) from None

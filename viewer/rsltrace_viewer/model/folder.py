@@ -13,6 +13,7 @@ from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
+from rsltrace.trace.native import run_name
 from rsltrace.trace.reader import Trace
 
 _LOOKED_AT_MAX = 200
@@ -64,7 +65,7 @@ def _trace(path: Path) -> Found:
     with Trace.open(path) as trace:
         state = "" if trace.complete else "  not finished"
         length = format_duration(trace.end_ns - trace.start_ns)
-        return Found(path, f"{trace.event_count:,} events", length, f"{trace.digest}{state}")
+        return Found(path, f"{trace.event_count:,} events", length, f"{run_name(trace)}{state}")
 
 
 def _recording(path: Path) -> Found:

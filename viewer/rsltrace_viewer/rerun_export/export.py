@@ -14,6 +14,7 @@ from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.errors import OutputError
 from rsltrace.model.regular_file import in_the_way
+from rsltrace.trace.native import refuse_native, run_name
 from rsltrace.trace.reader import Trace
 from rsltrace_viewer.rerun_export.columns import SIM_TIME, clock_for
 from rsltrace_viewer.rerun_export.distance import Distances, distance_chunks
@@ -52,6 +53,8 @@ def export(
     _check_output(output, traces, force=force)
     with ExitStack() as stack:
         opened = [stack.enter_context(Trace.open(path)) for path in traces]
+        for trace in opened if len(opened) == 2 else ():
+            refuse_native(trace, "its events are at times of their own (see rsltrace diff)")
         diff = diff_traces(opened[0], opened[1]) if len(opened) == 2 else None
         recording = rr.RecordingStream(
             APPLICATION_ID,
@@ -94,7 +97,7 @@ def _send(
     """Send it all; return what is left out."""
     clock = clock_for([trace.start_ns for trace in opened])
     labels = ("",) if len(opened) == 1 else ("a", "b")
-    names = " and ".join(f"{Path(trace.name).name} {trace.digest}" for trace in opened)
+    names = " and ".join(f"{Path(trace.name).name} {run_name(trace)}" for trace in opened)
     recording.send_recording_name(names)
     shown = [
         export_run(trace, label, clock, recording)

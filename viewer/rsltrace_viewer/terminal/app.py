@@ -445,10 +445,13 @@ class ViewerApp(Stepping):
 
 def open_session(a: Path, b: Path | None = None) -> Session:
     """Open one or two traces. Raises TraceError, TraceFormatError."""
-    first = Run.open(a)
+    opened = [Run.open(a)]
     try:
-        return Session(first, Run.open(b) if b is not None else None)
+        if b is not None:
+            opened.append(Run.open(b))
+        return Session(*opened)
     except TraceError:
-        with suppress(OSError):
-            first.close()
+        for run in opened:
+            with suppress(OSError):
+                run.close()
         raise

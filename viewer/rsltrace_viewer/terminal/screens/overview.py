@@ -15,6 +15,7 @@ from textual.widgets import Static
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration
+from rsltrace.trace.native import is_native
 from rsltrace_viewer.model.cells import cells, fit, wrap
 from rsltrace_viewer.model.chains import Chain
 from rsltrace_viewer.model.checks import Checks
@@ -202,7 +203,8 @@ class OverviewScreen(Screen[Choice | None]):
         for title, field, rows in tables:
             yield from self._table(title, field, rows, max(names, _NAMES_LEAST))
             yield (), None
-        if not timed and all(overview.share >= 1 for _, overview in runs):
+        simulated = not is_native(self._session.a.trace)
+        if simulated and not timed and all(overview.share >= 1 for _, overview in runs):
             yield ((_UNTIMED, "muted"),), None
 
     def _chains(self) -> Iterator[_Line]:

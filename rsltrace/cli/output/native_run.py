@@ -1,0 +1,104 @@
+"""``rsltrace record --native``: run, report, and end with the status that follows."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rsltrace.cli.output.watching import interruptible, progress
+from rsltrace.errors import NodeError
+from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace.terminal import say, tell
+
+if TYPE_CHECKING:
+    from rsltrace.cli.output.checks import Checked
+    from rsltrace.job import Job
+    from rsltrace.loop.stop import Stop
+    from rsltrace.native.session import NativeResult
+
+
+def run_native(
+    job: Job,
+    path: Path,
+    *,
+    force: bool,
+    echo: bool,
+    shows: bool,
+    executor: str,
+    domain: int | None,
+    note: Callable[[str], None],
+    begins: Callable[[], None],
+) -> NativeResult:
+    """Run a job natively; ``shows``: its progress, too. ``begins`` is called before it does."""
+    from rsltrace.native.session import run_natively
+    from rsltrace.run import Observer
+
+    shown = progress(quiet=not shows, what="observing", time="of real time")
+    with interruptible() as on_interrupt, shown as on_progress:
+
+        def interrupt(stop: Callable[[Stop], None]) -> None:
+            begins()
+            on_interrupt(stop)
+
+        return run_natively(
+            job,
+            path,
+            force=force,
+            echo=echo,
+            executor=executor,
+            domain_id=domain,
+            observer=Observer(progress=on_progress, interrupt=interrupt, note=note),
+        )
+
+
+def report_native(result: NativeResult, checked: Checked | None, *, as_json: bool) -> None:
+    """Say how a native run went."""
+    error = result.error
+    for note in result.notes:
+        tell(f"note: {note}")
+    if error is not None:
+        if isinstance(error, NodeError) and error.traceback_text:
+            tell(error.traceback_text.rstrip())
+        tell(f"rsltrace: error: {error}")
+    for line in [] if checked is None else checked.lines():
+        tell(line)
+    if as_json:
+        say(json.dumps(_values(result, checked)))
+        return
+    kept = result.kept and f" ({result.kept})"
+    tell(f"wrote {result.path}{kept}: {result.stop_reason}")
+    cost = f"observer {format_duration(result.observer_ns)} per callback"
+    say(f"native  events {result.events}  real {format_seconds(result.duration_ns)}  {cost}")
+
+
+def _values(result: NativeResult, checked: Checked | None) -> dict[str, Any]:
+    return {
+        "native": True,
+        "path": str(result.path),
+        "digest": None,
+        "events": result.events,
+        "duration_ns": result.duration_ns,
+        "observer_ns": result.observer_ns,
+        "pen_ns": result.pen_ns,
+        "stop_reason": result.stop_reason,
+        "exit_code": result.exit_code,
+        "error": None if result.error is None else str(result.error),
+        "stuck": list(result.stuck),
+        **({} if checked is None else checked.values()),
+        "notes": [*result.notes, *([result.kept] if result.kept else [])],
+    }
+
+
+def leave(result: NativeResult, status: int) -> None:
+    """End the process, even where a callback never comes back: its thread would keep it alive."""
+    if result.stuck:
+        for stream in (sys.stdout, sys.stderr):
+            with suppress(OSError, ValueError, AttributeError):
+                stream.flush()
+        os._exit(status)
+    sys.exit(status)

@@ -1,0 +1,222 @@
+"""Two runs of which at least one is native: what of their difference is content, order, timing.
+
+No event of a native run is at the time of another run's, so events are not aligned. Messages are
+compared topic by topic, without the times in them; callbacks by how often, when and in which order
+each ran.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from dataclasses import replace
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.diff.alignment.longest_increasing import longest_increasing
+from rsltrace.diff.bags.comparison import compare_content
+from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.result.bags import BagDiff, Presence, TopicDiff
+from rsltrace.diff.result.native import CallbackTimes, NativeComparison
+from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result.verdicts import Verdict
+from rsltrace.diff.traces.sides import interruptions, side
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.native import Spread, event_columns, is_native, spread
+from rsltrace.trace.reader import Trace
+from rsltrace.words.entities import EntityKey
+
+TIMES = ("stamp", "*.stamp")
+"""Fields that are not compared: what they hold is real time, or was simulated."""
+
+_CALLBACKS = tuple(
+    int(kind)
+    for kind in (
+        EventKind.TIMER,
+        EventKind.SUBSCRIPTION,
+        EventKind.SERVICE,
+        EventKind.CLIENT,
+        EventKind.ACTION,
+        EventKind.GUARD_CONDITION,
+        EventKind.QOS_EVENT,
+    )
+)
+
+
+def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
+    """Return the diff of two runs. Reads all of both.
+
+    Raises TraceError for options that need events to be aligned.
+    """
+    if options.nodes:
+        raise TraceError("events of native runs are not aligned: --topic chooses, --node cannot")
+    content = compare_content(a, b, replace(options, ignore=(*options.ignore, *TIMES)))
+    sides = (_Callbacks(a), _Callbacks(b))
+    compared, moved, first = _order(*sides)
+    tails = tuple(text for topic in content.topics if (text := _tail(topic)))
+    others = [topic for topic in content.topics if _says_something_else(topic)]
+    firsts = [topic.first for topic in others if topic.first is not None]
+    native = tuple(name for name, trace in (("a", a), ("b", b)) if is_native(trace))
+    found = NativeComparison(
+        native,
+        content,
+        bool(others or content.topics_only_a or content.topics_only_b),
+        min(firsts, key=lambda one: one.after_ns, default=None),
+        tails,
+        compared,
+        moved,
+        first,
+        tuple(_times(*sides)),
+    )
+    return Diff(
+        a=side(a),
+        b=side(b),
+        verdict=_verdict(a, b, found),
+        sentence=_sentence(found),
+        agreeing=0,
+        aligned_to=(a.event_count, b.event_count),
+        bytes_read=a.bytes_read + b.bytes_read,
+        notes=(*interruptions(a, b), *_notes(content)),
+        as_far_as_they_go=options.as_far_as_they_go,
+        native=found,
+    )
+
+
+def _notes(content: BagDiff) -> list[str]:
+    return [note for note in content.notes if not note.startswith("log times")]
+
+
+def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
+    if found.differs:
+        return Verdict.OTHER_CONTENT
+    if not (a.complete and b.complete):
+        return Verdict.AS_FAR_AS_THEY_GO
+    return Verdict.SAME_CONTENT
+
+
+def _says_something_else(topic: TopicDiff) -> bool:
+    """Whether more than the order of a topic's messages, or their number at its end, differs.
+
+    Publishers of one topic mix as the moment has it, so that messages change places.
+    """
+    missing = (topic.only_a or topic.only_b) and not _tail(topic)
+    return bool(topic.differing or missing)
+
+
+def _tail(topic: TopicDiff) -> str:
+    """Say how many messages more one run has at the end of a topic, if that is all that differs."""
+    first, more = topic.first, topic.only_a + topic.only_b
+    if first is None or topic.differing or topic.moved or (topic.only_a and topic.only_b):
+        return ""
+    shown = first.a if first.presence is Presence.ONLY_A else first.b
+    if shown is None or shown.index != topic.agreeing:
+        return ""
+    name = "a" if topic.only_a else "b"
+    return f"{topic.topic}: {more} more message{'' if more == 1 else 's'} in {name}, at its end"
+
+
+def _sentence(found: NativeComparison) -> str:
+    which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
+    said = sum(topic.agreeing for topic in found.content.topics)
+    order = (
+        f"{found.moved} of {found.compared} callbacks ran in another order"
+        if found.moved
+        else f"all {found.compared} callbacks that both have ran in the same order"
+    )
+    if found.differs:
+        return f"{which}, and the contents differ{_where(found)}; {order}"
+    return (
+        f"{which}, and the contents are the same but for times: {said} messages on "
+        f"{len(found.content.topics)} topics; {order}"
+    )
+
+
+def _where(found: NativeComparison) -> str:
+    first = found.first
+    if first is None:
+        lone = (*found.content.topics_only_a, *found.content.topics_only_b)
+        return f": only one run has messages on {lone[0].topic}"
+    shown = first.a or first.b
+    text = f", first on {first.topic}"
+    if shown is not None:
+        text += f": message {shown.index} "
+        if first.note:
+            text += "came in another order, and others are missing or differ"
+        elif first.presence is not Presence.BOTH:
+            text += f"is {first.presence.value}"
+        elif first.fields:
+            text += f"has another {first.fields[0].path}"
+        else:
+            text += "differs"
+    return text
+
+
+class _Callbacks:
+    """The callbacks of one run, in the order in which they began."""
+
+    def __init__(self, trace: Trace) -> None:
+        events = event_columns(trace)
+        self._stamps = events["stamp"].astype(np.int64)
+        self._causes = events["cause_event"]
+        keys = _keys(trace)
+        wanted = np.isin(events["kind"], _CALLBACKS)
+        self.places: defaultdict[EntityKey, list[int]] = defaultdict(list)
+        for place, entity in zip(
+            np.flatnonzero(wanted).tolist(), events["entity"][wanted].tolist(), strict=True
+        ):
+            if entity in keys:
+                self.places[keys[entity]].append(place)
+
+    def times(self, key: EntityKey) -> Spread | None:
+        """Return the periods of a timer, or the latencies of what was caused."""
+        places = np.array(self.places.get(key, ()), dtype=np.int64)
+        if key.kind == EntityKind.TIMER.label:
+            return spread(np.diff(self._stamps[places]))
+        causes: npt.NDArray[np.uint64] = self._causes[places]
+        known = causes != NO_EVENT
+        return spread(self._stamps[places[known]] - self._stamps[causes[known].astype(np.int64)])
+
+
+def _keys(trace: Trace) -> dict[int, EntityKey]:
+    """Return what each entity is, whatever its id."""
+    met: Counter[tuple[str, str, str, str]] = Counter()
+    keys = {}
+    for entity in sorted(trace.entities.values(), key=lambda entity: entity.id):
+        node = trace.entities.get(entity.node)
+        name = node.name if node is not None else ""
+        own = (name, entity.kind.label, entity.name, entity.type)
+        keys[entity.id] = EntityKey(*own, met[own])
+        met[own] += 1
+    return keys
+
+
+def _order(a: _Callbacks, b: _Callbacks) -> tuple[int, int, str]:
+    """Return how many callbacks both runs have, how many of them ran in another order, and the
+    first of these in words. The n-th of an entity is compared with the n-th."""
+    pairs: list[tuple[int, int, EntityKey]] = []
+    for key, places in a.places.items():
+        pairs += ((i, j, key) for i, j in zip(places, b.places.get(key, ()), strict=False))
+    pairs.sort(key=lambda pair: pair[0])
+    kept = longest_increasing([j for _, j, _ in pairs])
+    moved = [place for place in range(len(pairs)) if place not in kept]
+    first = ""
+    if moved:
+        i, j, key = pairs[moved[0]]
+        first = f"{key}, event {i} of a and {j} of b"
+    return len(pairs), len(moved), first
+
+
+def _times(a: _Callbacks, b: _Callbacks) -> list[CallbackTimes]:
+    return [
+        CallbackTimes(
+            key,
+            len(a.places.get(key, ())),
+            len(b.places.get(key, ())),
+            "period" if key.kind == EntityKind.TIMER.label else "latency",
+            a.times(key),
+            b.times(key),
+        )
+        for key in dict.fromkeys((*a.places, *b.places))
+    ]

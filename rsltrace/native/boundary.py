@@ -1,0 +1,321 @@
+"""What passes between rclpy and its extension: every message taken or sent, every log record.
+
+The methods of the extension's own classes are wrapped, where a simulation puts classes of its own:
+all of rclpy's Python and all user code run as they are. Each wrapper gives what its method gave.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import wraps
+from typing import Any
+
+from rsltrace.doors.rclpy.wire.codec import codec_for
+from rsltrace.model.event import OutputKind
+from rsltrace.native.ledger import Ledger, Logged, Sent, Taken, now_ns
+from rsltrace.native.patches import patched
+from rsltrace.native.things import Thing, Things
+from rsltrace.trace.chain import hash64
+
+_MESSAGE = int(OutputKind.MESSAGE)
+_REQUEST = int(OutputKind.REQUEST)
+_RESPONSE = int(OutputKind.RESPONSE)
+
+_ACTION_SENDS = {
+    "ActionServer": {
+        "send_goal_response": ("send_goal", _RESPONSE),
+        "send_cancel_response": ("cancel_goal", _RESPONSE),
+        "send_result_response": ("get_result", _RESPONSE),
+        "publish_feedback": ("feedback", _MESSAGE),
+        "publish_status": ("status", _MESSAGE),
+    },
+    "ActionClient": {
+        "send_goal_request": ("send_goal", _REQUEST),
+        "send_cancel_request": ("cancel_goal", _REQUEST),
+        "send_result_request": ("get_result", _REQUEST),
+    },
+}
+_ACTION_TAKES = {
+    "ActionServer": {
+        "take_goal_request": "send_goal",
+        "take_cancel_request": "cancel_goal",
+        "take_result_request": "get_result",
+    },
+    "ActionClient": {
+        "take_goal_response": "send_goal",
+        "take_cancel_response": "cancel_goal",
+        "take_result_response": "get_result",
+        "take_feedback": "feedback",
+        "take_status": "status",
+    },
+}
+
+
+def channel_of(kind: int, name: str) -> str:
+    """Return the name by which what was sent is found again by who takes it."""
+    return f"{kind} {name}"
+
+
+class Boundary:
+    """Tells a ledger of what is sent, and keeps what is taken for the callback that follows."""
+
+    def __init__(self, ledger: Ledger, things: Things) -> None:
+        self._ledger = ledger
+        self._things = things
+        self._local = threading.local()
+        self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
+        """What is told of the messages on a topic, and of their class."""
+        self.unreadable = 0
+        """Messages that could not be written as bytes."""
+
+    def take(self) -> Taken | None:
+        """Return what was taken in this thread since this was asked last."""
+        taken: Taken | None = getattr(self._local, "taken", None)
+        self._local.taken = None
+        return taken
+
+    @contextmanager
+    def watched(self, extension: Any) -> Iterator[None]:
+        """Be told of all that passes meanwhile."""
+        wraps_of: list[tuple[Any, str, Callable[..., Any]]] = [
+            (extension.Publisher, "publish", self._publish),
+            (extension.Publisher, "publish_raw", self._publish),
+            (extension.Subscription, "take_message", self._take_message),
+            (extension.Client, "send_request", self._send_request),
+            (extension.Client, "take_response", self._take_exchange(_RESPONSE)),
+            (extension.Service, "service_take_request", self._take_exchange(_REQUEST)),
+            (extension.Service, "service_send_response", self._send_response),
+            (extension.Timer, "call_timer", self._call_timer),
+            (extension, "rclpy_logging_rcutils_log", self._log),
+        ]
+        for name, sends in _ACTION_SENDS.items():
+            for method, (part, kind) in sends.items():
+                wrap = self._action_sends(part, kind)
+                wraps_of.append((getattr(extension, name), method, wrap))
+        for name, takes in _ACTION_TAKES.items():
+            for method, part in takes.items():
+                wraps_of.append((getattr(extension, name), method, self._action_takes(part)))
+        with ExitStack() as stack:
+            for owner, method, wrap in wraps_of:
+                stack.enter_context(patched(owner, method, wrap))
+            yield
+
+    # -- topics ----------------------------------------------------------------------------------
+
+    def _publish(self, original: Callable[..., None]) -> Callable[..., None]:
+        @wraps(original)
+        def publish(handle: Any, message: Any) -> None:
+            begun_ns = now_ns()
+            thing = self._things.find(handle)
+            sequence = 0 if thing is None else next(thing.sequence)
+            before_ns = time.time_ns()
+            begun_ns -= now_ns()
+            original(handle, message)
+            begun_ns += now_ns()
+            if thing is not None:
+                self._sent(_MESSAGE, thing, message, sequence, before_ns, begun_ns)
+
+        return publish
+
+    def _sent(
+        self, kind: int, thing: Thing, message: Any, sequence: int, before_ns: int, begun_ns: int
+    ) -> None:
+        """Note that a message was sent. ``begun_ns`` is when the observer began, were it not for
+        the time that sending took."""
+        after_ns = time.time_ns()
+        data = self._bytes_of(thing.sends_type, message)
+        digest = hash64(data) if data else 0
+        self._ledger.add(Sent(kind, thing, digest, data, sequence, after_ns, before_ns), begun_ns)
+        if kind == _MESSAGE and (told := self.on_message.get(thing.name)) is not None:
+            told(data, thing.sends_type)
+
+    def _take_message(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def take_message(handle: Any, message_type: Any, raw: bool) -> Any:
+            found = original(handle, message_type, raw)
+            begun_ns = now_ns()
+            thing = self._things.find(handle)
+            if found is not None and thing is not None:
+                message, info = found
+                self._took(
+                    thing,
+                    message,
+                    channel_of(_MESSAGE, thing.name),
+                    info.get("publication_sequence_number") or 0,
+                    info.get("source_timestamp") or 0,
+                    info.get("received_timestamp") or 0,
+                    begun_ns,
+                )
+            return found
+
+        return take_message
+
+    def _took(
+        self,
+        thing: Thing,
+        message: Any,
+        channel: str,
+        sequence: int,
+        source_ns: int,
+        ready_ns: int,
+        begun_ns: int,
+    ) -> None:
+        data = self._bytes_of(thing.takes_type, message)
+        digest = hash64(data) if data else 0
+        earlier: Taken | None = getattr(self._local, "taken", None)
+        if earlier is not None:  # an action may take several at once
+            earlier.input_hash = hash64(digest.to_bytes(8, "little"), earlier.input_hash)
+            return
+        taken = Taken(thing, digest, digest, channel, sequence, source_ns, ready_ns)
+        taken.observer_ns = now_ns() - begun_ns
+        self._local.taken = taken
+
+    def _bytes_of(self, type: Any, message: Any) -> bytes:
+        """Return a message as canonical CDR; nothing of one that cannot be written so."""
+        if message is None:  # the status of goals: rcl makes it
+            return b""
+        codec = codec_for(type)
+        try:
+            if isinstance(message, (bytes, bytearray, memoryview)):
+                return codec.canonical(bytes(message))
+            return codec.serialize(message)
+        except Exception:  # whatever it is, it is no concern of the node's
+            self.unreadable += 1
+            return b""
+
+    # -- services --------------------------------------------------------------------------------
+
+    def _send_request(self, original: Callable[..., int]) -> Callable[..., int]:
+        @wraps(original)
+        def send_request(handle: Any, request: Any) -> int:
+            thing, before_ns = self._things.find(handle), time.time_ns()
+            sequence = original(handle, request)
+            if thing is not None:
+                self._sent(_REQUEST, thing, request, sequence, before_ns, now_ns())
+            return sequence
+
+        return send_request
+
+    def _send_response(self, original: Callable[..., None]) -> Callable[..., None]:
+        @wraps(original)
+        def send_response(handle: Any, response: Any, request_id: Any) -> None:
+            thing, before_ns = self._things.find(handle), time.time_ns()
+            original(handle, response, request_id)
+            if thing is not None:
+                sequence = request_id.sequence_number
+                self._sent(_RESPONSE, thing, response, sequence, before_ns, now_ns())
+
+        return send_response
+
+    def _take_exchange(self, kind: int) -> Callable[..., Any]:
+        """Wrap what takes a request or a response: it gives message and header in some order."""
+
+        def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
+            @wraps(original)
+            def take(handle: Any, type: Any) -> Any:
+                found = original(handle, type)
+                begun_ns = now_ns()
+                message, header = found if kind == _REQUEST else reversed(found)
+                thing = self._things.find(handle)
+                if header is not None and thing is not None:
+                    self._took(
+                        thing,
+                        message,
+                        channel_of(kind, thing.name),
+                        header.request_id.sequence_number,
+                        header.source_timestamp,
+                        header.received_timestamp,
+                        begun_ns,
+                    )
+                return found
+
+            return take
+
+        return wrapping
+
+    # -- actions ---------------------------------------------------------------------------------
+
+    def _action_sends(self, part: str, kind: int) -> Callable[..., Any]:
+        def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
+            @wraps(original)
+            def send(handle: Any, *words: Any) -> Any:
+                parts, before_ns = self._things.parts.get(handle), time.time_ns()
+                given = original(handle, *words)
+                if parts is not None:
+                    thing = parts[part]
+                    # A request gives its number; a response is given the one it answers.
+                    if kind == _MESSAGE:  # who takes it learns no number
+                        sequence = 0
+                    else:
+                        sequence = given if kind == _REQUEST else words[0].sequence_number
+                    message = words[-1] if words else None  # a status is made by rcl
+                    self._sent(kind, thing, message, sequence, before_ns, now_ns())
+                return given
+
+            return send
+
+        return wrapping
+
+    def _action_takes(self, part: str) -> Callable[..., Any]:
+        def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
+            @wraps(original)
+            def take(handle: Any, type: Any) -> Any:
+                found = original(handle, type)
+                begun_ns = now_ns()
+                parts = self._things.parts.get(handle)
+                header, message = found if isinstance(found, tuple) else (None, found)
+                if message is not None and parts is not None:
+                    thing = parts[part]
+                    kind = _MESSAGE if header is None else _REQUEST
+                    if isinstance(header, int):
+                        kind = _RESPONSE
+                    number = getattr(header, "sequence_number", header) or 0
+                    channel = channel_of(kind, thing.name)
+                    self._took(thing, message, channel, number, 0, 0, begun_ns)
+                return found
+
+            return take
+
+        return wrapping
+
+    # -- timers and logs -------------------------------------------------------------------------
+
+    def _call_timer(self, original: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(original)
+        def call_timer(handle: Any) -> Any:
+            begun_ns = now_ns()
+            thing = self._things.find(handle)
+            if thing is not None:
+                due_ns = time.time_ns() + min(handle.time_until_next_call() or 0, 0)
+                taken = Taken(thing, ready_ns=due_ns)
+                taken.observer_ns = now_ns() - begun_ns
+                self._local.taken = taken
+            return original(handle)
+
+        return call_timer
+
+    def _log(self, original: Callable[..., None]) -> Callable[..., None]:
+        @wraps(original)
+        def log(
+            severity: int, name: str, message: Any, function: str, file: str, line: int
+        ) -> None:
+            original(severity, name, message, function, file, line)
+            begun_ns = now_ns()
+            thing = self._logger(name)
+            if thing is not None:
+                text = str(message).encode(errors="backslashreplace").decode()
+                self._ledger.add(
+                    Logged(thing, int(severity), name, text, function, file, line), begun_ns
+                )
+
+        return log
+
+    def _logger(self, name: str) -> Thing | None:
+        """Return the /rosout of the node whose logger, or child of a logger, has this name."""
+        rosout = self._things.rosout
+        while name and name not in rosout:
+            name = name.rpartition(".")[0]
+        return rosout.get(name)

@@ -1,0 +1,69 @@
+"""A DDS domain of one's own on this machine, so that nobody else's nodes take part."""
+
+from __future__ import annotations
+
+import os
+import random
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rsltrace.errors import SetupError
+
+DOMAIN_MAX = 101
+"""The largest whose ports lie below those that Linux gives to anybody (RTPS 2.2, 9.6.1.1)."""
+
+
+@contextmanager
+def domain(given: int | None) -> Iterator[int]:
+    """Take part in the given domain as the environment says, or alone in a free one.
+
+    A free one is this machine's only: no message leaves it.
+
+    :raises SetupError: if all domains are taken.
+    """
+    names = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY")
+    before = {name: os.environ.get(name) for name in names}
+    with _free(given) as number:
+        os.environ["ROS_DOMAIN_ID"] = str(number)
+        if given is None:
+            os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+            os.environ.pop("ROS_LOCALHOST_ONLY", None)
+        try:
+            yield number
+        finally:
+            for name, value in before.items():
+                if value is None:
+                    os.environ.pop(name, None)
+                else:
+                    os.environ[name] = value
+
+
+@contextmanager
+def _free(given: int | None) -> Iterator[int]:
+    if given is not None:
+        yield given
+        return
+    for number in random.SystemRandom().sample(range(1, DOMAIN_MAX + 1), DOMAIN_MAX):
+        # Another recording may be looking, too: a name in the kernel is only one's.
+        with socket.socket(socket.AF_UNIX) as claim:
+            try:
+                claim.bind(f"\0rsltrace native domain {number}")
+            except OSError:
+                continue
+            if _is_quiet(number):
+                yield number
+                return
+    raise SetupError(
+        f"all DDS domains from 1 to {DOMAIN_MAX} are in use on this machine; choose one (--domain)"
+    )
+
+
+def _is_quiet(number: int) -> bool:
+    """Whether nobody on this machine listens where the first participant of a domain would."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("", 7400 + 250 * number + 10))
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,247 @@
+"""What callbacks do, in the order in which they began, whichever thread ran them.
+
+A callback is one *span*, or several: where it awaits, or spins, another one runs in between. Spans
+are kept in the order of their starts until all that began before is over, so that what caused a
+callback always comes before it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from dataclasses import dataclass, field
+
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import EventFlag, EventKind
+from rsltrace.native.things import Thing
+
+now_ns = time.monotonic_ns
+_SUSPENDED = int(EventFlag.SUSPENDED)
+_RAISED = int(EventFlag.RAISED)
+
+
+@dataclass(slots=True)
+class Sent:
+    """A message, request or response that was sent. ``sequence`` is counted by its sender; it left
+    between two times of the system clock. ``data`` is canonical CDR."""
+
+    kind: int
+    thing: Thing
+    digest: int
+    data: bytes
+    sequence: int
+    after_ns: int
+    before_ns: int
+
+
+@dataclass(slots=True)
+class Logged:
+    """A log record, and the publisher of /rosout that it went to."""
+
+    thing: Thing
+    severity: int
+    name: str
+    text: str
+    function: str
+    file: str
+    line: int
+
+
+@dataclass(slots=True)
+class Failed:
+    """An exception that came out of a callback."""
+
+    kind: str
+    said: str
+    traceback: str
+
+
+@dataclass(slots=True)
+class Scheduled:
+    """A task that was made."""
+
+
+Output = Sent | Logged | Failed | Scheduled | Entity
+
+
+@dataclass(slots=True)
+class Taken:
+    """What a callback got. ``source_ns`` and ``ready_ns`` are system clock; 0 where unknown.
+
+    Of several messages that an action takes at once all but ``input_hash`` is of the first.
+    """
+
+    thing: Thing
+    digest: int = 0
+    input_hash: int = 0
+    channel: str = ""
+    sequence: int = 0
+    source_ns: int = 0
+    ready_ns: int = 0
+    observer_ns: int = 0
+
+
+@dataclass(slots=True)
+class Span:
+    """A callback, or a part of it up to where something else ran. ``start_ns`` and ``end_ns`` are
+    of the steady clock, ``wall_ns`` of the system clock; ``cause`` is a span and which of its
+    outputs."""
+
+    kind: int
+    thing: Thing | None
+    start_ns: int
+    wall_ns: int
+    thread: int
+    owner: Callback | None
+    taken: Taken | None = None
+    cause: tuple[Span, int] | None = None
+    flags: int = 0
+    end_ns: int = 0
+    observer_ns: int = 0
+    outputs: list[Output] = field(default_factory=list)
+    index: int = -1
+    """Which event of the trace it has become; -1 until then."""
+
+
+@dataclass(slots=True)
+class Callback:
+    """A callback under way. ``span`` is None while another one runs in its thread."""
+
+    thing: Thing | None
+    span: Span | None = None
+
+
+class Ledger:
+    """Takes what happens, from any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._spans: deque[Span] = deque()
+        self._local = threading.local()
+        self._threads = 0
+        self.count = 0
+        """How many spans are over."""
+        self.activity_ns = 0
+        """When something was last sent, steady."""
+
+    def begin(
+        self,
+        kind: int,
+        thing: Thing | None,
+        taken: Taken | None = None,
+        cause: tuple[Span, int] | None = None,
+    ) -> Callback:
+        """Note that a callback begins in this thread; what ran there is suspended."""
+        stack = self._stack()
+        if stack:
+            self._suspend(stack[-1])
+        callback = Callback(thing)
+        stack.append(callback)
+        with self._lock:
+            callback.span = self._open(kind, thing, callback)
+            callback.span.taken, callback.span.cause = taken, cause
+            if taken is not None:
+                callback.span.observer_ns = taken.observer_ns
+        return callback
+
+    def suspend(self) -> None:
+        """Note that the callback awaits something, and goes on with ``resume``."""
+        callback = self._stack().pop()
+        self._suspend(callback)
+
+    def resume(self, callback: Callback) -> None:
+        """Note that a callback goes on that awaited something.
+
+        It is an event once something comes of it: rclpy asks callbacks that wait again and again.
+        """
+        stack = self._stack()
+        if stack:
+            self._suspend(stack[-1])
+        stack.append(callback)
+
+    def end(self, failure: Failed | None = None) -> None:
+        """Note that the callback that runs in this thread is over."""
+        if failure is not None:
+            self.add(failure)
+        callback = self._stack().pop()
+        with self._lock:
+            if callback.span is not None:
+                callback.span.flags |= _RAISED if failure is not None else 0
+                self._close(callback.span)
+                callback.span = None
+
+    def add(self, output: Output, begun_ns: int = 0) -> tuple[Span, int]:
+        """Add an output of what runs in this thread; return where it is.
+
+        Outside of all callbacks (a thread of the user's) it is an event of its own. ``begun_ns`` is
+        when the observer began with it.
+        """
+        stack = self._stack()
+        with self._lock:
+            if not stack:
+                span = self._open(int(EventKind.OUTSIDE), None, None)
+                self._close(span)
+            elif (found := stack[-1].span) is not None:
+                span = found
+            else:
+                callback = stack[-1]
+                span = self._open(int(EventKind.RESUME), callback.thing, callback)
+                callback.span = span
+            span.outputs.append(output)
+            if type(output) is Sent:
+                self.activity_ns = now_ns()
+            if begun_ns:
+                span.observer_ns += now_ns() - begun_ns
+            return span, len(span.outputs) - 1
+
+    def current(self) -> Callback | None:
+        """Return the callback that runs in this thread."""
+        stack = self._stack()
+        return stack[-1] if stack else None
+
+    def finished(self, patience_ns: int | None) -> list[Span]:
+        """Take the spans before which all is over, in order.
+
+        One that goes on for longer than ``patience_ns`` is cut in two: it must not keep all others
+        from the file. None takes everything, as it is.
+        """
+        with self._lock:
+            spans, taken = self._spans, []
+            while spans:
+                first = spans[0]
+                if not first.end_ns:
+                    if patience_ns is not None and now_ns() - first.start_ns < patience_ns:
+                        break
+                    first.flags |= _SUSPENDED
+                    self._close(first)
+                    if first.owner is not None:
+                        first.owner.span = None
+                taken.append(spans.popleft())
+            return taken
+
+    def _stack(self) -> list[Callback]:
+        try:
+            stack: list[Callback] = self._local.stack
+        except AttributeError:
+            stack = self._local.stack = []
+            with self._lock:
+                self._threads += 1
+                self._local.thread = self._threads
+        return stack
+
+    def _suspend(self, callback: Callback) -> None:
+        with self._lock:
+            if callback.span is not None:
+                callback.span.flags |= _SUSPENDED
+                self._close(callback.span)
+                callback.span = None
+
+    def _open(self, kind: int, thing: Thing | None, owner: Callback | None) -> Span:
+        span = Span(kind, thing, now_ns(), time.time_ns(), self._local.thread, owner)
+        self._spans.append(span)
+        return span
+
+    def _close(self, span: Span) -> None:
+        span.end_ns = now_ns()
+        self.count += 1

@@ -1,0 +1,192 @@
+"""Writing spans down as the events of a trace, in a thread of its own."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from array import array
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from rsltrace.doors.rclpy.wire.codec import codec_for
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import NO_EVENT, OutputKind
+from rsltrace.model.stamp import NS_PER_S
+from rsltrace.native.causes import Causes
+from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span
+from rsltrace.native.things import Thing
+from rsltrace.trace.cdr import log_content
+from rsltrace.trace.chain import hash64
+from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TIMING
+from rsltrace.trace.recorder import Recorder
+
+_EVERY_S = 0.05
+_PATIENCE_NS = 2 * NS_PER_S
+"""A callback that goes on for longer is written in parts."""
+
+_PREFIX = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPONSE}
+
+
+@dataclass(frozen=True, slots=True)
+class Clocks:
+    """The system clock and the steady one at one moment, in nanoseconds.
+
+    Stamps of a trace are system time as the steady clock carries it on: it never goes back.
+    """
+
+    wall_ns: int
+    steady_ns: int
+
+    @classmethod
+    def now(cls) -> Clocks:
+        """Read both."""
+        return cls(time.time_ns(), time.monotonic_ns())
+
+    def stamp(self, steady_ns: int) -> int:
+        """Return the system time of a reading of the steady clock."""
+        return self.wall_ns + steady_ns - self.steady_ns
+
+
+class Pen(threading.Thread):
+    """Takes spans from a ledger and writes them, until it is told to finish."""
+
+    def __init__(self, ledger: Ledger, recorder: Recorder, clocks: Clocks, base_dir: Path) -> None:
+        super().__init__(name="rsltrace pen", daemon=True)
+        self._ledger = ledger
+        self._recorder = recorder
+        self._clocks = clocks
+        self._base_dir = base_dir
+        self._over = threading.Event()
+        self.causes = Causes()
+        self.error: BaseException | None = None
+        """Why nothing is written any more."""
+        self._observer_ns = array("Q")
+        self.cpu_ns = 0
+        """Processor time of this thread."""
+
+    @property
+    def observer_ns(self) -> int:
+        """The median of what observing a callback took in its thread."""
+        return int(np.median(self._observer_ns)) if self._observer_ns else 0
+
+    def run(self) -> None:
+        try:
+            while not self._over.wait(_EVERY_S):
+                self.write(_PATIENCE_NS)
+        except BaseException as error:
+            self.error = error
+        self.cpu_ns = time.thread_time_ns()
+
+    def finish(self) -> None:
+        """Write what is left. Nothing must begin any more.
+
+        :raises OutputError: the trace cannot be written.
+        """
+        self._over.set()
+        self.join()
+        if self.error is not None:
+            raise self.error
+        self.write(None)
+
+    def write(self, patience_ns: int | None) -> None:
+        """Write the spans that are over."""
+        for span in self._ledger.finished(patience_ns):
+            self._write(span)
+
+    def _write(self, span: Span) -> None:
+        recorder = self._recorder
+        span.index = index = recorder.index
+        stamp_ns = self._clocks.stamp(span.start_ns)
+        for position, output in enumerate(span.outputs):
+            if isinstance(output, Sent):
+                self._sent(output, stamp_ns)
+                self.causes.sent(output, index, position)
+            elif isinstance(output, Entity):
+                recorder.entity(replace(output, created_ns=stamp_ns))
+            elif isinstance(output, Logged):
+                self._logged(output, stamp_ns)
+            elif isinstance(output, Failed):
+                entity = 0 if span.thing is None else span.thing.id
+                digest = hash64(f"{output.kind}\0{output.said}".encode())
+                recorder.detail(OutputKind.EXCEPTION, entity, stamp_ns, output.traceback, digest)
+            else:
+                assert isinstance(output, Scheduled)
+                recorder.output(OutputKind.TASK, 0 if span.thing is None else span.thing.id, 0)
+        cause_event, cause_output = NO_EVENT, 0
+        taken = span.taken
+        if taken is not None:
+            cause_event, cause_output = self.causes.of(taken)
+        elif span.cause is not None and span.cause[0].index >= 0:
+            cause_event, cause_output = span.cause[0].index, span.cause[1]
+        self._timing(span, index, stamp_ns)
+        self._observer_ns.append(span.observer_ns)
+        recorder.end_event(
+            stamp_ns,
+            span.kind,
+            span.flags,
+            0 if span.thing is None else span.thing.id,
+            cause_event,
+            cause_output,
+            0 if taken is None else taken.input_hash,
+        )
+
+    def _timing(self, span: Span, index: int, stamp_ns: int) -> None:
+        taken = span.taken
+        packed = TIMING.pack(
+            index,
+            span.start_ns,
+            span.wall_ns,
+            span.end_ns - span.start_ns,
+            span.observer_ns,
+            0 if taken is None else taken.source_ns,
+            0 if taken is None else taken.ready_ns,
+            0 if taken is None else taken.sequence,
+            span.thread,
+        )
+        self._recorder.writer.add_timing(packed, stamp_ns)
+
+    def _sent(self, sent: Sent, stamp_ns: int) -> None:
+        prefix = _PREFIX.get(OutputKind(sent.kind), "")
+        channel = self._channel(sent.thing, prefix) if sent.data else -1
+        self._recorder.message(sent.kind, sent.thing.id, channel, stamp_ns, sent.data, sent.digest)
+
+    def _channel(self, thing: Thing, prefix: str) -> int:
+        if thing.channel is None:
+            thing.channel = -1
+            topic, recorder = prefix + thing.name, self._recorder
+            if thing.sends is not None and recorder.keep_payload(topic):
+                text, type_hash = thing.sends.describe()
+                thing.channel = recorder.writer.add_channel(
+                    topic,
+                    thing.sends.name,
+                    text,
+                    qos_yaml=thing.qos_yaml,
+                    type_hash="" if prefix else type_hash,
+                )
+        return thing.channel
+
+    def _logged(self, logged: Logged, stamp_ns: int) -> None:
+        record = logged.thing.sends_type(
+            level=logged.severity,
+            name=logged.name,
+            msg=logged.text,
+            file=self._portable(logged.file),
+            function=logged.function,
+            line=logged.line,
+        )
+        record.stamp.sec, record.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
+        data = codec_for(logged.thing.sends_type).serialize(record)
+        channel = self._channel(logged.thing, "")
+        self._recorder.message(
+            OutputKind.LOG, logged.thing.id, channel, stamp_ns, data, hash64(log_content(data))
+        )
+
+    def _portable(self, file: str) -> str:
+        path = Path(file)
+        for base in (self._base_dir, Path(sys.prefix)):
+            if path.is_relative_to(base):
+                return str(path.relative_to(base))
+        return path.name

@@ -1,0 +1,91 @@
+"""The entities of a native run: what a trace says of them, found again by rclpy's handles.
+
+They are named as in a simulated run, so that the two can be compared.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import count
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from rsltrace.middleware.entity import callback_name
+from rsltrace.middleware.interface import MessageType
+from rsltrace.middleware.source_position import source_of
+from rsltrace.model.entity import Entity, EntityKind
+
+
+@dataclass(slots=True)
+class Thing:
+    """An entity under observation.
+
+    ``sends`` and ``takes`` say of what types its messages are; ``sequence`` counts what it has
+    sent. ``node`` is its node's id.
+    """
+
+    id: int
+    node: int
+    kind: EntityKind
+    name: str
+    sends: MessageType | None = None
+    sends_type: Any = None
+    takes_type: Any = None
+    qos_yaml: str = ""
+    sequence: count[int] = field(default_factory=lambda: count(1))
+    channel: int | None = None
+    """That of the trace, once something has been written to it."""
+
+
+class Things:
+    """Gives out ids, and finds what belongs to one of rclpy's handles or wrappers."""
+
+    def __init__(self, tell: Callable[[Entity], object]) -> None:
+        self._tell = tell
+        self._ids = count(1)
+        self._lock = threading.Lock()
+        self._of: WeakKeyDictionary[Any, Thing] = WeakKeyDictionary()
+        self.parts: WeakKeyDictionary[Any, dict[str, Thing]] = WeakKeyDictionary()
+        """The services and topics that an end of an action has, by name."""
+        self.rosout: dict[str, Thing] = {}
+        """The publishers of /rosout by the names of loggers."""
+
+    def find(self, handle: Any) -> Thing | None:
+        """Return what belongs to a handle or wrapper; None if nobody has told of it."""
+        return self._of.get(handle)
+
+    def add(
+        self,
+        keys: tuple[Any, ...],
+        node: Thing | None,
+        kind: EntityKind,
+        name: str,
+        type_name: str = "",
+        *,
+        runs: object = None,
+        **detail: object,
+    ) -> Thing:
+        """Make an entity that ``keys`` lead to, and tell the trace of it as an output.
+
+        ``runs`` is the function that its events run.
+        """
+        with self._lock:
+            number = next(self._ids)
+        owner = number if kind is EntityKind.NODE else 0 if node is None else node.id
+        thing = Thing(number, owner, kind, name)
+        for key in keys:
+            self._of[key] = thing
+        if source := source_of(runs):
+            detail["source"] = source
+        self._tell(Entity(number, owner, kind, name, type_name, 0, detail))
+        return thing
+
+    def unnamed(self, wrapper: Any, kind: EntityKind) -> Thing:
+        """Return the thing of a wrapper that nobody has told of (an event handler, say)."""
+        found = self._of.get(wrapper)
+        if found is not None:
+            return found
+        name = callback_name(getattr(wrapper, "callback", None)) or type(wrapper).__qualname__
+        return self.add((wrapper,), None, kind, name, runs=getattr(wrapper, "callback", None))

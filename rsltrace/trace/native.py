@@ -1,0 +1,182 @@
+"""Traces of native runs: when each callback really ran, and what that says of latencies.
+
+A native run was observed on rclpy's own executors in real time. It has no digest that another run
+could repeat; what it has, and a simulated run has not, are the times of the callbacks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import NO_EVENT
+from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING_DTYPE, TOPIC_TIMINGS
+from rsltrace.trace.reader import Trace
+
+_SUBSCRIPTION_INPUT = (EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
+
+
+def is_native(trace: Trace) -> bool:
+    """Whether a trace is of a native run."""
+    return trace.metadata(METADATA_NATIVE).get("mode") == "native"
+
+
+def run_name(trace: Trace) -> str:
+    """Return what names a run in short: its digest, or that it is native."""
+    return "native" if is_native(trace) else trace.digest
+
+
+def refuse_native(trace: Trace, what: str) -> None:
+    """Raise TraceError if a trace is of a native run, of which there is no ``what``."""
+    if is_native(trace):
+        raise TraceError(
+            f"{trace.name} is of a native run: it was observed, not simulated, so {what}; record "
+            "the job without --native for a run that repeats"
+        )
+
+
+def timings(trace: Trace) -> npt.NDArray[np.void]:
+    """Return when each event ran: TIMING_DTYPE, shape (events,); empty for a simulated run.
+
+    :raises TraceError: if that is not what the trace holds.
+    """
+    rows = bytearray()
+    for _, _, data in trace.messages(TOPIC_TIMINGS):
+        if data[:4] != CDR_HEADER or len(data) != 4 + TIMING_DTYPE.itemsize:
+            raise TraceError(f"{trace.name}: a timing in it cannot be read")
+        rows += data[4:]
+    found = np.frombuffer(bytes(rows), TIMING_DTYPE)[: trace.event_count]  # of a run that was cut
+    if len(found) and (
+        len(found) != trace.event_count
+        or not np.array_equal(found["event"], np.arange(len(found), dtype=np.uint64))
+    ):
+        raise TraceError(f"{trace.name}: its timings are not those of its events")
+    return found
+
+
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """Some durations in nanoseconds: how many, their median, 95 % quantile and maximum."""
+
+    count: int
+    median_ns: int
+    p95_ns: int
+    max_ns: int
+
+
+def spread(values: npt.NDArray[np.int64]) -> Spread | None:
+    """Return the spread of durations, None of none."""
+    if not len(values):
+        return None
+    median, p95 = np.quantile(values, (0.5, 0.95)).astype(np.int64).tolist()
+    return Spread(len(values), median, p95, int(values.max()))
+
+
+@dataclass(frozen=True, slots=True)
+class CallbackFigures:
+    """How the callbacks of one entity ran.
+
+    ``duration`` is from start to end of each (or of its parts), ``wait`` from when it was ready,
+    ``latency`` from when its input was sent. ``jitter`` is by how much the time between two calls
+    of a timer is not its period. ``lost`` counts numbers that are missing between those that
+    came, where messages are numbered and their publisher is known.
+    """
+
+    entity: Entity
+    duration: Spread
+    wait: Spread | None
+    latency: Spread | None
+    jitter: Spread | None
+    lost: int | None
+
+
+def callback_figures(trace: Trace) -> list[CallbackFigures]:
+    """Return the figures of all entities of a native run that ran a callback, by id."""
+    rows = timings(trace)
+    if not len(rows):
+        return []
+    events = event_columns(trace)
+    senders = _senders(trace, events)
+    figures = []
+    for number in np.unique(events["entity"]).tolist():
+        entity = trace.entity(number)
+        if number == 0 or entity.kind is EntityKind.NODE:
+            continue
+        mine = events["entity"] == number
+        own = rows[mine]
+        duration = spread(own["duration"].astype(np.int64))
+        assert duration is not None
+        inputs = entity.kind in _SUBSCRIPTION_INPUT
+        figures.append(
+            CallbackFigures(
+                entity,
+                duration,
+                _since(own, "ready"),
+                _since(own, "source") if inputs else None,
+                _jitter(entity, own),
+                _lost(own["sequence"], senders[mine])
+                if entity.kind is EntityKind.SUBSCRIPTION
+                else None,
+            )
+        )
+    return figures
+
+
+def busy_threads(trace: Trace) -> dict[int, float]:
+    """Return which part of the run the callbacks in each thread took, between 0 and 1."""
+    rows = timings(trace)
+    if not len(rows):
+        return {}
+    ends = rows["steady"] + rows["duration"]
+    whole = max(int(ends.max() - rows["steady"].min()), 1)
+    return {
+        thread: float(rows["duration"][rows["thread"] == thread].sum()) / whole
+        for thread in np.unique(rows["thread"]).tolist()
+    }
+
+
+def event_columns(trace: Trace) -> npt.NDArray[np.void]:
+    """Return the columns of all events that say when what ran, and because of what."""
+    names = ["stamp", "entity", "kind", "cause_event", "cause_output", "outputs"]
+    parts = [events[names] for events in trace.events()]
+    return np.concatenate(parts) if parts else np.zeros(0, [(n, np.uint64) for n in names])
+
+
+def _senders(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
+    """Return who sent the input of each event, -1 where that is unknown."""
+    parts = [outputs["entity"] for outputs in trace.outputs()]
+    entities = np.concatenate(parts) if parts else np.zeros(0, np.uint32)
+    firsts = np.cumsum(events["outputs"], dtype=np.int64) - events["outputs"]
+    known = events["cause_event"] != NO_EVENT
+    senders = np.full(len(events), -1, np.int64)
+    causes = events["cause_event"][known].astype(np.int64)
+    places = firsts[causes] + events["cause_output"][known]
+    senders[known] = entities[places]
+    return senders
+
+
+def _since(rows: npt.NDArray[np.void], column: str) -> Spread | None:
+    known = rows[rows[column] != 0]
+    return spread(known["wall"].astype(np.int64) - known[column].astype(np.int64))
+
+
+def _jitter(entity: Entity, rows: npt.NDArray[np.void]) -> Spread | None:
+    period = entity.detail.get("period_ns")
+    if entity.kind is not EntityKind.TIMER or not isinstance(period, int):
+        return None
+    return spread(np.abs(np.diff(rows["steady"].astype(np.int64)) - period))
+
+
+def _lost(sequences: npt.NDArray[np.uint64], senders: npt.NDArray[np.int64]) -> int | None:
+    known = (sequences != 0) & (senders >= 0)
+    if not known.any():
+        return None
+    lost = 0
+    for sender in np.unique(senders[known]).tolist():
+        numbers = np.unique(sequences[known & (senders == sender)].astype(np.int64))
+        lost += int(numbers[-1] - numbers[0]) + 1 - len(numbers)
+    return lost
