@@ -15,6 +15,9 @@ from rsltrace.native.ledger import Sent, Taken
 KEPT = 200_000
 """Messages sent that are remembered: what comes later than after so many has no known cause."""
 
+SLACK_NS = 1_000_000
+"""How far the middleware's clock may be from ours."""
+
 _Key = tuple[str, int, int]
 _Place = tuple[int, int, int, int]
 
@@ -48,7 +51,11 @@ class Causes:
         for event, output, before_ns, after_ns in places:
             if before_ns <= taken.source_ns <= after_ns:
                 return event, output
-        if len(places) == 1 or (places and not taken.source_ns):
+        if places and not taken.source_ns:  # of actions, which do not tell when
             return places[-1][:2]
+        if len(places) == 1:
+            event, output, before_ns, after_ns = places[0]
+            if before_ns - SLACK_NS <= taken.source_ns <= after_ns + SLACK_NS:
+                return event, output
         self.unknown += 1
         return NO_EVENT, 0

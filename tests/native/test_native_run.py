@@ -59,6 +59,16 @@ def events_of(trace: Trace) -> list[Any]:
     return [trace.event(index) for index in range(trace.event_count)]
 
 
+def outputs_on(trace: Trace, node: str, topic: str) -> list[Any]:
+    (sender,) = [
+        entity.id
+        for entity in trace.entities.values()
+        if (trace.node_of(entity).name, entity.name) == (node, topic)
+    ]
+    outputs = [o for event in events_of(trace) for o in trace.outputs_of(event.index)]
+    return [output for output in outputs if output.entity == sender and output.kind == 1]
+
+
 GRAPH = """
 nodes:
   - {node: robot:Talker, arguments: {offset: 0}, parameters: {period: 0.01}, name: fast}
@@ -134,6 +144,11 @@ def test_the_causes_are_right(graph: tuple[Trace, str]) -> None:
         assert output.hash == event.input_hash
         assert trace.entity(output.entity).name == entity.name
         taken[entity.name, event.cause_event, event.cause_output] += 1
+    # Nothing that the fast talker did is missing: it counts.
+    payloads = [trace.payload(output) for output in outputs_on(trace, "/fast", "/numbers")]
+    messages: list[Any] = [trace.decode("/numbers", found[2]) for found in payloads if found]
+    counted = [message.data for message in messages]
+    assert counted == list(range(len(counted)))
     by_topic = Counter(name for name, _, _ in taken)
     assert by_topic["/numbers"] > 50
     assert by_topic["/same"] > 50

@@ -121,9 +121,9 @@ def _sentence(found: NativeComparison) -> str:
     which = "both runs are native" if len(found.native) == 2 else f"{found.native[0]} is native"
     said = sum(topic.agreeing for topic in found.content.topics)
     order = (
-        f"{found.moved} of {found.compared} callbacks ran in another order"
+        f"{found.moved} of the {found.compared} callbacks of both began in another order"
         if found.moved
-        else f"all {found.compared} callbacks that both have ran in the same order"
+        else f"the {found.compared} callbacks of both began in the same order"
     )
     if found.differs:
         return f"{which}, and the contents differ{_where(found)}; {order}"
