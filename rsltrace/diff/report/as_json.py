@@ -35,6 +35,8 @@ def as_json(diff: Diff | BagDiff) -> dict[str, Any]:
     result["failed"] = diff.failed
     result["within_tolerance"] = diff.within_tolerance
     if isinstance(diff, Diff):
+        if diff.native is None:
+            del result["native"]
         result["tolerance"] = None if diff.tolerance is None else as_json(diff.tolerance)
         result["resync_index"] = _sides(diff.resync_index)
         result["aligned_to"] = _sides(diff.aligned_to)
