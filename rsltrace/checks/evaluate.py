@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from rsltrace.checks.conditions import compared, condition, opposite, plain, topic_of
 from rsltrace.checks.functions import violations
-from rsltrace.checks.latency import LatencyResult, check_latency, latency_title
+from rsltrace.checks.latency import Known, LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
 from rsltrace.checks.trace_events import TraceEvent, events_of
 from rsltrace.debug.conditions.condition import Armed, Condition
@@ -125,13 +125,14 @@ def evaluating(
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
     results = []
+    known: Known = {}
     for spec, held_one in zip(job.checks, held, strict=True):
         if held_one is not None:
             results.append(_result(spec, held_one))
         elif spec.latency is None:
             results.append(_of_function(trace, spec, load))
         else:
-            for found in check_latency(trace, spec.latency):
+            for found in check_latency(trace, spec.latency, known):
                 if found is None:
                     yield []
                 else:

@@ -42,16 +42,28 @@ def latency_title(spec: LatencySpec) -> str:
     return f"{_WORDS[spec.measure]} of {named} below {format_duration(spec.below_ns)}{most}"
 
 
-def check_latency(trace: Trace, spec: LatencySpec) -> Iterator[LatencyResult | None]:
+Known = dict[tuple[object, ...], Latencies]
+"""Chains that are measured already, by what was asked for."""
+
+
+def check_latency(
+    trace: Trace, spec: LatencySpec, known: Known | None = None
+) -> Iterator[LatencyResult | None]:
     """Hold a check against a trace: yield None now and then, and in the end what came of it.
+
+    ``known`` are the chains that checks before were about; these are added.
 
     :raises TraceError: the trace is damaged.
     """
-    found = None
-    for found in measuring(trace, **spec.wanted):
-        if found is None:
-            yield None
-    assert found is not None
+    known = {} if known is None else known
+    asked = tuple(spec.wanted.values())
+    found = known.get(asked)
+    if found is None:
+        for found in measuring(trace, **spec.wanted):
+            if found is None:
+                yield None
+        assert found is not None
+        known[asked] = found
     missing = found.missing.replace("--via ", "via: ")
     if missing and not trace.complete:
         yield LatencyResult(undecided=True, note=missing)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -27,6 +28,7 @@ from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
 
 NODES, TOPICS = 3, 4
+RUNS = int(os.environ.get("RSLTRACE_RUNS", "15"))
 
 
 @dataclass
@@ -200,7 +202,8 @@ def assert_measured(chain: ChainLatency, outputs: list[list[Sent]], inputs: list
         assert all((getattr(one, part) >= 0).all() for part in Parts.__slots__)
 
 
-@settings(max_examples=30, deadline=None)
+@pytest.mark.repeated
+@settings(max_examples=RUNS, deadline=None)
 @given(seed=st.integers(0, 10**9))
 def test_all_chains_of_random_graphs(seed: int) -> None:
     run, messages, _ = random_run(seed)
@@ -241,7 +244,8 @@ def through(message: Sent, topics: list[str], via: str) -> Iterator[list[Sent]]:
             yield [*hops, message]
 
 
-@settings(max_examples=30, deadline=None)
+@pytest.mark.repeated
+@settings(max_examples=RUNS, deadline=None)
 @given(seed=st.integers(0, 10**9))
 @example(seed=439)  # a node that samples has received a newer message, which came of no input
 def test_a_chain_through_a_node_that_samples(seed: int) -> None:
@@ -296,6 +300,7 @@ def test_an_input_without_an_answer_is_too_late_once_its_time_is_up() -> None:
     assert found.undecided, "the run had ended"
 
 
+@settings(max_examples=RUNS, deadline=None)
 @given(st.lists(st.integers(0, 50), min_size=1))
 def test_quantiles_are_durations_that_so_many_do_not_exceed(durations: list[int]) -> None:
     found = figures(np.array(durations, dtype=np.int64))
