@@ -58,8 +58,8 @@ class Watch:
         """``fork_ns``: since the start of the run, when others are forked from it (-1: never)."""
         self.order: list[tuple[int, int]] = []
         """Of each choice, which of how many was taken."""
-        self.entities: set[int] = set()
-        """Whatever could run at some time."""
+        self.entities: set[tuple[int, int]] = set()
+        """Whatever could run at some time: entities, and which of their callbacks under way."""
         self.choices_before = 0
         """How many choices there have been up to ``fork_ns``."""
         self._fork_ns = fork_ns
@@ -74,7 +74,7 @@ class Watch:
                 loop.on_lull = self._note_lull
 
     def _note(self, ready: Sequence[Candidate], chosen: int, moment: Moment) -> None:
-        self.entities.update([one.entity_id for one in ready])
+        self.entities.update([(one.entity_id, one.thread) for one in ready])
         if len(ready) > 1:
             self.order.append((chosen, len(ready)))
             if moment.now_ns - self._session.start_ns <= self._fork_ns:

@@ -26,6 +26,7 @@ from rsltrace.job.parts.scheduling import (
     ExecutionSpec,
     ExecutorSpec,
     PolicySpec,
+    ThreadsSpec,
     executors_part,
     policy_part,
 )
@@ -38,6 +39,7 @@ from rsltrace.job.values.checks import (
     items,
     named_parts,
     one_of,
+    part,
     parts,
     text,
     whole,
@@ -175,6 +177,11 @@ class JobFields(Part):
         "first served, and timers last.",
         examples=["rate_monotonic", {"recorded": "run1.mcap"}],
     )
+    threads: Annotated[ThreadsSpec | None, part("switch")] = Field(
+        default=None,
+        description="Where threads take turns: without it, where they block.",
+        examples=[{"switch": "every_line"}],
+    )
     min_time_step_ns: Annotated[int, check(parse_time)] = Field(
         default=0,
         alias="min_time_step",
@@ -283,6 +290,7 @@ class JobFields(Part):
             guard: GuardSpec | dict[str, Any] | bool = ...,
             delay: DelaysSpec | dict[str, Any] | None = None,
             policy: PolicySpec | dict[str, Any] | str | None = None,
+            threads: ThreadsSpec | dict[str, Any] | str | None = None,
             min_time_step: TimeLike = 0,
             min_time_step_ns: int = 0,
             executors: Sequence[ExecutorSpec | dict[str, Any]] | str | None = None,

@@ -104,6 +104,9 @@ class OrderedLoop(EventLoop):
         """Told of every choice, of one alone, too, if somebody has to know."""
         self.on_lull: Callable[[], None] | None = None
         """Told each time that nothing is left that could run, if somebody has to know."""
+        self.has_begun = False
+        """Whether it has run anything yet."""
+        self._forced: Place | None = None
         self._held: dict[object, None] = {}
         self._ready = _Waiting(lambda item: self.place(item), self._runs)
         self._tasks = _Waiting(lambda item: self.place(item), self._runs)
@@ -119,6 +122,7 @@ class OrderedLoop(EventLoop):
 
     def run_step(self) -> None:
         """Run everything that is due at the present time and finds a worker."""
+        self.has_begun = True
         now_ns = self.now_ns
         scheduled = self.scheduled
         limit = self.events + self._livelock_limit
@@ -144,29 +148,53 @@ class OrderedLoop(EventLoop):
 
     def _next(self) -> Place | None:
         """Take out what runs next: tasks first, as rclpy has it, then what the policy chooses."""
+        forced, self._forced = self._forced, None
+        if forced is not None:
+            self._take_out(forced)
+            return forced
         for place in self._tasks.runnable():
             self._tasks.places.remove(place)
             return place
-        waiting = list(self._ready.runnable())
-        due, _ = self.timers.due(self.now_ns)
-        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
-        places = waiting + [place for place in timers if self._runs(place)]
+        places = self._waiting()
         if not places:
             return None
+        place = places[self.choose([place.candidate for place in places])]
+        self._take_out(place)
+        return place
+
+    def runnable(self) -> list[Place]:
+        """Return all that could run now beside the event under way: tasks, what is ready, timers
+        that are due."""
+        return [*self._tasks.runnable(), *self._waiting()]
+
+    def run_next(self, place: Place) -> None:
+        """Run one of ``runnable`` before anything else, once the event under way gives way."""
+        self._forced = place
+
+    def choose(self, ready: list[Candidate]) -> int:
+        """Have the policy choose; return the index of what it has chosen.
+
+        :raises RunError: if it cannot.
+        """
         moment = Moment(self.now_ns, self.events)
-        ready = [place.candidate for place in places]
         choice = self._chosen(ready, moment)
         if self.on_choice is not None:
             self.on_choice(ready, choice, moment)
-        if self.choices is not None and len(places) > 1:
+        if self.choices is not None and len(ready) > 1:
             self.choices.add(choice)
-        place = places[choice]
-        if choice < len(waiting):
-            for index, other in enumerate(self._ready.places):
+        return choice
+
+    def _waiting(self) -> list[Place]:
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        return [*self._ready.runnable(), *filter(self._runs, timers)]
+
+    def _take_out(self, place: Place) -> None:
+        for queue in (self._ready.places, self._tasks.places):
+            for index, other in enumerate(queue):
                 if other is place:
-                    del self._ready.places[index]
-                    break
-        return place
+                    del queue[index]
+                    return
 
     def _chosen(self, ready: list[Candidate], moment: Moment) -> int:
         name = type(self.policy).__qualname__

@@ -22,7 +22,8 @@ class Candidate:
     ``node`` and ``entity`` are names (``/planner``; ``/scan``, ``Planner.on_timer``), ``kind`` is
     ``timer``, ``subscription``, ``service``, ``client``, …; ``entity_id`` is the trace's.
     ``period_ns`` is a timer's period, for others that of their node's fastest timer, or None.
-    ``group`` are the names of the entities in its callback group.
+    ``group`` are the names of the entities in its callback group. ``thread`` tells apart callbacks
+    of one entity that are under way at the same time (``threads: {switch: every_line}``).
     """
 
     node: str
@@ -32,6 +33,7 @@ class Candidate:
     period_ns: int | None
     group: tuple[str, ...]
     item: Any
+    thread: int = 0
 
 
 class Moment(NamedTuple):

@@ -101,23 +101,27 @@ class Pct:
         for rank in range(depth - 1):
             self._changes.setdefault(stream.below(choices), []).append(rank)
         self._depth = depth
-        self._priorities: dict[int, float] = {}
+        self._priorities: dict[tuple[int, int], float] = {}
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         for one in ready:
-            if one.entity_id not in self._priorities:
-                self._priorities[one.entity_id] = self._depth + self._stream.uniform()
+            if (one.entity_id, one.thread) not in self._priorities:
+                self._priorities[one.entity_id, one.thread] = self._depth + self._stream.uniform()
         if len(ready) == 1:
             return 0
         chosen = self._highest(ready)
         for rank in self._changes.get(self._choices, ()):
-            self._priorities[ready[chosen].entity_id] = rank
+            self._priorities[ready[chosen].entity_id, ready[chosen].thread] = rank
             chosen = self._highest(ready)
         self._choices += 1
         return chosen
 
     def _highest(self, ready: Sequence[Candidate]) -> int:
-        return max(range(len(ready)), key=lambda i: (self._priorities[ready[i].entity_id], -i))
+        def priority(index: int) -> tuple[float, int]:
+            one = ready[index]
+            return self._priorities[one.entity_id, one.thread], -index
+
+        return max(range(len(ready)), key=priority)
 
 
 def pct_bound(entities: int, choices: int, depth: int) -> float:

@@ -18,7 +18,8 @@ class Runnable:
 
     ``kind`` and ``name`` are what a policy sees, ``group`` is what keeps others from running at the
     same time (a mutually exclusive callback group) with the names of its members. What has no
-    ``executor`` runs on none of the simulated ones.
+    ``executor`` runs on none of the simulated ones. ``thread`` tells apart callbacks of one entity
+    that are under way at the same time, where threads are switched at lines.
     """
 
     kind: str
@@ -29,6 +30,7 @@ class Runnable:
     group_names: tuple[str, ...] = ()
     period_ns: int | None = None
     executor: bool = True
+    thread: int = 0
 
 
 def on_no_executor(node: Any, name: str) -> Runnable:

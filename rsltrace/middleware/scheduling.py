@@ -99,7 +99,14 @@ class Scheduling:
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
         candidate = Candidate(
-            owner, what.name, what.kind, what.entity, what.period_ns, what.group_names, item
+            owner,
+            what.name,
+            what.kind,
+            what.entity,
+            what.period_ns,
+            what.group_names,
+            item,
+            what.thread,
         )
         return Place(candidate, self._workers_of(what), what.group)
 

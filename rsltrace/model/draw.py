@@ -1,8 +1,8 @@
 """What chance, or a fault of the job, decided, as one number that a trace holds in place of an
 output's hash.
 
-The upper 8 bits say what, the lower 56 how many nanoseconds. It is no hash: a reader gets the
-value back, so that a diff can name it.
+The upper 8 bits say what, the lower 56 how many nanoseconds (of a switch between threads: before
+which line). It is no hash: a reader gets the value back, so that a diff can name it.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ class Draw(IntEnum):
     HANG = 10
     RESTART = 11
     GOES_ON = 12
+    SWITCH = 13
 
 
 _WORDS = {
@@ -58,6 +59,11 @@ def encode_clock(by_ns: int) -> int:
     return encode_draw(Draw.CLOCK_AHEAD if by_ns > 0 else Draw.CLOCK_BACK, abs(by_ns))
 
 
+def is_switch(number: int) -> bool:
+    """Whether a decision lets another thread go on in the middle of a callback."""
+    return number >> _SHIFT == Draw.SWITCH
+
+
 def is_second_copy(number: int) -> bool:
     """Whether a decision sends a message twice."""
     return number >> _SHIFT == Draw.DUPLICATE
@@ -77,6 +83,8 @@ def draw_text(number: int) -> str:
         return f"draw of kind {kind}: {value_ns}"
     if draw in _WORDS:
         return _WORDS[draw]
+    if draw is Draw.SWITCH:
+        return f"another thread goes on before line {value_ns}"
     if draw in _CLOCKS:
         return f"clock set {format_duration(value_ns)} {_CLOCKS[draw]}"
     if draw in _FAULTS:

@@ -41,7 +41,7 @@ from rsltrace.run.plans.bags import (
 from rsltrace.run.plans.clocks import clock_notes, clocks_of
 from rsltrace.run.plans.entries import hook_entries, node_entries, say_where
 from rsltrace.run.plans.faults import arm_nodes, arm_topics, missed_faults
-from rsltrace.run.plans.guard import RunGuard, install_guard
+from rsltrace.run.plans.guard import RunGuard, install_guard, packages_of
 from rsltrace.run.plans.main_programs import MainProgram
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.processes import process_door
@@ -51,6 +51,7 @@ from rsltrace.run.plans.scheduling import (
     is_ordered,
     policy_of_job,
     scheduling_plan,
+    switches_at_lines,
     unmet_departures,
 )
 from rsltrace.run.plans.starts import missed_starts
@@ -292,6 +293,8 @@ class Session:
             recorded = None if self._recorded is None else self._recorded.order
             with self._guarded.engaged():
                 self.world.use_scheduling(loop, scheduling_plan(self.job, self.start_ns, recorded))
+            if switches_at_lines(self.job):
+                self.world.switch_at_lines(loop, packages_of(self.job.nodes))
 
     def _import_what_is_named(self) -> None:
         """Import the modules of stop function, hooks and nodes, and let rcl parse arguments."""

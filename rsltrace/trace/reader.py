@@ -343,6 +343,13 @@ class Trace:
         return lines
 
     @cached_property
+    def switches(self) -> dict[int, str]:
+        """The lines (``module.py:31``) before which other threads went on, by the event that ended
+        there."""
+        lines = self.code_lines.get(0, [])
+        return {line.event: line.place for line in lines if line.output != NO_SEQUENCE}
+
+    @cached_property
     def guarded(self) -> tuple[GuardCount, ...]:
         """How often the guard met each call; empty for a run without guard, or cut off."""
         return self._named(parse_counts, self.metadata(METADATA_GUARD).get("calls", "[]"))

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from rsltrace.model.code_line import CodeLine
+from rsltrace.model.draw import is_switch
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_SEQUENCE, Event, EventKind, Output, OutputKind
 from rsltrace.trace.reader import Trace
@@ -55,7 +56,8 @@ def _functions(lines: list[CodeLine], event: Event) -> list[str]:
 
 
 def output_places(trace: Trace, output: Output) -> list[str]:
-    """Return the lines (``module.py:31``) from which a message, call or log record came.
+    """Return the lines (``module.py:31``) from which a message, call or log record came, or before
+    which another thread went on.
 
     There are several where its callback had sent from several until then, none if nobody knows.
     The last is ``ELSEWHERE`` where a run has not looked at the output.
@@ -63,6 +65,9 @@ def output_places(trace: Trace, output: Output) -> list[str]:
     if output.kind is OutputKind.LOG:
         record = log_record(trace, output)
         return [record.place] if record is not None and record.place else []
+    if output.kind is OutputKind.DRAW and is_switch(output.hash):
+        place = trace.switches.get(output.event)
+        return [place] if place else []
     if output.kind not in _SENT:
         return []
     running = trace.event(output.event).entity

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from rsltrace.errors import TraceError
 from rsltrace.model.built_in import is_built_in
-from rsltrace.model.draw import draw_text
+from rsltrace.model.draw import draw_text, is_switch
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import Event, EventKind, Output, OutputKind
 from rsltrace.model.printable import printable
@@ -44,6 +44,9 @@ class EventWords:
             record = log_record(self._trace, output)
             return printable(f"log {record.level_name} {record.text}").rstrip() if record else "log"
         if kind is OutputKind.DRAW:
+            place = self._trace.switches.get(output.event) if is_switch(output.hash) else None
+            if place:
+                return f"another thread goes on before {printable(place)}"
             return f"{draw_text(output.hash)} ({self.names.node(output.entity) or name})"
         entity = self._entities.get(output.entity)
         text = output_text(kind, name, entity.kind.label if entity is not None else "")

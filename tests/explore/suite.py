@@ -17,7 +17,8 @@ class Bug:
     """A known bug.
 
     ``kind`` says what it is, ``search`` where it hides: in the ``order`` of what is ready at one
-    moment, or in what the job draws from its seed, such as a ``delay``; or it takes ``faults``.
+    moment, or in what the job draws from its seed, such as a ``delay``; between the ``lines`` of
+    threads; or it takes ``faults``.
     """
 
     folder: Path

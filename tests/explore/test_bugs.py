@@ -77,7 +77,7 @@ def test_the_suite_is_what_it_says() -> None:
     assert len({bug.name for bug in BUGS}) == len(BUGS)
     assert len({bug.kind for bug in BUGS}) == len(BUGS)
     for bug in BUGS:
-        assert bug.search in ("order", "delay", "faults")
+        assert bug.search in ("order", "delay", "faults", "lines")
         assert bool(bug.fault) == (bug.search == "faults")
         assert bug.fixed.is_file()
         assert (bug.folder / f"{bug.name}.py").is_file()

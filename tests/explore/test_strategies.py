@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.errors import ExploreError
 from rsltrace.explore.strategies.feedback import Feedback
 from rsltrace.explore.strategies.named import NAMES, strategy_named
 from rsltrace.explore.trial import Trial, TrialResult
@@ -77,3 +78,10 @@ def test_pct_meets_planted_orders_no_less_often_than_its_bound() -> None:
     assert [row[0] for row in rows] == ["1", "2", "3"]
     for row in rows:
         assert float(row[5]) >= float(row[3]) > 0
+
+
+def test_a_search_of_whole_callbacks_is_refused_where_lines_are_switched() -> None:
+    job = Job(nodes=[NodeSpec(node="m:N")], threads="every_line")
+    with pytest.raises(ExploreError, match="takes callbacks as whole"):
+        strategy_named("systematic", job)
+    assert strategy_named("mixed", job).propose(1) is not None

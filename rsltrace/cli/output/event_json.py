@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.model.draw import draw_text
+from rsltrace.model.draw import draw_text, is_switch
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.format import TOPIC_DETAILS
@@ -75,7 +75,9 @@ class EventJson:
             "hash": f"{output.hash:016x}",
             "sequence": output.sequence if kept else None,
         }
-        if output.kind in _WITH_PLACE:
+        if output.kind in _WITH_PLACE or (
+            output.kind is OutputKind.DRAW and is_switch(output.hash)
+        ):
             result["code"] = output_places(self._trace, output)
         if output.kind is OutputKind.DRAW:
             result["text"] = draw_text(output.hash)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import chain
 
-from rsltrace.model.event import Event, Output
+from rsltrace.model.event import Event, Output, OutputKind
 from rsltrace.model.finding import Finding
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_seconds
@@ -62,6 +62,8 @@ class EventLines:
         return "\n".join(lines)
 
     def _from_where(self, output: Output) -> str:
+        if output.kind is OutputKind.DRAW:
+            return ""  # it says so itself
         places = printable(places_text(output_places(self._trace, output)))
         return f"at {places}" if places else ""
 

@@ -26,6 +26,7 @@ from rsltrace.diff.result.divergence import MessageDifference, StateDifference
 from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.model.draw import is_switch
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.model.stamp import format_duration
@@ -155,6 +156,9 @@ def _judge(case: Case) -> Judgement:
     if case.cause_only:
         return _another_cause(case, a, b)
     draws = [m for m in case.messages if m.kind is OutputKind.DRAW]
+    switch = next((m for m in draws if is_switch(m.hash_a or 0) or is_switch(m.hash_b or 0)), None)
+    if switch is not None:
+        return _switch(case, a, b, switch)
     if draws and all(m.kind is OutputKind.DRAW for m in case.messages):
         return _draw(case, a, b, draws)
     if draws and draws[0] is case.messages[0] and draws[0].topic.startswith(CLOCK_OF):
@@ -424,6 +428,20 @@ def _draw(case: Case, a: EventView, b: EventView, draws: Sequence[MessageDiffere
         "drawn from a different number of times before"
     )
     return Judgement(Verdict.DRAW, Root.DRAW, sentence, why, a, b)
+
+
+def _switch(case: Case, a: EventView, b: EventView, met: MessageDifference) -> Judgement:
+    """Return the verdict where another thread went on in the middle of a callback."""
+    in_a, in_b = (is_switch(number or 0) for number in (met.hash_a, met.hash_b))
+    places = met.code or ("a line that is not known",)
+    sentence = f"{phrase(a)} {at_time(a.stamp_ns)} "
+    if in_a and in_b:
+        sentence += f"gave way to another thread before {places[0]} in a, before {places[-1]} in b"
+    else:
+        one, other = ("a", "b") if in_a else ("b", "a")
+        sentence += f"gave way to another thread before {places[0]} in {one}; in {other} it went on"
+    why = case.because() or "the policy chose another one of those that could run"
+    return Judgement(Verdict.SCHEDULE, Root.SCHEDULE, sentence, why, a, b)
 
 
 def _drawn(text: str, other: str) -> str:

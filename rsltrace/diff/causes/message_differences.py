@@ -95,7 +95,9 @@ class _Evidence:
 
     def _places(self, run: Run, row: OutputRow | None, view: EventView | None) -> list[str]:
         """Return the lines from which an output may have come."""
-        if row is None or view is None or row[0] not in _WITH_PAYLOAD:
+        if row is None or view is None:
+            return []
+        if row[0] not in _WITH_PAYLOAD and row[0] != OutputKind.DRAW:
             return []
         output = Output(view.index, _entity_id(run, row[1]), OutputKind(row[0]), row[2], row[3])
         return [place_here(run.trace, place) for place in output_places(run.trace, output)]

@@ -28,6 +28,7 @@ from rsltrace.doors.rclpy.stacks.blocking_calls import end_blocked
 from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.exit_handlers import own_exit_handlers
 from rsltrace.doors.rclpy.stacks.forked_child import forked_children_end
+from rsltrace.doors.rclpy.stacks.line_switches import switches_at_lines
 from rsltrace.doors.rclpy.stacks.mains import begin_program, end_programs
 from rsltrace.doors.rclpy.stacks.process_exit import own_process_ends
 from rsltrace.doors.rclpy.stacks.program import Program
@@ -172,6 +173,10 @@ class World:
         if plan.execution and self.domain.transport.network is None:
             # What a callback sends leaves when it is over: that takes links.
             self.use_network(NetworkPlan())
+
+    def switch_at_lines(self, loop: OrderedLoop, packages: frozenset[str]) -> None:
+        """Let threads take turns at lines of user code; that of ``packages`` is, too."""
+        self._stack.enter_context(switches_at_lines(self.stacks, loop, packages))
 
     def show_log(self, severity: int, name: str, text: str) -> None:
         """Print a log record of a node that publishes its records itself, if they are printed."""

@@ -13,6 +13,7 @@ from rsltrace.explore.strategies.vary import VaryWalk
 from rsltrace.explore.strategies.walks import PctWalk, RandomWalk
 from rsltrace.explore.trial import TrialResult
 from rsltrace.job import Job, locate
+from rsltrace.run.plans.scheduling import switches_at_lines
 
 NAMES = ("mixed", "pct", "random", "feedback", "systematic", "faults", "vary")
 
@@ -35,6 +36,12 @@ def strategy_named(
     if after is not None:
         _check_forks(name, job)
     if name == "systematic":
+        if switches_at_lines(job):
+            raise ExploreError(
+                "the systematic search takes callbacks as whole, which threads: {switch: "
+                "every_line} of the job divides: give --strategy pct, random, feedback or mixed, "
+                "or search without that key"
+            )
         return Systematic(depth)
     if name == "faults":
         return FaultWalk(job, seed, fork_ns=fork_ns)

@@ -18,6 +18,7 @@ from rsltrace.job.values.problem import Problem, describe, meant_by
 from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time
 
+WHEN_BLOCKED, EVERY_LINE = "when_blocked", "every_line"
 ORDERS = ("fifo", "rate_monotonic", "permutation")
 PRIORITY_MAX = 2**31 - 1
 
@@ -222,6 +223,18 @@ class ExecutionSpec(Part):
         default=(),
         description="By entity of a node.",
         examples=[[{"node": "/detector", "entity": "/image", "constant": "50ms"}]],
+    )
+
+
+class ThreadsSpec(Part):
+    """Where threads of one process, and callbacks that its executors run at once, take turns."""
+
+    switch: Annotated[str, check(one_of(WHEN_BLOCKED, EVERY_LINE))] = Field(
+        default=WHEN_BLOCKED,
+        description="`when_blocked`: each runs until it blocks or ends. `every_line`: before each "
+        "line of the user's own code the policy is asked whether it goes on, or another one that "
+        "could run at the same time; `fifo` lets it go on.",
+        examples=["every_line"],
     )
 
 

@@ -19,6 +19,7 @@ from rsltrace.replay.preparation import Preparation
 from rsltrace.replay.replaying import place_for
 from rsltrace.replay.verification import interruption
 from rsltrace.run import Observer, RunResult
+from rsltrace.run.plans.scheduling import switches_at_lines
 from rsltrace.run.process import kept_process
 from rsltrace.trace.format import METADATA_FED
 from rsltrace.trace.reader import Trace
@@ -45,6 +46,11 @@ def replay_node(
     trace = plan.trace
     if plan.edits:
         raise ReplayError(f"{trace.name} is a branch with edits, which replays as a whole only")
+    if switches_at_lines(plan.job):
+        raise ReplayError(
+            f"{trace.name} was made with threads: {{switch: every_line}}: where a callback gives "
+            "way depends on all of its process, so it replays as a whole only; leave out --node"
+        )
     columns = Columns(trace)
     unit = Unit(columns, plan.job, node, entries_of(trace, columns))
     check_payloads(columns, unit)

@@ -67,7 +67,7 @@ class RunGuard:
                 GuardContext(world.stacks, world.clocks),
                 policy=policy_of(job.guard),
                 seed=job.seed,
-                packages=_packages(job.nodes),
+                packages=packages_of(job.nodes),
                 on_finding=on_finding,
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
@@ -153,7 +153,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
             if name in sys.modules:
                 begin()
         on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(ordered_sets(_packages(job.nodes), on_loaded, orders=orders))
+        stack.enter_context(ordered_sets(packages_of(job.nodes), on_loaded, orders=orders))
     return made
 
 
@@ -165,5 +165,6 @@ def _orders_sets(job: Job) -> bool:
     return any(mode is not Mode.ALLOW for mode in modes)
 
 
-def _packages(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+def packages_of(nodes: Sequence[NodeSpec]) -> frozenset[str]:
+    """Return the packages that nodes are in: the user's, wherever they are."""
     return frozenset(spec.package for spec in nodes) - {"", "rsltrace", "rclpy"}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.chance.stream import Stream
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
-from rsltrace.job.parts.scheduling import PolicySpec
+from rsltrace.job.parts.scheduling import EVERY_LINE, PolicySpec
 from rsltrace.loop.policy import (
     Fifo,
     Permutation,
@@ -29,7 +29,13 @@ def is_ordered(job: Job) -> bool:
     """Whether a job needs more than the plain loop."""
     policy = job.policy
     fifo = policy is None or policy.order == "fifo"
-    return not fifo or job.executors is not None or job.execution is not None
+    rules = not fifo or job.executors is not None or job.execution is not None
+    return rules or switches_at_lines(job)
+
+
+def switches_at_lines(job: Job) -> bool:
+    """Whether a thread may go on in the middle of another's callback."""
+    return job.threads is not None and job.threads.switch == EVERY_LINE
 
 
 def scheduling_plan(job: Job, start_ns: int, policy: Policy | None) -> SchedulingPlan:

@@ -9,11 +9,13 @@ never meet any of this.
 
 from __future__ import annotations
 
+import itertools
 import os
 import traceback
 from _thread import get_ident
 from collections.abc import Callable
 from typing import Any
+from weakref import WeakKeyDictionary
 
 from greenlet import getcurrent, greenlet
 
@@ -55,6 +57,10 @@ class Runners:
         self.main: greenlet | None = None
         self.waiting: list[greenlet] = []
         self.error: BaseException | None = None
+        self.numbers: WeakKeyDictionary[greenlet, int] | None = None
+        """A number for each stack whose callback has been at a line where another could go on, if
+        threads are switched at lines."""
+        self._next_number = itertools.count(1).__next__
         self._run = run
         self._maker: greenlet | None = None
 
@@ -79,6 +85,15 @@ class Runners:
     def _make(self) -> None:
         while True:
             greenlet(self._run, self.main).switch()
+
+    def number_of(self, stack: greenlet) -> int:
+        """Return the number of a stack, where stacks have numbers."""
+        if self.numbers is None:
+            return 0
+        number = self.numbers.get(stack)
+        if number is None:
+            number = self.numbers[stack] = self._next_number()
+        return number
 
     def step_aside(self) -> None:
         """Have whoever switched to the present stack go on once it ends."""
@@ -164,6 +179,13 @@ class Wait:
             self.woken = self.timed_out = True
             self._runners.domain.loop.ready.append(self)
 
+    def give_way(self, output: int) -> None:
+        """Let the call return when it is its turn among those that are ready: it waits for nothing.
+        ``output`` of the event under way says so."""
+        self.woken = True
+        self._cause = (self._runners.domain.loop.events, output)
+        self._runners.domain.loop.ready.append(self)
+
     @property
     def held(self) -> list[Any] | None:
         """Where it is kept if its process hangs or has crashed, else None."""
@@ -203,7 +225,8 @@ class Wait:
 
     def runnable(self) -> Runnable:
         """Describe it to a policy: a callback under way goes on, and has its worker."""
-        return Runnable("resume", "", self.entity_id)
+        thread = self._runners.number_of(self.stack)
+        return Runnable("resume", "", self.entity_id, thread=thread)
 
     def describe(self) -> str:
         """Name the callback that waits."""
