@@ -25,6 +25,7 @@ from pathlib import Path
 from rsltrace.explore.outcome import Wants
 from rsltrace.explore.trial import JobSource, Trial
 from rsltrace.explore.workers import Worker
+from rsltrace.job.values.times import parse_time
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = ROOT / "tests/explore/bugs/order/command_after_stop/job.yaml"
@@ -73,9 +74,12 @@ stop: {duration: END}
 def cpu_s(pid: int) -> float:
     """Return the processor time of a process, its children and those that it has waited for."""
     words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    own = sum(map(int, words[11:15])) / TICKS
-    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-    return own + sum(cpu_s(int(child)) for child in children)
+    return sum(map(int, words[11:15])) / TICKS + sum(map(cpu_s, children_of(pid)))
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the processes that a process has started and that are there."""
+    return list(map(int, Path(f"/proc/{pid}/task/{pid}/children").read_text().split()))
 
 
 def rss_kb(pid: int) -> int:
@@ -123,20 +127,27 @@ def fork(runs: int) -> None:
             )
 
 
-def memory(runs: int, job: Path) -> None:
-    """Print the memory of one worker after some of its runs."""
+def memory(runs: int, job: Path, fork_after: str | None) -> None:
+    """Print the memory of one worker after some of its runs, and of the process that it forks from
+    if ``fork_after`` says when."""
+    fork_ns = -1 if fork_after is None else parse_time(fork_after)
+    order = {"order": "permutation", **({} if fork_after is None else {"after": fork_after})}
+    wants = Wants(behaviours=True, fork_ns=fork_ns)
     with tempfile.TemporaryDirectory() as folder, Worker(JobSource(str(job))) as worker:
         began_s = time.monotonic()
         for number in range(1, runs + 1):
-            trial = Trial(number, {"policy": "permutation", "seed": number})
-            found = worker.run(trial, Path(folder, "run.mcap"), Wants(behaviours=True))
+            trial = Trial(number, {"policy": {**order, "seed": number}})
+            found = worker.run(trial, Path(folder, "run.mcap"), wants)
+            assert number == 1 or found.is_forked == (fork_ns >= 0)
             if found.trace is not None:
                 Path(found.trace).unlink()
-            if number in (10, 100) or number % 1000 == 0:
+            if number in (10, 100, 300) or number % 1000 == 0:
                 rate = number / (time.monotonic() - began_s)
-                kb = rss_kb(pid_of(worker))
-                open_files = len(os.listdir(f"/proc/{pid_of(worker)}/fd"))
-                print(f"{number} runs: {kb} kB, {open_files} descriptors, {rate:.1f}/s", flush=True)
+                print(f"{number} runs, {rate:.1f}/s", end="", flush=True)
+                for pid in (pid_of(worker), *children_of(pid_of(worker))):
+                    open_files = len(os.listdir(f"/proc/{pid}/fd"))
+                    print(f"; {rss_kb(pid)} kB, {open_files} descriptors", end="")
+                print(flush=True)
 
 
 def throughput(runs: int, rounds: int, job: Path) -> None:
@@ -192,12 +203,13 @@ def main() -> None:
     parser.add_argument("what", choices=("fork", "throughput", "memory"))
     parser.add_argument("--runs", type=int, help="(default: 20, 400 and 10000)")
     parser.add_argument("--rounds", type=int, default=3, help="of throughput")
+    parser.add_argument("--fork-after", metavar="T", help="of memory: fork its runs")
     parser.add_argument("--job", type=Path, default=SHORT, help="of throughput and memory")
     options = parser.parse_args()
     if options.what == "fork":
         fork(options.runs or 20)
     elif options.what == "memory":
-        memory(options.runs or 10_000, options.job)
+        memory(options.runs or 10_000, options.job, options.fork_after)
     else:
         throughput(options.runs or 400, options.rounds, options.job)
 

@@ -2,7 +2,7 @@
 
 A worker has one such process for runs in other orders and one for those with faults. It stands
 still after the prefix, between two time steps, and is asked for copies; what cannot be copied, or
-differs before that, is run from the beginning, and the answer says why.
+differs before that (which the copy finds), is run from the beginning, and the answer says why.
 """
 
 from __future__ import annotations
@@ -180,17 +180,14 @@ class _Standing:
         self._answer_at = -1
 
     def serve(self, task: dict[str, Any], lines: Lines, worker: int) -> bool:
-        """Answer a request with a copy of this process, if there can be one. True in the copy."""
-        from rsltrace.run.branching import why_not as why_no_branch
+        """Answer a request with a copy of this process, if there can be one. True in the copy.
 
+        Nothing else is done here: garbage is not collected any more, and would be there in every
+        copy.
+        """
         tell, say = task["with"]
         try:
             pairs = self.session.inner_pairs()
-            self._job = self._source.job(Trial(**task["trial"]))
-            why = why_no_branch(self.session, self._job)
-            if why:
-                lines.send({"why": why})
-                return False
             pid = fork_beside(worker, pairs)
             if pid:
                 lines.send({"pid": pid})
@@ -215,12 +212,17 @@ class _Standing:
 
     def _made(self, task: dict[str, Any], wants: Wants) -> dict[str, Any]:
         from rsltrace.explore.outcome import result_of_run
+        from rsltrace.run.branching import why_not as why_no_branch
 
         began = time.perf_counter()
-        self.session.becomes(self._job, Path(task["trace"]))
+        trial = Trial(**task["trial"])
+        job = self._source.job(trial)
+        why = why_no_branch(self.session, job)
+        if why:
+            return {"why": why}
+        self.session.becomes(job, Path(task["trace"]))
         self.session.go_on()
         ran = self.session.finish()
         self._stack.close()
-        trial = Trial(**task["trial"])
-        result = result_of_run(self._job, trial, ran, self._watch, wants, began)
+        result = result_of_run(job, trial, ran, self._watch, wants, began)
         return {"result": replace(result, is_forked=True).as_values()}

@@ -106,15 +106,20 @@ def _run(task: dict[str, Any], prefixes: Prefixes | None) -> dict[str, Any]:
     """Run a trial in a copy of this process, or in one of those that stand at the end of a common
     prefix; return what came of it. Without ``prefixes``, also which libraries it has imported."""
     began = time.perf_counter()
-    told, tell = os.pipe()
-    said, say = os.pipe()
     why = ""
-    child: int | None = None
     if prefixes is not None and task["wants"]["fork_ns"] >= 0:
-        child, why = prefixes.fork(task, tell, say)
-    if child is None:
-        child = _forked(task, (told, tell, said, say), tells=prefixes is None)
-    answer = _answer(task, child, (told, tell, said, say), began)
+        ends = (*os.pipe(), *os.pipe())
+        child, why = prefixes.fork(task, ends[1], ends[3])
+        if child is None:
+            for end in ends:
+                os.close(end)
+        else:
+            answer = _answer(task, child, ends, began)
+            if "why" not in answer:
+                return answer
+            why = answer["why"]
+    ends = (*os.pipe(), *os.pipe())
+    answer = _answer(task, _forked(task, ends, tells=prefixes is None), ends, began)
     if why and "result" in answer:
         answer["result"]["why_not_forked"] = why
     return answer
@@ -146,6 +151,7 @@ def _answer(
     answer, output, in_time = _hear(told, said, task.get("timeout_s"))
     with suppress(ProcessLookupError):
         os.killpg(child, signal.SIGKILL)
+    os.kill(child, signal.SIGKILL)  # it may not have a group of its own yet
     _, status = os.waitpid(child, 0)
     for end in (told, said):
         os.close(end)

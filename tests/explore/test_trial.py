@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,21 +57,41 @@ def test_texts_are_not_replaced_when_they_are_read_again(searched: Path) -> None
 
 
 @pytest.mark.long
-def test_workers_do_not_grow_and_leave_nobody_behind(searched: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize("forks", [False, True])
+def test_workers_do_not_grow_and_leave_nobody_behind(
+    searched: Path, tmp_path: Path, *, forks: bool
+) -> None:
+    wants = Wants(behaviours=True, fork_ns=50_000_000 if forks else -1)
     with Worker(JobSource(str(searched / "job.yaml"))) as worker:
         sizes = []
         for number in range(60):
-            trial = Trial(number, {"policy": "permutation", "seed": number})
-            worker.run(trial, tmp_path / "run.mcap", Wants(behaviours=True))
+            order = {"order": "permutation", "after": "50ms", "seed": number}
+            found = worker.run(Trial(number, {"policy": order}), tmp_path / "run.mcap", wants, 300)
+            assert found.is_forked == (forks and number > 0)
             assert worker._process is not None
-            status = Path(f"/proc/{worker._process.pid}/status").read_text()
-            sizes.append(int(status.split("VmRSS:")[1].split()[0]))
-        children = Path(f"/proc/{worker._process.pid}/task/{worker._process.pid}/children")
-        assert children.read_text() == ""
-        pid = worker._process.pid
-    assert sizes[-1] - sizes[20] < 1024  # kB
-    assert not Path(f"/proc/{pid}").exists()
+            pid = worker._process.pid
+            children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+            assert len(children) == found.is_forked  # the one with the prefix
+            sizes.append([_rss_kb(one) for one in (pid, *children)])
+    assert all(last - before < 512 for before, last in zip(sizes[20], sizes[-1], strict=True))
+    deadline = time.monotonic() + 60
+    while any(map(_runs, (pid, *children))):
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
     assert not list(tmp_path.iterdir())
+
+
+def _runs(pid: object) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state not in "ZX"  # who is dead may wait for somebody to look
+
+
+def _rss_kb(pid: object) -> int:
+    status = Path(f"/proc/{pid}/status").read_text()
+    return int(status.split("VmRSS:")[1].split()[0])
 
 
 @pytest.mark.long
