@@ -15,7 +15,7 @@ from rsltrace_viewer.model.run import Run
 if TYPE_CHECKING:
     from rsltrace.job import Job
 
-EVENTS_MAX = 2_000_000
+EVENTS_MAX = 500_000
 """Chains are looked for by themselves in runs of up to so many events: some microseconds each."""
 ARROW, VIA = " → ", " via "
 
