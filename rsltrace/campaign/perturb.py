@@ -33,6 +33,7 @@ ADDRESSES = "address space"
 LOAD = "CPU load"
 THREAD_COUNT = "thread counts"
 KERNEL = "BLAS core type"
+CORE_TYPE = "OPENBLAS_CORETYPE"
 KINDS = (
     HASH_SEED,
     FOLDER,
@@ -148,7 +149,7 @@ def surroundings(number: int, seed: int = 0) -> Surroundings:
     if can_fix_addresses():
         values[ADDRESSES] = "random"
     kernels = core_types()
-    if len(kernels) > 1:
+    if len(kernels) > 1 and not os.environ.get(CORE_TYPE):  # else the user has chosen one
         values[KERNEL] = chance.choice(kernels)
     return Surroundings(number, values)
 
@@ -291,5 +292,5 @@ def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
     if THREAD_COUNT in values:
         env.update(dict.fromkeys(THREADS, values[THREAD_COUNT]))
     if KERNEL in values:
-        env["OPENBLAS_CORETYPE"] = values[KERNEL]
+        env[CORE_TYPE] = values[KERNEL]
     return env

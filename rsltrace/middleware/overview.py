@@ -18,6 +18,8 @@ from rsltrace.model.stamp import format_duration
 
 _ACTION = "/_action/"
 _CLOCK = "/clock"
+_TRANSFORMS = "/tf"
+_STATIC_TRANSFORMS = "/tf_static"
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +84,16 @@ def overview(
     if not everything:
         links = [link for link in links if not _is_everywhere(link)]
     links.sort(key=lambda link: (link.kind, link.name))
+    moving = any(link.name == _TRANSFORMS and link.senders for link in links)
+    doubtful = [link for link in links if not (moving and _is_unheard_static(link))]
     return Overview(
         nodes,
         tuple(links),
         waiting=tuple(waiting),
-        problems=(*_namesakes(nodes), *(one for link in links for one in _problems(link, follows))),
+        problems=(
+            *_namesakes(nodes),
+            *(one for link in doubtful for one in _problems(link, follows)),
+        ),
     )
 
 
@@ -174,6 +181,11 @@ def _is_everywhere(link: Link) -> bool:
     return link.kind == "service" and (
         link.name.rpartition("/")[2] in NODE_SERVICES and not link.senders
     )
+
+
+def _is_unheard_static(link: Link) -> bool:
+    """Say whether a link is what every listener of tf2 subscribes to besides ``/tf``, in vain."""
+    return link.name == _STATIC_TRANSFORMS and not link.senders
 
 
 def _problems(link: Link, follows: Callable[[str], bool]) -> Iterator[str]:

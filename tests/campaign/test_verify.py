@@ -10,13 +10,17 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
+from rsltrace.campaign import perturb
 from rsltrace.campaign.perturb import KINDS, recorded, surroundings
 from rsltrace.campaign.processes import Done
+from rsltrace.campaign.verify import Verified
+from rsltrace.cli.output import verify_text
 
 pytestmark = pytest.mark.ros
 
@@ -32,6 +36,26 @@ def test_surroundings_differ_from_run_to_run_and_not_from_time_to_time() -> None
     assert surroundings(3).values != surroundings(4).values != surroundings(4, seed=1).values
     assert set(surroundings(1).values) <= set(KINDS)
     assert list(surroundings(1).only(KINDS[0]).values) == [KINDS[0]]
+
+
+def test_a_core_type_that_the_user_has_chosen_is_left_alone(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(perturb, "core_types", lambda: ("Nehalem", "Haswell"))
+    monkeypatch.delenv(perturb.CORE_TYPE, raising=False)
+    assert perturb.KERNEL in surroundings(1).values
+    monkeypatch.setenv(perturb.CORE_TYPE, "Haswell")
+    values = surroundings(1).values
+    assert perturb.KERNEL not in values
+    assert perturb.THREAD_COUNT in values
+
+
+def test_of_a_core_type_that_makes_a_difference_the_way_out_is_named() -> None:
+    found = Verified(cast(Any, None), 2, (), (), narrowed=True, provoked_by=(perturb.KERNEL,))
+    told = verify_text._provoked(found, "rsltrace verify job.yaml --run 1")
+    assert "OPENBLAS_CORETYPE=Haswell rsltrace" in told
+    other = replace(found, provoked_by=(perturb.HEAP,))
+    assert "CORETYPE" not in verify_text._provoked(other, "rsltrace verify job.yaml --run 1")
 
 
 def test_one_digest_is_stated_as_what_was_tried(

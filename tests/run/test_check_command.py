@@ -96,6 +96,33 @@ to look at:
 """
 
 
+def test_a_listener_of_transforms_needs_nobody_who_publishes_static_ones(
+    command: Any, job_file: Callable[..., Path]
+) -> None:
+    code = """
+from std_msgs.msg import Empty as TFMessage
+
+class Listens(Node):
+    def __init__(self):
+        super().__init__('listens')
+        for topic in ('/tf', '/tf_static'):
+            self.create_subscription(TFMessage, topic, print, 10)
+
+class Moves(Node):
+    def __init__(self):
+        super().__init__('moves')
+        self.create_publisher(TFMessage, '/tf', 10)
+"""
+    alone = "nodes: [{node: nodes_under_test:Listens}]\nstop: {duration: 1s}\n"
+    job_file(alone, code)
+    done = command("check", "job.yaml")
+    assert "topic /tf: /listens subscribes, and nobody publishes" in done.stdout
+    assert "topic /tf_static: /listens subscribes, and nobody publishes" in done.stdout
+    job_file(alone.replace("}]", "}, {node: nodes_under_test:Moves}]", 1), code)
+    done = command("check", "job.yaml")
+    assert (done.returncode, "nothing looks wrong" in done.stdout) == (0, True)
+
+
 def test_the_report_of_a_job(command: Any, job_file: Callable[..., Path], tmp_path: Path) -> None:
     job_file(JOB, NODES)
     done = command("check", "job.yaml", "--set", "stop.duration=2s", "--graph", "g.svg")

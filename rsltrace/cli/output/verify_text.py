@@ -7,11 +7,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rsltrace.campaign.perturb import CORE_TYPE, KERNEL
+
 if TYPE_CHECKING:
     from rsltrace.campaign.perturb import Recorded
     from rsltrace.campaign.verify import Verified
 
 _LINES_MAX = 40
+_WAY_OUT = (
+    "  OpenBLAS rounds otherwise for each core type: compare such values with a tolerance, or "
+    f"choose one\n  that all your machines can be, for every run: {CORE_TYPE}=Haswell rsltrace …"
+)
 
 
 def as_text(result: Verified, folder: Path, again: Sequence[str], *, kept: bool) -> str:
@@ -100,9 +106,11 @@ def _provoked(result: Verified, command: str) -> str:
     if not result.provoked_by:
         return "provoked by several of them together, or by chance: none alone is enough"
     each = " (each alone is enough)" if len(result.provoked_by) > 1 else " (alone is enough)"
-    return f"provoked by: {', '.join(result.provoked_by)}{each}\n  " + (
-        f"{command} --only '{result.provoked_by[0]}'"
-    )
+    lines = [
+        f"provoked by: {', '.join(result.provoked_by)}{each}",
+        f"  {command} --only '{result.provoked_by[0]}'",
+    ]
+    return "\n".join(lines + [_WAY_OUT] * (KERNEL in result.provoked_by))
 
 
 def _trouble(result: Verified, run: Recorded, command: str) -> str:
