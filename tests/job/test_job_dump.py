@@ -260,6 +260,7 @@ def test_the_resolved_job_is_complete_and_json_compatible() -> None:
         "record": {"payloads": True, "topics": ["*"], "exclude": [], "segment_events": 4096},
         "delay": None,
         "policy": None,
+        "threads": None,
         "min_time_step_ns": 0,
         "executors": None,
         "execution": None,
