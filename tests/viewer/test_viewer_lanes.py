@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,13 +10,16 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from rsltrace_viewer.model.axis import axis_text
 from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.lane_window import LaneWindow
-from rsltrace_viewer.model.lanes import drawn
+from rsltrace_viewer.model.lanes import Lanes, drawn
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.steady import ends_of, spread
 from rsltrace_viewer.model.view import SingleView
 from rsltrace_viewer.model.windows import Window, step_below, step_from
+
+from rsltrace.model.stamp import format_seconds
 
 _S = 1_000_000_000
 
@@ -25,6 +29,26 @@ def test_steps_are_one_two_or_five(least: int) -> None:
     step = step_from(least)
     assert step >= least > step_below(step) or least == 1
     assert str(step).rstrip("0") in ("1", "2", "5")
+
+
+@given(st.integers(30, 150), st.booleans(), st.floats(-0.5, 1.5), st.sets(st.integers(0, 149)))
+@example(63, False, 0.4, set(range(30, 63)))
+@example(63, False, 0.9, set(range(63)))
+@example(63, False, 0.0, {61})
+def test_marks_do_not_cover_what_the_axis_says(
+    columns: int, order: bool, at: float, marks: set[int]
+) -> None:
+    window = Window(0, columns if order else 31 * _S // 10, order)
+    position = int(window.end * at)
+    cursor, marks = window.column(position, columns), {m for m in marks if m < columns}
+    line = axis_text(Lanes(window, columns, ()), position, cursor, marks, 0)
+    assert len(line) == columns
+    assert ("≠" in line) == bool(marks) or "▲" in line
+    here = f"{position}" if order else f"{format_seconds(position)[:-3]} s"
+    told = [rf"▲ {here}|{here} ▲", "event 0", str(window.end - 1), "0.000 s", "3.100 s"]
+    told += ["one column is one event", r"[\d.]+ ms per column"]
+    assert set(re.sub(rf"(?<!\S)({'|'.join(told)})(?!\S)", "", line)) <= {" ", "≠"}
+    assert ("▲" in line) == (0 <= cursor < columns)
 
 
 @given(st.integers(0, 2 * 10**18), st.integers(1, 10**14), st.integers(1, 400))

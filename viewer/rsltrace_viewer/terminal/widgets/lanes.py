@@ -14,7 +14,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_duration, format_seconds
+from rsltrace_viewer.model.axis import axis_text
 from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.lanes import Lane, Lanes
 from rsltrace_viewer.model.timeline.short_names import ShortNames
@@ -219,7 +219,10 @@ class LanesView(Widget, can_focus=True):
         if self.lanes is None:
             return Strip([Piece(" " * width, self._style("empty"))], width)
         if y == self.size.height - 1:
-            return self._axis(self.lanes, width)
+            marks = self._divergences
+            axis = axis_text(self.lanes, self._position, self.cursor, marks, self.base_ns)
+            text = fit(" " * self._before_lanes + axis, width)
+            return Strip([Piece(text, self._style("axis"))], width)
         place = self._first_lane() + y
         if place >= len(self.lanes.lanes):
             return Strip([Piece(" " * width, self._style("empty"))], width)
@@ -249,45 +252,6 @@ class LanesView(Widget, can_focus=True):
             pieces.append(Piece(character, style))
         return Strip(pieces).simplify().adjust_cell_length(width, bar)
 
-    def _axis(self, lanes: Lanes, width: int) -> Strip:
-        window = lanes.window
-        if window.order:
-            left, right = f"event {max(window.start, 0)}", f"{window.end - 1}"
-            here = f"▲ {self._position}"
-            scale = "one column is one event"
-        else:
-            left = f"{format_seconds(window.start - self.base_ns)[:-6]} s"
-            right = f"{format_seconds(window.end - self.base_ns)[:-6]} s"
-            here = f"▲ {format_seconds(self._position - self.base_ns)[:-3]} s"
-            scale = f"{format_duration(window.step(lanes.columns))} per column"
-        if lanes.known < 1:
-            scale += f", {lanes.known:.0%} read"
-        line = [" "] * lanes.columns
-        _put(line, 0, left)
-        _put(line, lanes.columns - len(right), right)
-        middle = (lanes.columns - len(scale)) // 2
-        hidden = any(middle <= column < middle + len(scale) for column in self._divergences)
-        if not hidden and abs(self.cursor - lanes.columns // 2) > len(scale) // 2 + len(here) + 2:
-            _put(line, middle, scale)
-        for column in self._divergences:
-            _put(line, column, "≠")
-        if 0 <= self.cursor < lanes.columns:
-            start = min(self.cursor, max(lanes.columns - len(here), 0))
-            text = here if start == self.cursor else f"{here[2:]} ▲"
-            start = start if start == self.cursor else self.cursor - len(text) + 1
-            _put(line, max(start, 0), text, gap=True)
-        text = " " * self._before_lanes + "".join(line)
-        return Strip([Piece(fit(text, width), self._style("axis"))], width)
-
 
 def _has(lane: Lane, column: int) -> bool:
     return lane.letters[column] != " " if lane.letters else lane.levels[column] > 0
-
-
-def _put(line: list[str], start: int, text: str, *, gap: bool = False) -> None:
-    if gap:
-        _put(line, start - 1, " ")
-        _put(line, start + len(text), " ")
-    for offset, character in enumerate(text):
-        if 0 <= start + offset < len(line):
-            line[start + offset] = character
