@@ -150,6 +150,12 @@ def memory(runs: int, job: Path, fork_after: str | None) -> None:
                 print(flush=True)
 
 
+def quietly(command: list[str]) -> None:
+    """Run a command that says 0 or 1 in the end."""
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode in (0, 1), done.stderr
+
+
 def throughput(runs: int, rounds: int, job: Path) -> None:
     """Print runs per second, of a loop of ``record`` and of searches."""
     from distributed import LocalCluster
@@ -159,7 +165,7 @@ def throughput(runs: int, rounds: int, job: Path) -> None:
 
         def run(folder: Path) -> None:
             budget = ["--budget", str(runs), "-q", "-o", str(folder / "found")]
-            subprocess.run([*command, *budget, *words], stdout=subprocess.DEVNULL)
+            quietly([*command, *budget, *words])
 
         return run
 
@@ -167,9 +173,7 @@ def throughput(runs: int, rounds: int, job: Path) -> None:
         command = [sys.executable, "-m", "rsltrace", "record", str(job), "-q", "--force"]
         for seed in range(loops):
             order = ["--set", "policy=permutation", "--seed", str(seed)]
-            subprocess.run(
-                [*command, *order, "-o", str(folder / "run.mcap")], stdout=subprocess.DEVNULL
-            )
+            quietly([*command, *order, "-o", str(folder / "run.mcap")])
 
     loops = max(runs // 10, 5)
     with LocalCluster(n_workers=4, threads_per_worker=1, dashboard_address=None) as cluster:
