@@ -238,7 +238,7 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
             ("driver/part", "driver/part is a program that nobody has built (CMakeLists.txt of d"),
             (
                 "driver/driver_nod",
-                "did you mean 'driver_node'?: it has run.py; once it is built",
+                "did you mean 'driver_node'? It has run.py; once it is built",
             ),
             ("none/x", "package 'none' has no executable 'x': it has none"),
         ]:
