@@ -13,7 +13,7 @@ import json
 import os
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib import import_module
 from types import ModuleType
@@ -135,6 +135,20 @@ def thread_pools() -> ModuleType:
 
 
 @contextmanager
+def kept_variables(names: Iterable[str]) -> Iterator[None]:
+    """Give variables of the environment back what they were before the ``with`` block."""
+    before = {name: os.environ.get(name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+@contextmanager
 def pinned_place() -> Iterator[None]:
     """Pin what can be pinned from within: time zone, locale and numerical threads."""
     before = {name: os.environ.get(name) for name in PLACE}
@@ -142,14 +156,10 @@ def pinned_place() -> Iterator[None]:
         yield
         return
     with thread_pools().threadpool_limits(limits=1):
-        os.environ.update(PLACE)
-        time.tzset()
         try:
-            yield
+            with kept_variables(PLACE):
+                os.environ.update(PLACE)
+                time.tzset()
+                yield
         finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
             time.tzset()

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rsltrace.errors import SetupError
+from rsltrace.guard.pin import kept_variables
 
 DOMAIN_MAX = 101
 """The largest whose ports lie below those that Linux gives to anybody (RTPS 2.2, 9.6.1.1)."""
@@ -23,20 +24,12 @@ def domain(given: int | None) -> Iterator[int]:
     :raises SetupError: if all domains are taken.
     """
     names = ("ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE", "ROS_LOCALHOST_ONLY")
-    before = {name: os.environ.get(name) for name in names}
-    with _free(given) as number:
+    with kept_variables(names), _free(given) as number:
         os.environ["ROS_DOMAIN_ID"] = str(number)
         if given is None:
             os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
             os.environ.pop("ROS_LOCALHOST_ONLY", None)
-        try:
-            yield number
-        finally:
-            for name, value in before.items():
-                if value is None:
-                    os.environ.pop(name, None)
-                else:
-                    os.environ[name] = value
+        yield number
 
 
 @contextmanager

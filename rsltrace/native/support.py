@@ -19,6 +19,7 @@ _STEERING = (
     "execution",
     "clocks",
     "faults",
+    "threads",
     "vary",
 )
 """Keys of a job that say how a simulation goes; nobody can tell real time and DDS."""

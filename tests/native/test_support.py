@@ -1,0 +1,20 @@
+"""Which keys of a job a native run follows, and which it says are without effect."""
+
+from __future__ import annotations
+
+from rsltrace.job import Job
+from rsltrace.native.support import ignored
+
+FOLLOWED = {
+    *("nodes", "launch", "ros_arguments", "search_path", "stop"),
+    *("progress", "record", "checks", "metrics"),
+    *("source_name", "given_text", "base_dir", "composed"),
+}
+REFUSED = {"bags", "hooks"}
+
+
+def test_every_key_of_a_job_is_followed_refused_or_named_as_without_effect() -> None:
+    everything = set(Job.model_fields)
+    named = ignored(Job.model_construct(everything, nodes=()))
+    keys = {name for name in everything if name.removesuffix("_ns") in named}
+    assert everything - keys == FOLLOWED | REFUSED
