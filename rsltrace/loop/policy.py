@@ -24,6 +24,7 @@ class Candidate:
     ``period_ns`` is a timer's period, for others that of their node's fastest timer, or None.
     ``group`` are the names of the entities in its callback group. ``thread`` tells apart callbacks
     of one entity that are under way at the same time (``threads: {switch: every_line}``).
+    ``executor`` tells apart the simulated executors, where there are any.
     """
 
     node: str
@@ -34,6 +35,7 @@ class Candidate:
     group: tuple[str, ...]
     item: Any
     thread: int = 0
+    executor: str = ""
 
 
 class Moment(NamedTuple):
@@ -96,7 +98,13 @@ class Priority:
 
 
 class RateMonotonic:
-    """The shortest period first; what has none comes last, in order of arrival."""
+    """The shortest period first; what has none comes last, in order of arrival.
+
+    A message has the period of the timer that it came of (``follows_chains``: the middleware sees
+    to that).
+    """
+
+    follows_chains = True
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         return min(range(len(ready)), key=lambda i: (self._period(ready[i]), i))

@@ -65,6 +65,9 @@ class Recorded:
     :raises RunError: from ``choose``, if what the recording has next cannot run now.
     """
 
+    follows_chains = True
+    """Its policy may have gone by the periods of chains."""
+
     def __init__(
         self,
         file: str,

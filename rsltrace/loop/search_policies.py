@@ -80,6 +80,7 @@ class After:
     def __init__(self, time_ns: int, policy: Policy) -> None:
         self._time_ns = time_ns
         self._policy = policy
+        self.follows_chains = getattr(policy, "follows_chains", False)
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         return 0 if moment.now_ns <= self._time_ns else self._policy.choose(ready, moment)

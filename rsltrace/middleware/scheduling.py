@@ -16,6 +16,7 @@ from rsltrace.middleware.entity import Runnable
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.events.event import OutsideEvent, Owner
 from rsltrace.middleware.participant import Participant
+from rsltrace.middleware.rates import Rates, follows_chains
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import EventKind
 
@@ -88,6 +89,9 @@ class Scheduling:
         self._counts: dict[tuple[str, str, str], int] = {}
         loop.policy = plan.policy
         loop.place = self.place
+        self._rates: Rates | None = None
+        if follows_chains(plan.policy):
+            self._rates = Rates(dispatcher)
         if plan.execution:
             self._execute = dispatcher.execute
             dispatcher.execute = self._timed  # type: ignore[method-assign]
@@ -98,17 +102,19 @@ class Scheduling:
         """Describe something that may run."""
         what: Runnable = item.runnable()
         owner = what.node.fully_qualified_name if what.node is not None else ""
+        workers = self._workers_of(what)
         candidate = Candidate(
             owner,
             what.name,
             what.kind,
             what.entity,
-            what.period_ns,
+            what.period_ns if self._rates is None else self._rates.period(item, what),
             what.group_names,
             item,
             what.thread,
+            "" if workers is None else workers.name,
         )
-        return Place(candidate, self._workers_of(what), what.group)
+        return Place(candidate, workers, what.group)
 
     def _workers_of(self, what: Runnable) -> Workers | None:
         """Return the simulated executor that something runs on, if it does on any."""

@@ -67,6 +67,8 @@ def _obstacles(session: Session, job: Job) -> Iterator[str]:
                 yield "its order departs from the plain one"
         elif policy.after_ns is None or session.start_ns + policy.after_ns < loop.now_ns:
             yield "its policy chooses"
+        elif policy.order == "rate_monotonic":
+            yield "its policy follows chains"
     own = len(old.faults)
     if job.faults[:own] != old.faults:
         yield "it is without faults of the job"

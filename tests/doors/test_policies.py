@@ -86,16 +86,93 @@ def test_rate_monotonic_runs_the_shortest_period_first(order: Any) -> None:
     assert order(*makers, policy="rate_monotonic") == by_rate
 
 
-def test_subscriptions_have_the_rate_of_their_node(order: Any) -> None:
-    def listener(name: str, period_ms: int) -> Node:
-        node = Node(name)
-        node.create_subscription(String, "a", lambda m: ORDER.append(name), 10)
-        node.create_timer(period_ms / 1000, lambda: None)
-        return node
+def listener(name: str, topic: str, period_ms: int = 0, then: str = "") -> Node:
+    """Hears a topic; with a timer of its own, and a publisher that it answers on, if wanted."""
+    node = Node(name)
+    answer = node.create_publisher(String, then, 10) if then else None
 
-    makers = (Burst, lambda: listener("slow", 500), lambda: listener("fast", 90))
-    assert order(*makers, policy="fifo") == ["a", "slow", "fast", "b", "c"]
-    assert order(*makers, policy="rate_monotonic") == ["fast", "a", "b", "c", "slow"]
+    def hear(message: Any) -> None:
+        ORDER.append(name)
+        if answer is not None:
+            answer.publish(message)
+
+    node.create_subscription(String, topic, hear, 10)
+    if period_ms:
+        node.create_timer(period_ms / 1000, lambda: None)
+    return node
+
+
+def sender(name: str, topic: str, period_ms: int) -> Node:
+    node = Node(name)
+    publisher = node.create_publisher(String, topic, 10)
+    node.create_timer(period_ms / 1000, lambda: publisher.publish(String()))
+    return node
+
+
+def test_subscriptions_have_the_rate_of_their_chain(order: Any) -> None:
+    """The fast chain goes through two nodes, whatever timers they have; messages that come of no
+    timer have the rate of their node."""
+    makers = (
+        lambda: sender("slow", "s", 40),
+        lambda: sender("fast", "f", 20),
+        lambda: listener("slow_end", "s", period_ms=5),
+        lambda: listener("middle", "f", period_ms=500, then="g"),
+        lambda: listener("fast_end", "g"),
+    )
+    at_once = {"execution": {"default": "1ms"}, "executors": "single_threaded"}
+    fast, slow = ["middle", "fast_end"], ["slow_end"]
+    found = order(*makers, policy="rate_monotonic", ms=66, **at_once)
+    assert found == [*fast, *fast, *slow, *fast]
+    assert order(*makers, policy="fifo", ms=66, **at_once) != found
+
+
+def test_what_no_timer_has_caused_has_the_rate_of_its_node(order: Any) -> None:
+    class Once(Node):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__("once")
+            self.create_publisher(String, "a", 10).publish(String())
+
+    makers = (
+        lambda: listener("slow", "a", 500),
+        lambda: listener("fast", "a", 90),
+        Once,
+    )
+    assert order(*makers, policy="fifo") == ["slow", "fast"]
+    assert order(*makers, policy="rate_monotonic") == ["fast", "slow"]
+
+
+def test_wait_sets_run_what_polling_points_find(order: Any) -> None:
+    """/b is created before /a's second message comes: it waits for its polling point; timers of
+    rclcpp do not, those of rclpy do."""
+
+    class Polled(Node):  # type: ignore[misc]
+        def __init__(self) -> None:
+            super().__init__("polled")
+            self.mine = {topic: self.create_publisher(String, topic, 10) for topic in "abc"}
+            for topic in "cba":
+                self.create_subscription(String, topic, self.hear(topic), 10)
+            self.create_timer(0.1, self.send)
+            self.create_timer(0.105, lambda: ORDER.append("t"))
+
+        def send(self) -> None:
+            for topic in "ba":
+                self.mine[topic].publish(String())
+
+        def hear(self, topic: str) -> Callable[[Any], None]:
+            def hear(message: Any) -> None:
+                ORDER.append(topic)
+                if topic == "b":
+                    self.mine["c"].publish(String())
+
+            return hear
+
+    slow = {"execution": {"default": "4ms"}, "ms": 150}
+    assert order(Polled, policy="fifo", **slow) == ["b", "a", "c", "t"]
+    assert order(Polled, policy={"priority": [{"entity": "/c", "priority": 1}]}, **slow) == [
+        *("b", "c", "a", "t")
+    ]
+    assert order(Polled, policy="wait_set", **slow) == ["b", "t", "a", "c"]
+    assert order(Polled, policy="rclpy", **slow) == ["b", "a", "t", "c"]
 
 
 @pytest.mark.parametrize(

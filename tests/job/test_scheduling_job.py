@@ -81,7 +81,8 @@ def test_clocks() -> None:
     [
         (
             "policy: fifoo",
-            "job.yaml:2:9: policy: expected fifo or rate_monotonic or permutation, or a mapping "
+            "job.yaml:2:9: policy: expected fifo or rate_monotonic or wait_set or rclpy or "
+            "permutation, or a mapping "
             "with priority or departures or pct or recorded or function, got text 'fifoo'; did you "
             "mean fifo?",
         ),

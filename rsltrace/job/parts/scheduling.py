@@ -19,7 +19,7 @@ from rsltrace.job.values.target import Target, check_callable_target
 from rsltrace.job.values.times import TimeLike, parse_time
 
 WHEN_BLOCKED, EVERY_LINE = "when_blocked", "every_line"
-ORDERS = ("fifo", "rate_monotonic", "permutation")
+ORDERS = ("fifo", "rate_monotonic", "wait_set", "rclpy", "permutation")
 PRIORITY_MAX = 2**31 - 1
 
 NodeGlob = Annotated[str, check(text(check_node_glob))]
@@ -103,8 +103,9 @@ class PolicySpec(Part):
     order: Annotated[str | None, check(one_of(*ORDERS), optional=True)] = Field(
         default=None,
         description="`fifo` (first come, first served; timers last), `rate_monotonic` (shortest "
-        "period first: of the timer, or of the node's fastest timer) or `permutation` (what is "
-        "ready at one instant in an order that the seed decides).",
+        "period first: of the timer that a callback is, or that its chain begins with), `wait_set` "
+        "(rclcpp's executors: timers first, the rest as polling points find it), `rclpy` (rclpy's) "
+        "or `permutation` (what is ready at one instant in an order that the seed decides).",
         examples=["rate_monotonic"],
     )
     priority: Annotated[tuple[PriorityRuleSpec, ...] | None, parts(optional=True)] = Field(

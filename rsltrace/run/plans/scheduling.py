@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.chance.stream import Stream
@@ -18,6 +18,7 @@ from rsltrace.loop.policy import (
     RateMonotonic,
 )
 from rsltrace.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.loop.wait_set import RclpyWaitSet, WaitSet
 from rsltrace.run.plans.network import distribution_of
 from rsltrace.run.plans.target import load_target
 
@@ -115,9 +116,13 @@ def of_order(order: str, seed: int) -> Policy | None:
     """Return the policy that a job calls by a word alone, None if there is none of that name."""
     if order == "permutation":
         return Permutation(Stream(seed, "permutation"))
-    if order == "rate_monotonic":
-        return RateMonotonic()
-    return Fifo() if order == "fifo" else None
+    makers: dict[str, Callable[[], Policy]] = {
+        "fifo": Fifo,
+        "rate_monotonic": RateMonotonic,
+        "wait_set": WaitSet,
+        "rclpy": RclpyWaitSet,
+    }
+    return makers[order]() if order in makers else None
 
 
 def own_policy(function: Any, where: str) -> Policy:
