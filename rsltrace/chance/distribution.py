@@ -151,6 +151,29 @@ class Samples:
 
 
 @dataclass(frozen=True, slots=True)
+class Empirical:
+    """A table of quantiles: ``percent`` of all values, from 0 to 100, are at most ``values_ns``.
+
+    Between two lines of the table values are as likely as each other.
+    """
+
+    percent: tuple[float, ...]
+    values_ns: tuple[int, ...]
+
+    def sampler(self, stream: Stream, start_ns: int) -> Sampler:
+        uniform, percent, values = stream.uniform, self.percent, self.values_ns
+
+        def draw(now_ns: int) -> int:
+            at = uniform() * 100.0
+            place = bisect_right(percent, at, 1, len(percent) - 1)
+            low, low_ns = percent[place - 1], values[place - 1]
+            part = (at - low) / (percent[place] - low)
+            return low_ns + int(part * (values[place] - low_ns) + 0.5)
+
+        return draw
+
+
+@dataclass(frozen=True, slots=True)
 class Series:
     """A value that changes over time: points (ns since the start of the run, value in ns).
 

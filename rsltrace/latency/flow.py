@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.errors import TraceError
+from rsltrace.latency.observed import observed
 from rsltrace.latency.paths import NO_PATH, Hop, Paths, Wanted, sink_hop
 from rsltrace.model.built_in import NODE_TOPICS
 from rsltrace.model.draw import Draw, encode_draw
@@ -70,7 +71,7 @@ class Table:
 
 
 class Flow:
-    """What came of what. Times are simulated ns.
+    """What came of what. Times are simulated ns, in a native run those of its clocks.
 
     ``messages``, a row for each message and path that it came on: ``key`` (of the message), its
     ``path``, ``parent`` (the row of the message that it came of), ``taken`` (the row of how that
@@ -89,6 +90,7 @@ class Flow:
         self.lost = Table("message", "entity")
         self._wanted = wanted
         self._all = wanted.first is None
+        self._observed = observed(trace)
         self._delays = Table("message", "entity", "delay")
         self._of_events = Table("event", "taken")
         self._suspended: dict[int, deque[tuple[int, int]]] = {}
@@ -168,6 +170,8 @@ class Flow:
         outputs: list[_Selected],
     ) -> None:
         taken, busy_ns = self._came_of(index, stamp_ns, entity, kind, cause)
+        if self._observed is not None:
+            busy_ns = self._observed.durations[index]
         if taken != NONE:
             self._of_events.add(index, taken)
         if kind == _SUBSCRIPTION and (received := self._last.get(self.node_of(entity))) is not None:
@@ -176,7 +180,10 @@ class Flow:
         for place, what, sender, number in outputs:
             if what == _MESSAGE:
                 key = index << _PLACE_BITS | min(place, (1 << _PLACE_BITS) - 2)
-                row = self._publish(key, sender, stamp_ns, stamp_ns + busy_ns, taken)
+                left_ns = stamp_ns + busy_ns
+                if self._observed is not None:
+                    left_ns = self._observed.left_ns(index, place, stamp_ns)
+                row = self._publish(key, sender, stamp_ns, left_ns, taken)
                 follows = place
                 continue
             draw, value_ns = number >> _KIND_BITS, number & _VALUE
@@ -211,7 +218,7 @@ class Flow:
         than it what it sends is held back."""
         inherited = NONE
         if cause[0] < index:
-            if (taken := self._receive(entity, stamp_ns, cause)) != NONE:
+            if (taken := self._receive(index, entity, stamp_ns, cause)) != NONE:
                 return taken, 0
             if kind != _SUBSCRIPTION:
                 inherited = self._of_event(cause[0])
@@ -226,7 +233,7 @@ class Flow:
         at = bisect_left(events, event)
         return self._of_events["taken"][at] if at < len(events) and events[at] == event else NONE
 
-    def _receive(self, entity: int, stamp_ns: int, cause: tuple[int, int]) -> int:
+    def _receive(self, index: int, entity: int, stamp_ns: int, cause: tuple[int, int]) -> int:
         """Take note of a message that arrives, if it is one of those on a path."""
         if cause[1] >= 1 << _PLACE_BITS:
             return NONE
@@ -238,7 +245,9 @@ class Flow:
             last += 1
         if last == row:
             return NONE
-        return self.taken.add(row, last - row, entity, stamp_ns, self._delay(row, entity))
+        drawn, seen = self._delay(row, entity), self._observed
+        delay_ns = drawn if seen is None else seen.delay_ns(index)
+        return self.taken.add(row, last - row, entity, stamp_ns, delay_ns)
 
     def _topic(self, row: int) -> str:
         return self.paths.known[self.paths.hops[self.messages["path"][row]][-1]].topic

@@ -21,12 +21,10 @@ from rsltrace.native.things import Thing
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 from rsltrace.trace.format import PREFIX_REQUEST, PREFIX_RESPONSE, TIMING
+from rsltrace.trace.native import CUT_AFTER_NS
 from rsltrace.trace.recorder import Recorder
 
 _EVERY_S = 0.05
-_PATIENCE_NS = 2 * NS_PER_S
-"""A callback that goes on for longer is written in parts."""
-
 _PREFIX = {OutputKind.REQUEST: PREFIX_REQUEST, OutputKind.RESPONSE: PREFIX_RESPONSE}
 
 
@@ -75,7 +73,7 @@ class Pen(threading.Thread):
     def run(self) -> None:
         try:
             while not self._over.wait(_EVERY_S):
-                self.write(_PATIENCE_NS)
+                self.write(CUT_AFTER_NS)
         except BaseException as error:
             self.error = error
         self.cpu_ns = time.thread_time_ns()

@@ -14,9 +14,12 @@ import numpy.typing as npt
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT
+from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.format import CDR_HEADER, METADATA_NATIVE, TIMING_DTYPE, TOPIC_TIMINGS
 from rsltrace.trace.reader import Trace
 
+CUT_AFTER_NS = 2 * NS_PER_S
+"""A callback that goes on for longer is in the trace in parts."""
 _SUBSCRIPTION_INPUT = (EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
 
 
@@ -100,7 +103,7 @@ def callback_figures(trace: Trace) -> list[CallbackFigures]:
     if not len(rows):
         return []
     events = event_columns(trace)
-    senders = _senders(trace, events)
+    senders = senders_of(trace, events)
     figures = []
     for number in np.unique(events["entity"]).tolist():
         entity = trace.entity(number)
@@ -118,7 +121,7 @@ def callback_figures(trace: Trace) -> list[CallbackFigures]:
                 _since(own, "ready"),
                 _since(own, "source") if inputs else None,
                 _jitter(entity, own),
-                _lost(own["sequence"], senders[mine])
+                missing_numbers(own["sequence"], senders[mine])
                 if entity.kind is EntityKind.SUBSCRIPTION
                 else None,
             )
@@ -141,12 +144,12 @@ def busy_threads(trace: Trace) -> dict[int, float]:
 
 def event_columns(trace: Trace) -> npt.NDArray[np.void]:
     """Return the columns of all events that say when what ran, and because of what."""
-    names = ["stamp", "entity", "kind", "cause_event", "cause_output", "outputs"]
+    names = ["stamp", "entity", "kind", "flags", "cause_event", "cause_output", "outputs"]
     parts = [events[names] for events in trace.events()]
     return np.concatenate(parts) if parts else np.zeros(0, [(n, np.uint64) for n in names])
 
 
-def _senders(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
+def senders_of(trace: Trace, events: npt.NDArray[np.void]) -> npt.NDArray[np.int64]:
     """Return who sent the input of each event, -1 where that is unknown."""
     parts = [outputs["entity"] for outputs in trace.outputs()]
     entities = np.concatenate(parts) if parts else np.zeros(0, np.uint32)
@@ -171,7 +174,11 @@ def _jitter(entity: Entity, rows: npt.NDArray[np.void]) -> Spread | None:
     return spread(np.abs(np.diff(rows["steady"].astype(np.int64)) - period))
 
 
-def _lost(sequences: npt.NDArray[np.uint64], senders: npt.NDArray[np.int64]) -> int | None:
+def missing_numbers(
+    sequences: npt.NDArray[np.uint64], senders: npt.NDArray[np.int64]
+) -> int | None:
+    """Return how many numbers are missing between those that came, of known senders; None if
+    nothing is numbered."""
     known = (sequences != 0) & (senders >= 0)
     if not known.any():
         return None

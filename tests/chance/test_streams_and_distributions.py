@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from rsltrace.chance.distribution import (
     Constant,
     Distribution,
+    Empirical,
     Gamma,
     Lognormal,
     Normal,
@@ -171,6 +172,21 @@ def test_samples_are_drawn_evenly() -> None:
     values = draws(Samples((1, 1, 5, 9)))
     for value, share in ((1, 0.5), (5, 0.25), (9, 0.25)):
         assert abs(values.count(value) / N - share) < 4 * math.sqrt(share * (1 - share) / N)
+
+
+def test_a_table_of_quantiles() -> None:
+    values = draws(Empirical((0, 20, 90, 100), (MS, 2 * MS, 2 * MS, 9 * MS)))
+    share = values.count(2 * MS) / N
+    assert abs(share - 0.7) < 4 * math.sqrt(0.21 / N)
+    below = [value for value in values if value < 2 * MS]
+    above = [value for value in values if value > 2 * MS]
+    assert abs(len(above) / N - 0.1) < 4 * math.sqrt(0.09 / N)
+    for part, low, high in ((below, MS, 2 * MS), (above, 2 * MS, 9 * MS)):
+        assert low <= min(part)
+        assert max(part) <= high
+        mean, sd = (low + high) / 2, (high - low) / math.sqrt(12)
+        assert abs(fmean(part) - mean) < 4 * sd / math.sqrt(len(part))
+    assert set(draws(Empirical((0, 100), (5, 5)), count=10)) == {5}
 
 
 def test_constant() -> None:

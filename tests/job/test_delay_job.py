@@ -10,6 +10,7 @@ import pytest
 from rsltrace.chance.channel import Burst, Model, Outage
 from rsltrace.chance.distribution import (
     Constant,
+    Empirical,
     Gamma,
     Lognormal,
     Normal,
@@ -65,6 +66,11 @@ def model(spec: str) -> Model:
         ("{gamma: {shape: 2, scale: 1ms}}", Gamma(2.0, MS)),
         ("{gamma: {mean: 5ms, sd: 2ms}}", Gamma.of_moments(5 * MS, 2 * MS)),
         ("{samples: {values: [1ms, 2ms]}}", Samples((MS, 2 * MS))),
+        ("{empirical: {values: [1ms, 1ms, 4ms]}}", Empirical((0, 50, 100), (MS, MS, 4 * MS))),
+        (
+            "{empirical: {values: [0s, 1ms, 4ms], percent: [0, 99.5, 100]}}",
+            Empirical((0, 99.5, 100), (0, MS, 4 * MS)),
+        ),
         ("{series: {points: [[0s, 1ms], [1s, 2ms]]}}", Series(((0, MS), (S, 2 * MS)))),
         ("{series: {points: [[0, 1ms]], steps: true}}", Series(((0, MS),), True)),
         ("{drop: 0.1}", None),
@@ -172,6 +178,27 @@ def test_rules_and_outages_of_a_plan() -> None:
         (
             "default: {samples: {values: []}}",
             "job.yaml:3:31: delay.default.samples.values: an empty list has nothing to draw from",
+        ),
+        (
+            "default: {empirical: {values: [1ms]}}",
+            "job.yaml:3:24: delay.default.empirical: a table needs two values at least, the least "
+            "and the greatest",
+        ),
+        (
+            "default: {empirical: {values: [2ms, 1ms]}}",
+            "job.yaml:3:39: delay.default.empirical.values[1]: it is less than the one before",
+        ),
+        (
+            "default: {empirical: {values: [1ms, 2ms], percent: [0, 50, 100]}}",
+            "job.yaml:3:54: delay.default.empirical.percent: 2 values need as many, got 3",
+        ),
+        (
+            "default: {empirical: {values: [1ms, 2ms], percent: [5, 100]}}",
+            "job.yaml:3:55: delay.default.empirical.percent[0]: expected 0, of the least value",
+        ),
+        (
+            "default: {empirical: {values: [1ms, 2ms, 3ms], percent: [0, 0, 100]}}",
+            "job.yaml:3:63: delay.default.empirical.percent[1]: it is not more than the one before",
         ),
         (
             "default: {series: {points: [[1s, 1ms], [1s, 2ms]]}}",

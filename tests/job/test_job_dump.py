@@ -98,6 +98,10 @@ distributions = st.one_of(
         {"normal": st.fixed_dictionaries({"mean": short_times, "sd": some_times})}
     ),
     st.lists(short_times, min_size=1, max_size=3).map(lambda v: {"samples": {"values": v}}),
+    st.lists(st.integers(0, 2**55), min_size=2, max_size=4).map(
+        lambda v: {"empirical": {"values": [f"{ns}ns" for ns in sorted(v)]}}
+    ),
+    st.just({"empirical": {"values": ["1ms", "1ms", "2ms"], "percent": [0, 99.5, 100]}}),
     st.tuples(some_times, short_times, st.booleans()).map(
         lambda v: {"series": {"points": [["0s", v[1]], [v[0], v[1]]], "steps": v[2]}}
     ),

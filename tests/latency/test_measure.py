@@ -25,7 +25,14 @@ from rsltrace.latency.paths import Hop
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
-from rsltrace.trace.format import EVENT_DTYPE, OUTPUT_DTYPE
+from rsltrace.trace.format import (
+    CDR_HEADER,
+    EVENT_DTYPE,
+    METADATA_NATIVE,
+    OUTPUT_DTYPE,
+    TIMING,
+    TOPIC_TIMINGS,
+)
 
 NODES, TOPICS = 3, 4
 RUNS = int(os.environ.get("RSLTRACE_RUNS", "15"))
@@ -62,6 +69,18 @@ class MadeRun:
     complete: bool = True
     end_ns: int = 0
     ended_after: int | None = None
+    timings: list[bytes] = field(default_factory=list)
+
+    @property
+    def event_count(self) -> int:
+        return len(self.rows)
+
+    def metadata(self, name: str) -> dict[str, str]:
+        return {"mode": "native"} if self.timings and name == METADATA_NATIVE else {}
+
+    def messages(self, topic: str) -> Iterator[tuple[int, int, bytes]]:
+        assert topic == TOPIC_TIMINGS
+        return ((0, 0, CDR_HEADER + packed) for packed in self.timings)
 
     def entity(self, number: int) -> Entity:
         return self.entities[number]
@@ -222,6 +241,44 @@ def test_all_chains_of_random_graphs(seed: int) -> None:
             or any(hops[-1] is one for one in used)
         ]
         assert_measured(chain, outputs, inputs)
+
+
+def observed(run: Any, messages: list[Sent], ahead_ns: int) -> Any:
+    """Return a run as if it had been native: nothing was drawn, but clocks were read. That of the
+    system is ``ahead_ns`` of the trace's."""
+    busy = {
+        event: value & (encode_draw(1) - 1)
+        for event, kind, _, value in run.sent
+        if kind == OutputKind.DRAW and value // encode_draw(1) == Draw.EXECUTION
+    }
+    by_place = {message.cause: message for message in messages}
+    for index, stamp_ns, entity, _, _, *cause in run.rows:
+        source_ns = ready_ns = 0
+        if (message := by_place.get(tuple(cause))) is not None:
+            source_ns = message.left_ns + ahead_ns
+            ready_ns = source_ns + message.delays[entity] if entity in message.delays else 0
+        times = (index, stamp_ns, stamp_ns + ahead_ns, busy.get(index, 0), 0, source_ns, ready_ns)
+        run.timings.append(TIMING.pack(*times, 0, 1))
+    run.sent = [
+        (event, OutputKind.TASK if kind == OutputKind.DRAW else kind, *rest)
+        for event, kind, *rest in run.sent
+    ]
+    return run
+
+
+@pytest.mark.parametrize("seed", range(RUNS))
+def test_a_native_run_has_the_latencies_of_the_simulated_one_that_does_the_same(seed: int) -> None:
+    simulated, messages, _ = random_run(seed)
+    expected_of = {one.hops: one for one in measure_latencies(simulated).chains}
+    native = observed(random_run(seed)[0], messages, ahead_ns=10**18)
+    for chain in measure_latencies(native).chains:
+        other = expected_of.pop(chain.hops)
+        for measure in MEASURES:
+            assert chain.durations(measure).tolist() == other.durations(measure).tolist()
+        for parts, expected_parts in zip(chain.parts, other.parts, strict=True):
+            for part in ("link", "queue", "held", "runs"):
+                assert getattr(parts, part).tolist() == getattr(expected_parts, part).tolist()
+    assert not expected_of
 
 
 def through(message: Sent, topics: list[str], via: str) -> Iterator[list[Sent]]:

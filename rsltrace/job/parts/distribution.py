@@ -151,6 +151,51 @@ class SamplesSpec(Part):
         return self
 
 
+class EmpiricalSpec(Part):
+    """A table of quantiles: how many percent of all values are at most this; what lies between two
+    lines of it is evenly spread."""
+
+    MEANT: ClassVar[str] = "values"
+    MEANT_LIST: ClassVar[bool] = True
+
+    values_ns: Annotated[tuple[int, ...], check(items(parse_short_time))] = Field(
+        alias="values",
+        description="The quantiles, from the least value to the greatest.",
+        examples=[["1ms", "1.2ms", "4ms"]],
+    )
+    percent: Annotated[tuple[float, ...] | None, check(items(number(0, 100)), optional=True)] = (
+        Field(
+            default=None,
+            description="Of each value, the percentage of all that do not exceed it: from 0 to "
+            "100. Without it they are equally far apart.",
+            examples=[[0, 90, 100]],
+        )
+    )
+
+    @model_validator(mode="after")
+    def _a_table(self) -> EmpiricalSpec:
+        values, percent = self.values_ns, self.percent
+        if len(values) < 2:
+            raise Problem("a table needs two values at least, the least and the greatest")
+        for index in range(1, len(values)):
+            if values[index] < values[index - 1]:
+                raise Problem("it is less than the one before", ("values", index))
+        if percent is None:
+            return self
+        if len(percent) != len(values):
+            raise Problem(f"{len(values)} values need as many, got {len(percent)}", ("percent",))
+        for index, expected in ((0, 0), (len(percent) - 1, 100)):
+            if percent[index] != expected:
+                raise Problem(
+                    f"expected {expected}, of the {'greatest' if index else 'least'} value",
+                    ("percent", index),
+                )
+        for index in range(1, len(percent)):
+            if percent[index] <= percent[index - 1]:
+                raise Problem("it is not more than the one before", ("percent", index))
+        return self
+
+
 def _check_point(value: object) -> tuple[int, int]:
     if not isinstance(value, (list, tuple)) or len(value) != 2:
         raise Problem("expected a pair: [time since the start, value]")
@@ -239,6 +284,11 @@ class DistributionSpec(Part):
         description="One of some measured values.",
         examples=[{"file": "delays.txt", "unit": "ms"}],
     )
+    empirical: Annotated[EmpiricalSpec | None, given] = Field(
+        default=None,
+        description="A table of quantiles, of measured values for example.",
+        examples=[{"values": ["1ms", "1.2ms", "4ms"], "percent": [0, 90, 100]}],
+    )
     series: Annotated[SeriesSpec | None, given] = Field(
         default=None,
         description="A value that changes over time.",
@@ -252,6 +302,7 @@ class DistributionSpec(Part):
         "lognormal",
         "gamma",
         "samples",
+        "empirical",
         "series",
     )
     ALTERNATIVES: ClassVar[tuple[tuple[str, ...], ...]] = tuple((kind,) for kind in KINDS)

@@ -6,6 +6,7 @@ from rsltrace.chance.channel import Burst, Model, Outage
 from rsltrace.chance.distribution import (
     Constant,
     Distribution,
+    Empirical,
     Gamma,
     Lognormal,
     Normal,
@@ -100,6 +101,11 @@ def distribution_of(job: Job, spec: DistributionSpec) -> Distribution:
             path, name = job.resolve(samples.file), job.shown(samples.file)
             return Samples(read_samples(samples, path, name))
         return Samples(samples.values_ns or ())
+    if spec.empirical is not None:
+        values, percent = spec.empirical.values_ns, spec.empirical.percent
+        if percent is None:
+            percent = tuple(100 * index / (len(values) - 1) for index in range(len(values)))
+        return Empirical(percent, values)
     series = spec.series
     assert series is not None
     if series.file is not None:
