@@ -49,6 +49,20 @@ class Job(JobFields):
         """
         return job_resolved(self)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of it."""
+        from rsltrace.model.html import Sheet
+
+        sheet = Sheet(f"job {self.source_name}")
+        sheet.table(
+            ("", "runs", "named", "parameters"),
+            ((n.kind, n.target, n.name or "", ", ".join(n.parameters)) for n in self.nodes),
+        )
+        sheet.table(("launch file",), ((one.file,) for one in self.launch))
+        sheet.table(("bag",), ((bag.path,) for bag in self.bags))
+        sheet.text(self.to_yaml(), summary="as YAML")
+        return sheet.html()
+
     @model_validator(mode="after")
     def _check_whole(self) -> Job:
         problems = list(contradictions(self))

@@ -28,6 +28,7 @@ from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.model.finding import Finding, GuardCount, Mode
+from rsltrace.model.stamp import format_seconds
 from rsltrace.trace.cdr import unpack_code_line, unpack_detail, unpack_entity, unpack_finding
 from rsltrace.trace.chain import digest_text
 from rsltrace.trace.check import check_data_section, check_hashes, check_records
@@ -38,6 +39,7 @@ from rsltrace.trace.format import (
     METADATA_JOB,
     METADATA_OWN,
     METADATA_RESULT,
+    PREFIX_OWN,
     PREFIX_REQUEST,
     PREFIX_RESPONSE,
     TOPIC_CODE_LINES,
@@ -56,6 +58,7 @@ from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder, Decoders
+    from rsltrace.trace.tables import Tables
 
 _P = ParamSpec("_P")
 _T = TypeVar("_T")
@@ -447,6 +450,41 @@ class Trace:
             return self._decoder(found).decode(data)
         except TraceError as error:
             raise TraceError(f"{self.name}: {error}") from error
+
+    @property
+    def tables(self) -> Tables:
+        """Its events, outputs, entities and decoded messages, as tables for Arrow and pandas."""
+        from rsltrace.trace.tables import Tables
+
+        return Tables(self, self._decoder)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of it. Raises TraceError where it is damaged."""
+        from rsltrace.model.html import Sheet
+
+        sheet = Sheet(f"trace {Path(self.name).name}")
+        if not self.complete:
+            sheet.line("cut off: the run was killed or crashed, or is still going on")
+        sheet.facts(
+            (
+                ("ended", self.result.get("stop_reason", "")),
+                ("digest", self.digest),
+                (
+                    "simulated",
+                    f"{format_seconds(self.start_ns)} s to {format_seconds(self.end_ns)} s",
+                ),
+                ("events", self.event_count),
+                ("outputs", self.output_count),
+            )
+        )
+        nodes = [entity for entity in self.entities.values() if entity.kind is EntityKind.NODE]
+        sheet.table(("node", "class"), ((node.name, node.type) for node in nodes))
+        topics = [c for c in self.channels.values() if not c.topic.startswith(PREFIX_OWN)]
+        sheet.table(
+            ("topic", "type", "messages"),
+            ((one.topic, one.type, self.message_counts.get(one.id, 0)) for one in topics),
+        )
+        return sheet.html()
 
     def _decoder(self, channel: ChannelInfo) -> Decoder:
         if self._decoders is None:

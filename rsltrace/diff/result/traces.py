@@ -124,3 +124,35 @@ class Diff:
             agrees = self.agreeing or (self.native is not None and self.native.compared)
             return 0 if self.as_far_as_they_go and agrees else EXIT_DIVERGED
         return EXIT_WITHIN_TOLERANCE if self.within_tolerance else EXIT_DIVERGED
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of it."""
+        from rsltrace.model.html import Sheet
+        from rsltrace.model.stamp import format_seconds
+        from rsltrace.words.phrases import as_sentence
+
+        sheet = Sheet(as_sentence(self.sentence))
+        sheet.line(f"{self.verdict.value}; the first {self.agreeing} events agree")
+        sheet.table(
+            ("", "trace", "events", "ends at", "digest", "stopped by"),
+            (
+                (name, s.path, s.events, f"{format_seconds(s.end_ns)} s", s.digest, s.stop_reason)
+                for name, s in (("a", self.a), ("b", self.b))
+            ),
+        )
+        if (shown := self.shown) is None:
+            return sheet.html()
+        sheet.table(
+            ("", "topic", "field", "a", "b"),
+            (
+                ("input" if m.position < 0 else f"output {m.position}", m.topic, f.path, f.a, f.b)
+                for m in shown.messages
+                for f in m.fields
+            ),
+        )
+        if shown.root_sentence:
+            sheet.line(f"cause: {shown.root_sentence}")
+        sheet.table(("reaches", "after"), ((r.topic, f"{r.after_ns} ns") for r in shown.reaches))
+        if shown.next_step:
+            sheet.line(f"next: {shown.next_step}")
+        return sheet.html()

@@ -1,0 +1,226 @@
+"""Events, outputs and entities as record batches: a segment of rows becomes columns.
+
+A segment lies in memory row by row, Arrow wants columns: each is copied out once, as it is. Names
+and kinds are dictionary-encoded, so a row costs a number for each.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import TraceError
+from rsltrace.model.entity import Entity
+from rsltrace.model.event import (
+    NO_EVENT,
+    NO_SEQUENCE,
+    EventFlag,
+    EventKind,
+    Output,
+    OutputKind,
+)
+from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.tables.table import Table
+
+_WHOLE_MAX = np.uint64(2**63 - 1)
+
+
+class Source(Protocol):
+    """What a table needs of a trace."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def entities(self) -> dict[int, Entity]: ...
+    @property
+    def channels(self) -> Mapping[int, ChannelInfo]: ...
+    def events(self, first: int = 0, last: int | None = None) -> Iterator[npt.NDArray[np.void]]: ...
+    def outputs(
+        self, first: int = 0, last: int | None = None
+    ) -> Iterator[npt.NDArray[np.void]]: ...
+    def channel_of(self, output: Output) -> ChannelInfo | None: ...
+    def messages_of(self, channels: frozenset[int]) -> Iterator[tuple[int, int, int, bytes]]: ...
+
+
+class Labels:
+    """Texts that many rows have, in Arrow's dictionary encoding: by a number of each row."""
+
+    def __init__(self, arrow: Any, texts: Mapping[int, str | None]) -> None:
+        """``texts`` are those of the rows' numbers; those missing, and None, become null."""
+        known = dict.fromkeys(text for text in texts.values() if text is not None)
+        places = {text: place for place, text in enumerate(known)}
+        self._arrow = arrow
+        self._texts = arrow.array(list(known), arrow.string())
+        self._places = np.full(max(texts, default=0) + 2, -1, dtype=np.int32)
+        for number, text in texts.items():
+            if text is not None:
+                self._places[number] = places[text]
+        self.type = arrow.dictionary(arrow.int32(), arrow.string())
+
+    def of(self, numbers: npt.NDArray[np.unsignedinteger]) -> Any:
+        """Return the texts of some rows."""
+        places = self._places[np.minimum(numbers, len(self._places) - 1)]
+        indices = self._arrow.array(places, mask=places < 0)
+        return self._arrow.DictionaryArray.from_arrays(indices, self._texts)
+
+
+def node_names(entities: Mapping[int, Entity]) -> dict[int, str | None]:
+    """Return the names of the entities' nodes; None for what belongs to the run itself."""
+    nodes = {e.id: entities.get(e.node) for e in entities.values()}
+    return {number: node.name if node and node.id else None for number, node in nodes.items()}
+
+
+def event_table(trace: Source, first: int, last: int | None) -> Table:
+    """Return the events as a table."""
+
+    def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
+        whole, hashes, number = arrow.int64(), arrow.uint64(), arrow.uint32()
+        entities = trace.entities
+        kinds = Labels(arrow, {kind.value: kind.label for kind in EventKind})
+        nodes = Labels(arrow, node_names(entities))
+        names = Labels(arrow, {e.id: e.name or None for e in entities.values()})
+        schema = arrow.schema(
+            {
+                "index": whole,
+                "stamp_ns": whole,
+                "kind": kinds.type,
+                "node": nodes.type,
+                "name": names.type,
+                "entity": number,
+                "cause_event": whole,
+                "cause_output": number,
+                "outputs": number,
+                "raised": arrow.bool_(),
+                "suspended": arrow.bool_(),
+                "input_hash": hashes,
+                "output_hash": hashes,
+                "state_hash": hashes,
+                "chain_hash": hashes,
+            }
+        )
+
+        def batch(events: npt.NDArray[np.void]) -> Any:
+            check_kinds(trace, events["kind"], EventKind)
+            flags, no_cause = events["flags"], events["cause_event"] == np.uint64(NO_EVENT)
+            columns = [
+                arrow.array(whole_numbers(trace, events["index"])),
+                arrow.array(whole_numbers(trace, events["stamp"])),
+                kinds.of(events["kind"]),
+                nodes.of(events["entity"]),
+                names.of(events["entity"]),
+                arrow.array(_column(events, "entity")),
+                arrow.array(events["cause_event"].astype(np.int64), mask=no_cause),
+                arrow.array(_column(events, "cause_output"), mask=no_cause),
+                arrow.array(_column(events, "outputs")),
+                arrow.array(flags & np.uint8(EventFlag.RAISED) != 0),
+                arrow.array(flags & np.uint8(EventFlag.SUSPENDED) != 0),
+                arrow.array(_column(events, "input_hash")),
+                arrow.array(_column(events, "output_hash")),
+                arrow.array(_column(events, "state_hash"), mask=events["state_hash"] == 0),
+                arrow.array(_column(events, "chain_hash")),
+            ]
+            return arrow.record_batch(columns, schema=schema)
+
+        return schema, map(batch, trace.events(first, last))
+
+    return Table(make)
+
+
+def output_table(trace: Source, first: int, last: int | None) -> Table:
+    """Return the outputs as a table."""
+
+    def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
+        whole, number = arrow.int64(), arrow.uint32()
+        entities = trace.entities
+        kinds = Labels(arrow, {kind.value: kind.label for kind in OutputKind})
+        nodes = Labels(arrow, node_names(entities))
+        names = Labels(arrow, {e.id: e.name or None for e in entities.values()})
+        types = Labels(arrow, {e.id: e.type or None for e in entities.values()})
+        schema = arrow.schema(
+            {
+                "event": whole,
+                "stamp_ns": whole,
+                "kind": kinds.type,
+                "node": nodes.type,
+                "name": names.type,
+                "type": types.type,
+                "entity": number,
+                "sequence": number,
+                "hash": arrow.uint64(),
+            }
+        )
+
+        def batch(pair: tuple[npt.NDArray[np.void], npt.NDArray[np.void]]) -> Any:
+            events, outputs = pair
+            check_kinds(trace, outputs["kind"], OutputKind)
+            owners = (outputs["event"] - events["index"][0]).astype(np.intp)
+            sequences = _column(outputs, "sequence")
+            columns = [
+                arrow.array(whole_numbers(trace, outputs["event"])),
+                arrow.array(whole_numbers(trace, events["stamp"])[owners]),
+                kinds.of(outputs["kind"]),
+                nodes.of(outputs["entity"]),
+                names.of(outputs["entity"]),
+                types.of(outputs["entity"]),
+                arrow.array(_column(outputs, "entity")),
+                arrow.array(sequences, mask=sequences == NO_SEQUENCE),
+                arrow.array(_column(outputs, "hash")),
+            ]
+            return arrow.record_batch(columns, schema=schema)
+
+        pairs = zip(trace.events(first, last), trace.outputs(first, last), strict=True)
+        return schema, map(batch, pairs)
+
+    return Table(make)
+
+
+def entity_table(trace: Source) -> Table:
+    """Return the entities as a table."""
+
+    def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
+        entities = list(trace.entities.values())
+        nodes = node_names(trace.entities)
+        columns: dict[str, tuple[Any, Sequence[Any]]] = {
+            "entity": (arrow.uint32(), [e.id for e in entities]),
+            "kind": (arrow.string(), [e.kind.label for e in entities]),
+            "node": (arrow.string(), [nodes[e.id] for e in entities]),
+            "name": (arrow.string(), [e.name for e in entities]),
+            "type": (arrow.string(), [e.type for e in entities]),
+            "created_ns": (arrow.uint64(), [e.created_ns for e in entities]),
+            "source": (arrow.string(), [e.source for e in entities]),
+            "detail": (arrow.string(), [json.dumps(e.detail) for e in entities]),
+        }
+        schema = arrow.schema([(name, kind) for name, (kind, _) in columns.items()])
+        arrays = [arrow.array(values, kind) for kind, values in columns.values()]
+        return schema, iter([arrow.record_batch(arrays, schema=schema)])
+
+    return Table(make)
+
+
+def whole_numbers(trace: Source, values: npt.NDArray[np.uint64]) -> npt.NDArray[np.int64]:
+    """Return indexes or stamps as signed integers, whose differences are no surprise."""
+    if len(values) and values.max() > _WHOLE_MAX:
+        raise TraceError(f"{trace.name}: an event is later than any time of ROS")
+    return values.astype(np.int64)
+
+
+def check_kinds(
+    trace: Source, values: npt.NDArray[np.unsignedinteger], known: type[IntEnum]
+) -> None:
+    """Raise TraceError for a kind that this version does not know."""
+    unknown = set(np.unique(values).tolist()) - {kind.value for kind in known}
+    if unknown:
+        raise TraceError(
+            f"{trace.name}: {min(unknown)} is not a valid {known.__name__}; a newer rsltrace wrote "
+            "this trace"
+        )
+
+
+def _column(rows: npt.NDArray[np.void], name: str) -> npt.NDArray[Any]:
+    column: npt.NDArray[Any] = np.ascontiguousarray(rows[name])
+    return column
