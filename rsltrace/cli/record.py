@@ -80,6 +80,12 @@ if TYPE_CHECKING:
     metavar="ID",
     help="With --native: take part in this DDS domain (default: alone in a free one).",
 )
+@click.option(
+    "--policy",
+    type=click.Choice(("rate_monotonic", "priority")),
+    help="With --native: executors take what is most urgent first, and their threads are in the "
+    "real-time class where permitted: by rate, or by the rules of the job's policy.",
+)
 @click.option("-q", "--quiet", is_flag=True, help="No progress, no log records of the nodes.")
 def record(
     words: tuple[str, ...],
@@ -98,6 +104,7 @@ def record(
     native: bool,
     executor: str | None,
     domain: int | None,
+    policy: str | None,
     quiet: bool,
 ) -> None:
     """Run JOB (a job.yaml), or a launch file's nodes, deterministically and record the trace.
@@ -119,7 +126,7 @@ def record(
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         end_with_run()
-    _check_options(native, executor, domain, replay, seed)
+    _check_options(native, executor, domain, policy, replay, seed)
     changes = all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:
@@ -142,6 +149,7 @@ def record(
             as_json=as_json,
             executor=executor or "single",
             domain=domain,
+            policy=policy,
         )
         return
     told: list[str] = []
@@ -162,13 +170,25 @@ def record(
 
 
 def _check_options(
-    native: bool, executor: str | None, domain: int | None, replay: Path | None, seed: int | None
+    native: bool,
+    executor: str | None,
+    domain: int | None,
+    policy: str | None,
+    replay: Path | None,
+    seed: int | None,
 ) -> None:
     """Raise a usage error for options that make no sense together."""
     if native and (replay is not None or seed is not None):
         raise click.UsageError("--native steers nothing: --replay and --seed are of no use with it")
     if not native and (executor is not None or domain is not None):
         raise click.UsageError("--executor and --domain are for native runs: add --native")
+    if not native and policy is not None:
+        raise click.UsageError(
+            "--policy is for native runs: add --native, or say what a simulation goes by with "
+            "--set policy=rate_monotonic"
+        )
+    if policy is not None and executor == "multi":
+        raise click.UsageError("--policy is for single-threaded executors: leave --executor out")
 
 
 def _check_first(job: Job, bag: Path | None, *, force: bool) -> None:
@@ -231,6 +251,7 @@ def _record_native(
     as_json: bool,
     executor: str,
     domain: int | None,
+    policy: str | None,
 ) -> None:
     """Run a job natively, and end the process."""
     from rsltrace.cli.output.native_run import leave, report_native, run_native
@@ -243,6 +264,7 @@ def _record_native(
         shows=not (quiet or as_json),
         executor=executor,
         domain=domain,
+        policy=policy,
         note=_note,
         begins=lambda: _say_if_it_has_no_end(job),
     )

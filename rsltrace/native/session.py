@@ -27,6 +27,7 @@ from rsltrace.native.executors import Executors, failure_of
 from rsltrace.native.ledger import Ledger
 from rsltrace.native.nodes import Nodes
 from rsltrace.native.pen import Clocks, Pen
+from rsltrace.native.priorities import Priorities
 from rsltrace.native.things import Things
 from rsltrace.run.inputs import check_output
 from rsltrace.run.launch_files import without_launch_files
@@ -75,20 +76,25 @@ def run_natively(
     echo: bool = True,
     executor: str = "single",
     domain_id: int | None = None,
+    policy: str | None = None,
     observer: Observer | None = None,
 ) -> NativeResult:
     """Run a job natively and record it. What goes wrong in the run is in the result's ``error``.
 
     ``echo`` lets nodes print their log records. ``executor`` is that of each entry, ``single`` or
     ``multi`` (threaded). Without a ``domain_id`` the nodes are alone in a free domain of this
-    machine.
+    machine. ``policy`` gives callbacks and threads priorities: ``rate_monotonic``, or ``priority``,
+    that of the job.
 
     :raises JobError, SetupError, OutputError: the run could not start or be written.
     """
     check_free()
     expanded = without_launch_files(job)
     support.check(expanded.job)
-    run = _Run(expanded.job, observer or Observer(), EXECUTORS[executor], domain_id)
+    rules = support.priority_rules(expanded.job, policy)
+    run = _Run(expanded.job, observer or Observer(), EXECUTORS[executor], domain_id, policy)
+    if policy is not None:
+        run.priorities = Priorities(run.things, rules)
     run.notes += expanded.notes
     with kept_process(), ExitStack() as stack:
         stack.enter_context(search_path(run.job))
@@ -105,6 +111,7 @@ class _Run:
     observer: Observer
     executor: str
     domain_id: int | None
+    policy: str | None = None
     notes: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -112,6 +119,7 @@ class _Run:
         self.things = Things(self.ledger.add)
         self.boundary = Boundary(self.ledger, self.things)
         self.nodes = Nodes(self.things)
+        self.priorities: Priorities | None = None
         self.error: RunError | None = None
         self.ending: Stop | None = None
         self._stopped = threading.Event()
@@ -127,7 +135,9 @@ class _Run:
         job, note = self.job, self.observer.note or (lambda text: None)
         self.entries = node_entries(job, told=note)
         self.conditions = tuple(stop_conditions(job, self._start_ns))
-        if without := support.ignored(job):
+        if self.priorities is not None and self.priorities.refused:
+            note(f"{self.priorities.refused}; executors go by priorities all the same")
+        if without := support.ignored(job, self.policy):
             note(f"a native run is not steered; without effect in the job: {', '.join(without)}")
         self.domain = stack.enter_context(domain(self.domain_id))
         for place in (output, unfinished(output)):
@@ -148,6 +158,8 @@ class _Run:
         self.pen = Pen(self.ledger, recorder, clocks, job.base_dir)
         executors = Executors(self.ledger, self.things, self.boundary)
         stack.enter_context(self.boundary.watched(boundary().real))
+        if self.priorities is not None:
+            stack.enter_context(self.priorities.watched(boundary().real))
         stack.enter_context(self.nodes.watched())
         stack.enter_context(executors.watched())
         self._watch_topic()
@@ -162,7 +174,12 @@ class _Run:
             "discovery": "this machine" if self.domain_id is None else "as the environment says",
             "wall_ns": str(self.clocks.wall_ns),
             "steady_ns": str(self.clocks.steady_ns),
-            "ignored": ", ".join(support.ignored(self.job)),
+            "ignored": ", ".join(support.ignored(self.job, self.policy)),
+            **(
+                {}
+                if self.priorities is None
+                else {"policy": self.policy or "", "priorities": self.priorities.description}
+            ),
         }
 
     def _watch_topic(self) -> None:
@@ -224,6 +241,10 @@ class _Run:
             self.observer.progress(now_ns, end_ns_of(self.job, self._start_ns), events)
 
     def _make_executor(self) -> Any:
+        if self.priorities is not None:
+            from rsltrace.native.priority_executor import PriorityExecutor
+
+            return PriorityExecutor(self.priorities)
         import rclpy.executors
 
         return getattr(rclpy.executors, self.executor)()
@@ -294,6 +315,7 @@ class _Run:
                 "observer_ns": str(observer_ns),
                 "pen_ns": str(pen_ns),
                 "unknown_causes": str(self.pen.causes.unknown),
+                **self._levels(),
             },
             replace=self._begun_ns > 0 or exit_code == 0,
         )
@@ -310,6 +332,12 @@ class _Run:
             notes=(*self.notes, *self._said(stuck)),
             kept=self.writer.kept,
         )
+
+    def _levels(self) -> dict[str, str]:
+        if self.priorities is None:
+            return {}
+        levels = sorted(self.priorities.levels.items(), key=lambda one: (-one[1], one[0]))
+        return {"thread_priorities": ", ".join(f"{name} {level}" for name, level in levels)}
 
     def _said(self, stuck: tuple[str, ...]) -> Iterator[str]:
         for name in stuck:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, locate
+from rsltrace.loop.policy import PriorityRule
 
 _STEERING = (
     "start_ns",
@@ -52,9 +53,29 @@ def check(job: Job) -> None:
         raise JobError("there are no nodes to run natively", where=locate(job, ("nodes",)))
 
 
-def ignored(job: Job) -> list[str]:
-    """Return the keys of a job that have no effect natively."""
+def priority_rules(job: Job, policy: str | None) -> tuple[PriorityRule, ...] | None:
+    """Return the rules that a native run's priorities go by, None if they go by rate.
+
+    :raises JobError: the job has none, and ``policy`` is ``priority``.
+    """
+    if policy != "priority":
+        return None
+    rules = None if job.policy is None else job.policy.priority
+    if rules is None:
+        raise JobError(
+            "--policy priority takes the rules of the job, which has none: write for example "
+            "policy: {priority: [{node: /controller, priority: 10}]}",
+            where=locate(job, ("policy",)),
+        )
+    return tuple(PriorityRule(r.priority, r.node, r.entity, r.group_of) for r in rules)
+
+
+def ignored(job: Job, policy: str | None = None) -> list[str]:
+    """Return the keys of a job that have no effect natively, where priorities go by ``policy``."""
     keys = [key.removesuffix("_ns") for key in _STEERING if key in job.model_fields_set]
+    if "policy" in keys and job.policy is not None and policy is not None:
+        given = job.policy.order or ("priority" if job.policy.priority is not None else "")
+        keys = [key for key in keys if key != "policy" or policy != given]
     if any(spec.guard is not None for spec in job.nodes) and "guard" not in keys:
         keys.append("guard")
     return keys

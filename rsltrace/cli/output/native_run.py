@@ -31,6 +31,7 @@ def run_native(
     shows: bool,
     executor: str,
     domain: int | None,
+    policy: str | None,
     note: Callable[[str], None],
     begins: Callable[[], None],
 ) -> NativeResult:
@@ -52,6 +53,7 @@ def run_native(
             echo=echo,
             executor=executor,
             domain_id=domain,
+            policy=policy,
             observer=Observer(progress=on_progress, interrupt=interrupt, note=note),
         )
 

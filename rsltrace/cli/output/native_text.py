@@ -34,6 +34,8 @@ def native_lines(trace: Trace) -> list[str]:
     ]
     if described.get("ignored"):
         rows.append(("  of the job without effect", printable(described["ignored"])))
+    if levels := trace.result.get("thread_priorities"):
+        rows.append(("  real-time priorities", printable(levels)))
     observer, pen = (trace.result.get(key, "") for key in ("observer_ns", "pen_ns"))
     if observer.isdigit() and pen.isdigit():
         text = f"{format_duration(int(observer))} per callback in its thread (median), and "
