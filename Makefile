@@ -17,7 +17,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs samples bench pictures clean
+.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -26,7 +26,7 @@ $(INSTALLED): pyproject.toml
 		|| { echo "rsltrace needs Python 3.10 to 3.13; set PYTHON=python3.12 or the like"; exit 1; }
 	@echo "setting up $(VENV) (once, about a minute)"
 	@$(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,remote,rerun,dev]'
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[$(ROS),view,remote,rerun,dev,docs]'
 	@touch $@
 
 demo: $(INSTALLED)
@@ -98,6 +98,15 @@ test-kilted:
 docs: $(INSTALLED)
 	$(BIN)/python -m rsltrace.job.documents.reference > docs/jobs.md
 	$(BIN)/python docs/draw_architecture.py
+
+# The site: strict, so a link that leads nowhere or a page that nobody can reach is an error.
+# `make docs-serve` shows it at http://127.0.0.1:8000 while one writes.
+MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs
+site: $(INSTALLED)
+	$(MKDOCS) build --quiet --strict
+
+docs-serve: $(INSTALLED)
+	$(MKDOCS) serve
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py

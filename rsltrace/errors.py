@@ -41,7 +41,8 @@ class RsltraceError(Exception):
 class JobError(RsltraceError):
     """A job that cannot be used.
 
-    ``where`` is ``file:line:column`` (or as much of it as is known); the message begins with it.
+    What to do: mend the line that the message names; ``rsltrace check`` tries a job without
+    running it. ``where`` is ``file:line:column`` (or as much of it as is known); the message begins with it.
     """
 
     def __init__(self, message: str, *, where: str | None = None) -> None:
@@ -50,13 +51,17 @@ class JobError(RsltraceError):
 
 
 class SetupError(RsltraceError):
-    """Something the run needs is not installed."""
+    """Something the run needs is not installed.
+
+    What to do: install what the message names, or source the ROS 2 that has it.
+    """
 
 
 class BagError(RsltraceError):
     """A rosbag2 recording that cannot be read or played.
 
-    ``glob`` is that of the topics to play which fits none.
+    What to do: look at the recording with ``ros2 bag info``; of topics that a glob does not fit,
+    the message names those that are near. ``glob`` is that of the topics to play which fits none.
     """
 
     def __init__(self, message: str, *, glob: str | None = None) -> None:
@@ -65,40 +70,68 @@ class BagError(RsltraceError):
 
 
 class TraceError(RsltraceError):
-    """A trace that cannot be read or compared."""
+    """A trace that cannot be read or compared.
+
+    What to do: ``rsltrace info --check`` says how far the file is whole. Of a damaged file, record
+    the run again: the same job gives the same trace.
+    """
 
 
 class TraceFormatError(TraceError):
-    """The file is not an rsltrace trace, or is one of a format this version cannot read."""
+    """The file is not an rsltrace trace, or is one of a format this version cannot read.
+
+    What to do: name a file that ``rsltrace record`` wrote; plain recordings can be compared
+    (``rsltrace diff``) and looked at (``rsltrace view``), not replayed.
+    """
 
 
 class ReplayError(TraceError):
-    """A trace cannot be replayed: what it needs is not here, or nobody has said to trust it."""
+    """A trace cannot be replayed: what it needs is not here, or nobody has said to trust it.
+
+    What to do: go to the folder of its job, or say ``--trust`` if you know who wrote the trace.
+    """
 
 
 class BisectError(RsltraceError):
-    """No commit can be named: no repository, ends that do the same, a check without an answer."""
+    """No commit can be named: no repository, ends that do the same, a check without an answer.
+
+    What to do: compare the two ends by hand first (``rsltrace record`` in each, ``rsltrace diff``).
+    """
 
 
 class DebugError(RsltraceError):
-    """A debugging session cannot do what it is asked; it goes on unless the message says not."""
+    """A debugging session cannot do what it is asked; it goes on unless the message says not.
+
+    What to do: ``help`` at the prompt lists what can be asked.
+    """
 
 
 class ExploreError(RsltraceError):
-    """A search for a failing run cannot begin or go on. What it has found so far is kept."""
+    """A search for a failing run cannot begin or go on. What it has found so far is kept.
+
+    What to do: mend what the message names, then go on with ``--resume``.
+    """
 
 
 class EditError(TraceError):
-    """An edit that cannot be understood, or that cannot be made where it should be."""
+    """An edit that cannot be understood, or that cannot be made where it should be.
+
+    What to do: ``rsltrace cat`` shows the events and their numbers, docs/what-if.md what can be
+    changed at which.
+    """
 
 
 class OutputError(RsltraceError):
-    """The trace cannot be written."""
+    """The trace cannot be written.
+
+    What to do: another name (``-o``), ``--force`` to replace what is there, or room on the disk.
+    """
 
 
 class ConditionError(RsltraceError):
     """A breakpoint's condition, or an expression, that cannot be understood or not be evaluated.
 
+    What to do: mend what the carets point at; docs/debugging.md lists what there is to ask.
     ``text`` is what was typed, ``start`` and ``end`` say which characters of it are meant. The
     message shows them.
     """
@@ -114,11 +147,17 @@ class ConditionError(RsltraceError):
 
 
 class CheckError(RsltraceError):
-    """A check of a job that cannot be held against a run."""
+    """A check of a job that cannot be held against a run.
+
+    What to do: mend the check's expression or function; docs/checks.md has the forms.
+    """
 
 
 class RunError(RsltraceError):
-    """The run went wrong. What happened until then is in the trace."""
+    """The run went wrong. What happened until then is in the trace.
+
+    What to do: ``rsltrace view`` the trace, from its end backwards.
+    """
 
     exit_code = EXIT_RUN
 
@@ -126,7 +165,8 @@ class RunError(RsltraceError):
 class NodeError(RunError):
     """User code raised: a constructor or a callback.
 
-    ``node`` and ``entity`` name it, ``stamp_ns`` is the simulated time, ``traceback_text`` the
+    What to do: the traceback names the line; ``rsltrace debug`` stops before it, as often as you
+    like. ``node`` and ``entity`` name it, ``stamp_ns`` is the simulated time, ``traceback_text`` the
     user's traceback without rsltrace's own frames.
     """
 
@@ -141,19 +181,34 @@ class NodeError(RunError):
 
 
 class LivelockError(RunError):
-    """Events follow each other without end while simulated time stands still."""
+    """Events follow each other without end while simulated time stands still.
+
+    What to do: give one of the callbacks that the message names a timer or a delay, or raise
+    ``livelock_limit`` if they do end.
+    """
 
 
 class DeadlockError(RunError):
-    """Something waits for what can never come."""
+    """Something waits for what can never come.
+
+    What to do: the message names the line that waits, and for what; ``rsltrace check`` shows who
+    offers which service.
+    """
 
 
 class UnsupportedError(RunError):
-    """A node used a part of rclpy that the simulation does not offer."""
+    """A node used a part of rclpy that the simulation does not offer.
+
+    What to do: what the message says instead; or leave that node out (``nodes:``).
+    """
 
 
 class GuardError(RunError):
-    """A node made a call whose answer can differ from run to run, and its job forbids that."""
+    """A node made a call whose answer can differ from run to run, and its job forbids that.
+
+    What to do: take the value from ROS (clock, parameter, message), or let the guard record the
+    answers: ``guard: {mode: record}``, docs/guard.md.
+    """
 
 
 def nearest(word: str, names: Iterable[str]) -> str | None:

@@ -13,11 +13,14 @@ import pytest
 from rsltrace.cli.main import cli
 
 ROOT = Path(__file__).parent.parent
-DOCUMENTS = sorted([ROOT / "README.md", *ROOT.glob("docs/*.md"), *ROOT.glob("*/*/README.md")])
+PAGES = sorted(ROOT.glob("docs/**/*.md"))
+DOCUMENTS = sorted([ROOT / "README.md", *PAGES, *ROOT.glob("*/*/README.md")])
 _LINK = re.compile(r"\]\((?!https?:)([^)\s#]*)(#[^)\s]*)?\)")
 _FILE = re.compile(r"`((?:docs|examples|benchmarks|sample_traces|tests)/[\w./-]*[\w/])`")
 _CODE = re.compile(r"`((?:rsltrace|viewer)/[\w./-]+)`")
 _FENCE = re.compile(r"^```.*?^```", re.M | re.S)
+_TYPED = re.compile(r"\A```console$|^(?:\$|\(rsltrace\)|\(Pdb\)) ", re.M)
+_RUN_OR_NOT = re.compile(r"<!-- (?:run(?:: \S+)?|not run: \w.{10,}) -->")
 _OPTION = re.compile(r"(?<=\s)--?[a-zA-Z][\w-]*")
 
 documents = pytest.mark.parametrize("path", DOCUMENTS, ids=lambda p: str(p.relative_to(ROOT)))
@@ -81,3 +84,44 @@ def test_the_picture_of_the_architecture_is_current_and_complete() -> None:
     drawn = {name for box in drawing["BOXES"] for name in re.findall(r"\w+", box.name)}
     packages = {path.parent.name for path in ROOT.glob("rsltrace/*/__init__.py")}
     assert packages <= drawn
+
+
+@documents
+def test_every_session_is_run_or_says_why_not(path: Path) -> None:
+    unmarked = [fence.split("\n")[:3] for fence in sessions(path.read_text("utf-8"))]
+    assert not unmarked, (
+        f"{path}: put <!-- run --> before each of these blocks, and tests/run/"
+        f"test_console_documents.py runs it, or <!-- not run: REASON -->: {unmarked}"
+    )
+
+
+def sessions(text: str) -> Iterator[str]:
+    """Yield the blocks in which somebody types, and that no comment before them explains."""
+    before = 0
+    for fence in _FENCE.finditer(text):
+        mark = text[before : fence.start()].rstrip("\n").rpartition("\n")[2]
+        before = fence.end()
+        if _TYPED.search(fence[0]) and not _RUN_OR_NOT.fullmatch(mark):
+            yield fence[0]
+
+
+def test_a_session_that_nobody_runs_is_noticed() -> None:
+    block = "```console\n$ ls\n```\n"
+    marked = "<!-- run -->\n", "<!-- run: husky -->\n", "<!-- not run: takes a robot -->\n"
+    assert not any(list(sessions(f"text\n{mark}{block}")) for mark in marked)
+    for mark in ("", "text\n", "<!-- not run -->\n", "<!-- not run: -->\n", "<!-- file: x -->\n"):
+        assert len(list(sessions(f"<!-- run -->\n{block}{mark}{block}"))) == 1, mark
+    assert list(sessions("```\n$ ls\n```\n"))
+    assert list(sessions("```\n(rsltrace) up\n```\n"))
+    assert not list(sessions("```yaml\na: $x\n```\n"))
+
+
+def test_every_page_has_its_place_on_the_site() -> None:
+    """mkdocs.yml is read as text: it holds a tag that only MkDocs knows."""
+    nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
+    named = re.findall(r"[\w/-]+\.md", nav)
+    pages = {path.relative_to(ROOT / "docs").as_posix() for path in PAGES}
+    assert len(named) == len(set(named))
+    missing = sorted(pages - set(named))
+    assert not missing, f"add these to nav: in mkdocs.yml, where a reader looks for them: {missing}"
+    assert not set(named) - pages, "mkdocs.yml names pages that are not there"

@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[2]
 DATA = ROOT.parent / "shared" / "data"
 DOCUMENTS = sorted(
     path
-    for path in (ROOT / "README.md", *ROOT.glob("docs/*.md"))
+    for path in (ROOT / "README.md", *ROOT.glob("docs/**/*.md"))
     if "<!-- run" in path.read_text("utf-8")
 )
 _BLOCK = re.compile(
@@ -113,7 +113,7 @@ def console(command: str, folder: Path, typed: str = "") -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_every_command_does_what_it_shows(document: Path, tmp_path: Path) -> None:
     ran = 0
     for step in steps(document.read_text("utf-8")):
