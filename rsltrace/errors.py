@@ -42,7 +42,8 @@ class JobError(RsltraceError):
     """A job that cannot be used.
 
     What to do: mend the line that the message names; ``rsltrace check`` tries a job without
-    running it. ``where`` is ``file:line:column`` (or as much of it as is known); the message begins with it.
+    running it. ``where`` is ``file:line:column`` (or as much of it as is known); the message begins
+    with it.
     """
 
     def __init__(self, message: str, *, where: str | None = None) -> None:
@@ -166,8 +167,8 @@ class NodeError(RunError):
     """User code raised: a constructor or a callback.
 
     What to do: the traceback names the line; ``rsltrace debug`` stops before it, as often as you
-    like. ``node`` and ``entity`` name it, ``stamp_ns`` is the simulated time, ``traceback_text`` the
-    user's traceback without rsltrace's own frames.
+    like. ``node`` and ``entity`` name it, ``stamp_ns`` is the simulated time, ``traceback_text``
+    the user's traceback without rsltrace's own frames.
     """
 
     def __init__(
