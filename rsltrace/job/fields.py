@@ -214,12 +214,13 @@ class JobFields(Part):
     faults: Annotated[tuple[FaultSpec, ...], parts()] = Field(
         default=(),
         description="What goes wrong, and exactly when: nodes that crash, hang or restart, single "
-        "messages that are lost, late or come twice.",
+        "messages that are lost, late or come twice, or that a bag plays otherwise than recorded.",
         examples=[
             [
                 {"crash": "/planner", "at": "2s"},
                 {"restart": "/map", "topic": "/goal", "message": 3, "for": "500ms"},
                 {"drop": "/scan", "message": 12, "to": "/slam"},
+                {"change": "/scan", "message": 30, "field": "ranges[0]", "value": "nan"},
             ]
         ],
     )

@@ -79,5 +79,9 @@ def _obstacles(session: Session, job: Job) -> Iterator[str]:
 def _is_to_come(fault: FaultSpec, session: Session) -> bool:
     if fault.of_node:  # of those that come at a time, the order among what is due then is another
         return fault.event is not None and fault.event >= session.loop.events
+    assert fault.message is not None
+    if fault.of_bag:
+        bags = session.bag_faults
+        return bags is None or fault.message > bags.reached[fault.name]
     reached = session.world.domain.transport.faults.get(fault.name)
-    return fault.message is not None and (reached is None or fault.message > reached.reached)
+    return reached is None or fault.message > reached.reached

@@ -82,6 +82,7 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.faults import NodeFaults
     from rsltrace.doors.rclpy.world import World
     from rsltrace.middleware.events.recorded_run import RecordedRun
+    from rsltrace.run.plans.bag_faults import BagFaults
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
@@ -175,6 +176,7 @@ class Session:
         self._processes: ProcessDoor
         self._numerics_known = True
         self._faults: NodeFaults | None = None
+        self.bag_faults: BagFaults | None = None
 
     @property
     def has_begun(self) -> bool:
@@ -402,7 +404,9 @@ class Session:
                     say_where(self.job, entry, self.world.error)
                     break
             if not self.ended:
-                start_players(self.world, self.job, self._bags)
+                self.bag_faults = start_players(
+                    self.world, self.job, self._bags, is_open=self.may_become
+                )
             if not self.ended:
                 self.world.jump(self.start_ns)
                 self._has_begun = not self.ended
@@ -447,6 +451,8 @@ class Session:
                 self.loop.policy = going_on(policy_of_job(job, self.start_ns), self.loop.policy)
         faults = job.faults[len(old.faults) :]
         arm_topics(faults, self.world)
+        if self.bag_faults is not None:
+            self.bag_faults.add(job, len(old.faults))
         self._faults = arm_nodes(job, self.world, self.start_ns)
         check_output(job, path, None)
         write_job(writer, job)
@@ -469,7 +475,7 @@ class Session:
         if not lasted:
             return (*rules, *parameter_notes)
         starts = missed_starts(self.job, self.world.starts.missed())
-        faults = missed_faults(self.job, self.world, self._faults)
+        faults = missed_faults(self.job, self.world, self._faults, self.bag_faults)
         if isinstance(self.loop, OrderedLoop):
             rules += unmet_departures(self.job, self.loop.policy)
         return (*rules, *parameter_notes, *starts, *faults)

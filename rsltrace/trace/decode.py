@@ -28,6 +28,7 @@ from rsltrace.errors import TraceError
 from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
+from rsltrace.trace.leaves import Leaf, leaves_of
 from rsltrace.trace.wide_texts import STAND_IN_TYPE, with_wide_texts, without_wide_texts
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
@@ -112,6 +113,10 @@ class Decoder:
             for name, (kind, detail) in found[1]
             if name not in _NOT_OF_THE_MESSAGE
         }
+
+    def leaves(self) -> list[Leaf]:
+        """Return the fields of the message that hold values."""
+        return leaves_of(self.name, self.types)
 
     def of(self, channel: ChannelInfo) -> Decoder:
         """Return this decoder for another channel of the same schema."""

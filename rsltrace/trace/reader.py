@@ -58,6 +58,7 @@ from rsltrace.trace.segments import SegmentReader, event_of, output_of
 
 if TYPE_CHECKING:
     from rsltrace.trace.decode import Decoder, Decoders
+    from rsltrace.trace.leaves import Leaf
     from rsltrace.trace.tables import Tables
 
 _P = ParamSpec("_P")
@@ -432,6 +433,14 @@ class Trace:
                     if fields is not None:
                         return fields
         return None
+
+    def leaves(self, topic: str) -> list[Leaf]:
+        """Return the fields of a topic's messages that hold values. Raises TraceError if the topic
+        has no messages here, or no usable schema."""
+        found = self._channel(topic, "")
+        if found is None:
+            raise TraceError(f"{self.name} has no messages on {topic}")
+        return self._decoder(found).leaves()
 
     def decode(self, channel: ChannelInfo | str | int, data: bytes) -> object:
         """Return ``data`` decoded by the schema of a channel (or its id, or its topic).

@@ -328,6 +328,15 @@ def test_mains_crash_hang_and_start_again() -> None:
         ({"delay": "/t", "message": 1}, "how late is the message"),
         ({"drop": "/t", "message": 0}, "must be at least 1"),
         ({"drop": "t", "message": 1}, "write '/t'"),
+        ({"change": "/t", "message": 1}, "what changes\\? Give field"),
+        ({"change": "/t", "message": 1, "field": "x"}, "give one of value, .*: none is given"),
+        ({"change": "/t", "message": 1, "field": "x", "value": 1, "scale": 2}, "value and scale"),
+        ({"change": "/t", "message": 1, "field": "x[", "value": 1}, "'x\\[' is not a field"),
+        ({"change": "/t", "message": 1, "field": "x", "value": {}}, "expected text, a number"),
+        ({"change": "/t", "message": 1, "field": "x", "scale": float("inf")}, "must be at least"),
+        ({"swap": "/t", "message": 1, "field": "x"}, "field is for change, not for swap"),
+        ({"repeat": "/t", "message": 1}, "no message before the first"),
+        ({"swap": "/t", "message": 1, "to": "/n"}, "to is for drop and duplicate and delay"),
     ],
 )
 def test_a_fault_that_makes_no_sense_is_refused(fault: dict[str, Any], said: str) -> None:

@@ -27,7 +27,7 @@ class Bug:
     native: bool = True
     """Whether its checks can be watched natively."""
     fault: Mapping[str, Any] = field(default_factory=dict)
-    """The fault that it takes, without when: ``{"restart": "/sensor"}``."""
+    """The fault that it takes, without when: ``{"restart": "/sensor"}``, ``{"swap": "/odom"}``."""
 
     @property
     def name(self) -> str:

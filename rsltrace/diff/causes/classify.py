@@ -37,7 +37,7 @@ _QOS_EVENT = "new qos event "
 _NO_CALLBACKS = (EntityKind.MAIN.label, EntityKind.THREAD.label)
 _DRAWN_FROM = ("delay", "faults", "execution", "seed", "clocks")
 """Keys of a job that decide whether something is drawn."""
-_OF_BAGS = ("bags", "start", "construct_time", "min_time_step")
+_OF_BAGS = ("bags", "faults", "start", "construct_time", "min_time_step")
 """Keys of a job that decide when a bag's message is played."""
 
 
@@ -349,7 +349,7 @@ def _bag_timing(case: Case, a: EventView, b: EventView) -> Judgement:
             f"the bag's messages on {a.entity.name} {at_time(early)} and {at_time(late)} are "
             "swapped"
         )
-        why = "the bags that were played have these two messages in another order"
+        why = case.because() or "the bags that were played have these two messages in another order"
     else:
         late_ns = b.stamp_ns - a.stamp_ns
         late_text = "later" if late_ns > 0 else "earlier"

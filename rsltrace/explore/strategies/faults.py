@@ -1,4 +1,5 @@
-"""Faults: single messages lost, late or twice, and nodes that crash, hang or start again."""
+"""Faults: single messages lost, late or twice, what bags play changed, swapped or stale, and nodes
+that crash, hang or start again."""
 
 from __future__ import annotations
 
@@ -11,6 +12,7 @@ import numpy as np
 from rsltrace.chance.network import QUIET_TOPICS
 from rsltrace.chance.stream import Stream
 from rsltrace.errors import ExploreError
+from rsltrace.explore.strategies.bag_changes import Played, is_played, played_in
 from rsltrace.explore.strategies.strategy import Proposal
 from rsltrace.explore.trial import TrialResult
 from rsltrace.job import Job
@@ -41,6 +43,9 @@ class FaultWalk:
         self._fork_ns = fork_ns
         self._topics: dict[str, range] = {}
         """Of each topic the messages that may be disturbed."""
+        self._played: dict[str, Played] = {}
+        """Of each topic that a bag plays what it could play instead."""
+        self._progress = job.progress
         self._nodes: dict[str, bool] = {}
         self._events = range(1)
         self._longest_ns = 1
@@ -57,15 +62,18 @@ class FaultWalk:
             self._events = range(first, max(trace.ended_after or trace.event_count, 1))
             before, after = _sent(trace, first_output)
             names: dict[str, tuple[int, int]] = {}
+            played: dict[str, tuple[int, int]] = {}
             for entity in trace.entities.values():
                 if entity.kind is EntityKind.NODE and entity.name != f"/{PLAYER}":
                     self._nodes[entity.name] = bool(entity.type)  # others have a real process
                 elif before[entity.id] + after[entity.id] and entity.name not in QUIET_TOPICS:
                     one, two = names.get(entity.name, (0, 0))
                     names[entity.name] = one + before[entity.id], two + after[entity.id]
-        self._topics = {
-            name: range(1 + one, 1 + one + two) for name, (one, two) in names.items() if two
-        }
+                    if is_played(trace, entity) and entity.name != self._progress:
+                        one, two = played.get(entity.name, (0, 0))
+                        played[entity.name] = one + before[entity.id], two + after[entity.id]
+            self._played = played_in(trace, _to_come(played))
+        self._topics = _to_come(names)
         if not self._events:
             raise ExploreError("the run of the job as it is ends before runs would be forked")
         if not self._nodes and not self._topics:
@@ -100,6 +108,8 @@ class FaultWalk:
     def _fault(self, draw: Stream) -> dict[str, Any]:
         if self._topics and (not self._nodes or draw.below(2)):
             topic = list(self._topics)[draw.below(len(self._topics))]
+            if topic in self._played and draw.below(3):
+                return self._played[topic].fault(topic, draw)
             kind = _OF_MESSAGES[draw.below(len(_OF_MESSAGES))]
             messages = self._topics[topic]
             fault = {kind: topic, "message": messages[draw.below(len(messages))]}
@@ -114,6 +124,11 @@ class FaultWalk:
         """Draw how long something lasts, evenly in its logarithm, in whole milliseconds."""
         ratio = self._longest_ns / _SHORTEST_NS
         return f"{max(round(math.exp(draw.uniform() * math.log(ratio))), 1)}ms"
+
+
+def _to_come(counts: dict[str, tuple[int, int]]) -> dict[str, range]:
+    """Return the numbers of a topic's messages that follow those before; nothing where none do."""
+    return {name: range(1 + one, 1 + one + two) for name, (one, two) in counts.items() if two}
 
 
 def _first_after(trace: Trace, fork_ns: int) -> tuple[int, int]:

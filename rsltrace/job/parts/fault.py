@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field, model_validator
 
 from rsltrace.job.parts.part import Part
-from rsltrace.job.values.checks import check, text, whole
+from rsltrace.job.values.checks import check, number, text, whole
+from rsltrace.job.values.field_path import check_field, field_value
 from rsltrace.job.values.names import check_node_glob, check_topic
 from rsltrace.job.values.problem import Problem
 from rsltrace.job.values.times import TimeLike, parse_time
 
+_HUGE = 1.7976931348623157e308
 FullName = Annotated[str | None, check(text(check_topic), optional=True)]
 
 
 class FaultSpec(Part):
     """One thing that goes wrong. Exactly one of ``crash``, ``hang`` and ``restart`` (a node, and
-    when: ``at``, ``event``, or ``message`` of a ``topic``) or of ``drop``, ``duplicate`` and
-    ``delay`` (a topic, and which ``message``)."""
+    when: ``at``, ``event``, or ``message`` of a ``topic``), of ``drop``, ``duplicate`` and
+    ``delay`` (a topic, and which ``message``), or of ``change``, ``swap`` and ``repeat`` (a topic
+    that bags play, and which ``message`` of theirs)."""
 
     TIMES: ClassVar[dict[str, str]] = {"at": "at_ns", "for": "for_ns", "by": "by_ns"}
     OF_NODES: ClassVar[tuple[str, ...]] = ("crash", "hang", "restart")
     OF_MESSAGES: ClassVar[tuple[str, ...]] = ("drop", "duplicate", "delay")
-    ONE_OF: ClassVar[tuple[str, ...]] = OF_NODES + OF_MESSAGES
+    OF_BAGS: ClassVar[tuple[str, ...]] = ("change", "swap", "repeat")
+    CHANGES: ClassVar[tuple[str, ...]] = ("value", "scale", "offset", "length")
+    ONE_OF: ClassVar[tuple[str, ...]] = OF_NODES + OF_MESSAGES + OF_BAGS
 
     crash: FullName = Field(
         default=None,
@@ -58,6 +63,21 @@ class FaultSpec(Part):
         "publisher wait for it, as in DDS, unless the link's model says `keep_order: false`.",
         examples=["/scan"],
     )
+    change: FullName = Field(
+        default=None,
+        description="Topic that bags play, of which one message has another value in its `field`.",
+        examples=["/scan"],
+    )
+    swap: FullName = Field(
+        default=None,
+        description="Topic that bags play, of which one message and the next one change places.",
+        examples=["/odom"],
+    )
+    repeat: FullName = Field(
+        default=None,
+        description="Topic that bags play, of which one message is the one before it once more.",
+        examples=["/odom"],
+    )
     at_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
         default=None,
         alias="at",
@@ -77,7 +97,7 @@ class FaultSpec(Part):
     message: Annotated[int | None, check(whole(1), optional=True)] = Field(
         default=None,
         description="Which message of the topic, from 1, in the order of publication, whoever has "
-        "published it.",
+        "published it; of those that bags play for `change`, `swap` and `repeat`.",
         examples=[3],
     )
     for_ns: Annotated[int | None, check(parse_time, optional=True)] = Field(
@@ -101,6 +121,34 @@ class FaultSpec(Part):
         examples=["/slam"],
     )
 
+    field: Annotated[str | None, check(text(check_field), optional=True)] = Field(
+        default=None,
+        description="The field that changes: `[3]` is an item of an array, `[-1]` its last one, "
+        "`[*]` all of them.",
+        examples=["ranges[3]"],
+    )
+    value: Annotated[Any, check(field_value, optional=True)] = Field(
+        default=None,
+        description="What the field is instead; `nan`, `inf` and `-inf` are numbers, too.",
+        examples=["nan"],
+    )
+    scale: Annotated[float | None, check(number(-_HUGE, _HUGE), optional=True)] = Field(
+        default=None,
+        description="What the number in the field is multiplied by.",
+        examples=[-1],
+    )
+    offset: Annotated[float | None, check(number(-_HUGE, _HUGE), optional=True)] = Field(
+        default=None,
+        description="What is added to the number in the field.",
+        examples=[0.5],
+    )
+    length: Annotated[int | None, check(whole(0), optional=True)] = Field(
+        default=None,
+        description="How many items the array in the field has: it is cut, or its last one comes "
+        "again.",
+        examples=[0],
+    )
+
     if TYPE_CHECKING:
 
         def __init__(
@@ -121,6 +169,14 @@ class FaultSpec(Part):
             by: TimeLike | None = None,
             by_ns: int | None = None,
             to: str | None = None,
+            change: str | None = None,
+            swap: str | None = None,
+            repeat: str | None = None,
+            field: str | None = None,
+            value: Any = None,
+            scale: float | None = None,
+            offset: float | None = None,
+            length: int | None = None,
         ) -> None: ...
 
     @property
@@ -138,6 +194,16 @@ class FaultSpec(Part):
         """Whether it is about a node."""
         return self.kind in self.OF_NODES
 
+    @property
+    def of_message(self) -> bool:
+        """Whether it is about a message on its way to its receivers."""
+        return self.kind in self.OF_MESSAGES
+
+    @property
+    def of_bag(self) -> bool:
+        """Whether it is about a message that bags play, before it is published."""
+        return self.kind in self.OF_BAGS
+
     @model_validator(mode="after")
     def _says_one_thing(self) -> FaultSpec:
         given = [kind for kind in self.ONE_OF if getattr(self, kind) is not None]
@@ -151,15 +217,29 @@ class FaultSpec(Part):
             ("for", self.for_ns, ("hang", "restart")),
             ("by", self.by_ns, ("duplicate", "delay")),
             ("to", self.to, self.OF_MESSAGES),
+            *((key, getattr(self, key), ("change",)) for key in ("field", *self.CHANGES)),
         ):
             if field is not None and self.kind not in kinds:
                 raise Problem(f"{key} is for {' and '.join(kinds)}, not for {self.kind}", (key,))
         self._says_when()
+        self._says_what()
         if self.hang is not None and self.for_ns == 0:
             raise Problem("must be more than 0; without it the node hangs up to the end", ("for",))
         if self.delay is not None and not self.by_ns:
             raise Problem("how late is the message? Give by: 200ms", ("delay",))
         return self
+
+    def _says_what(self) -> None:
+        if self.repeat is not None and self.message == 1:
+            raise Problem("there is no message before the first one", ("message",))
+        if self.change is None:
+            return
+        if self.field is None:
+            raise Problem(f"what changes? Give field: a field of {self.change}", ("change",))
+        given = [key for key in self.CHANGES if getattr(self, key) is not None]
+        if len(given) != 1:
+            what = f"{' and '.join(given)} are given" if given else "none is given"
+            raise Problem(f"give one of {', '.join(self.CHANGES)}: {what}", ("field",))
 
     def _says_when(self) -> None:
         if not self.of_node:

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from rsltrace.bag.topic import BagTopic
     from rsltrace.doors.rclpy.handles.node import NodeHandle
     from rsltrace.doors.rclpy.world import World
+    from rsltrace.run.plans.bag_faults import BagFaults
 
 PLAYER = "rosbag2_player"
 """The node that publishes what bags have, named as ``ros2 bag play`` names its own."""
@@ -172,19 +173,26 @@ def start_ns_of(job: Job, bags: list[BagInput]) -> int:
 
 
 def check_bag_types(job: Job, bags: list[BagInput]) -> None:
-    """Raise BagError if a recorded topic has a type that is not installed, or no name for ROS."""
+    """Raise BagError if a recorded topic has a type that is not installed, or no name for ROS, or
+    if a fault cannot change it so."""
+    changes = any(fault.change is not None for fault in job.faults)
     for index, entry in enumerate(bags):
         where = f"{locate(job, ('bags', index, 'path'))}: {entry.spec.path}"
         for topic in entry.bag.topics:
             name = entry.name_of(topic)
+            name = name if name.startswith("/") else f"/{name}"
             try:
-                check_topic(name if name.startswith("/") else f"/{name}")
+                check_topic(name)
             except ValueError as error:
                 raise BagError(
                     f"{where}: a topic cannot be played: {error}; give it another name "
                     "(remappings), or leave it out (exclude)"
                 ) from None
-            check_type(where, topic)
+            cls = check_type(where, topic)
+            if changes:
+                from rsltrace.run.plans.bag_faults import check_changes
+
+                check_changes(job, name, cls)
 
 
 def check_type(bag: str, topic: BagTopic) -> type:
@@ -209,17 +217,25 @@ def begins_with_header(message_class: Any) -> bool:
     return next(iter(fields.values()), "") == "std_msgs/Header"
 
 
-def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
-    """Make a publisher for every recorded topic and merge the bags by time, then by order."""
+def start_players(
+    world: World, job: Job, bags: list[BagInput], *, is_open: bool = False
+) -> BagFaults | None:
+    """Make a publisher for every recorded topic and merge the bags by time, then by order.
+
+    Return the faults of what they play, of which there may be more later if they are ``is_open``;
+    None without bags.
+    """
     if not bags:
-        return
+        return None
     from rclpy.node import Node
 
     from rsltrace.doors.player import Player, make_publisher
     from rsltrace.doors.rclpy.wire.codec import codec_for
     from rsltrace.doors.rclpy.wire.interfaces import get_message_class, message_type
+    from rsltrace.run.plans.bag_faults import BagFaults
 
     domain = world.domain
+    faults = BagFaults(job, is_open=is_open)
     streams: list[Iterator[tuple[int, Any, bytes]]] = []
     told: list[Any] = []
 
@@ -251,7 +267,7 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
 
     world.run_outside("the bag player", EventKind.CONSTRUCT, build)
     if domain.loop.stopped is not None:
-        return
+        return faults
     ends_run = not has_stop(job)
 
     def on_end() -> None:
@@ -261,11 +277,13 @@ def start_players(world: World, job: Job, bags: list[BagInput]) -> None:
     merged = streams[0]
     if len(streams) > 1:
         merged = heapq.merge(*streams, key=lambda message: message[0])
+    merged = faults.played(merged)
     if told:
         merged = _with_progress(merged, told[0], _span_ns(bags))
     paths = " and ".join(entry.spec.path for entry in bags)
     name = f"the {'bag' if len(bags) == 1 else 'bags'} {paths}"
     Player(domain, merged, name, on_end).start()
+    return faults
 
 
 def _messages(playback: Playback, publishers: list[Any]) -> Iterator[tuple[int, Any, bytes]]:

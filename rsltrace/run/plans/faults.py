@@ -12,6 +12,7 @@ from rsltrace.middleware.faults import MessageFault, TopicFaults
 if TYPE_CHECKING:
     from rsltrace.doors.rclpy.faults import NodeFaults
     from rsltrace.doors.rclpy.world import World
+    from rsltrace.run.plans.bag_faults import BagFaults
 
 
 def arm_topics(faults: Sequence[FaultSpec], world: World) -> None:
@@ -19,7 +20,7 @@ def arm_topics(faults: Sequence[FaultSpec], world: World) -> None:
     ``FaultsOfAll`` have been there from the beginning."""
     by_topic: dict[str, list[MessageFault]] = {}
     for spec in faults:
-        if not spec.of_node:
+        if spec.of_message:
             by_topic.setdefault(spec.name, []).append(_message_fault(spec))
     for topic, found in by_topic.items():
         world.domain.transport.faults.setdefault(topic, TopicFaults(())).add(found)
@@ -49,10 +50,15 @@ def arm_nodes(job: Job, world: World, start_ns: int) -> NodeFaults | None:
     return NodeFaults(world, faults, start_ns)
 
 
-def missed_faults(job: Job, world: World, nodes: NodeFaults | None) -> Iterator[str]:
+def missed_faults(
+    job: Job, world: World, nodes: NodeFaults | None, bags: BagFaults | None
+) -> Iterator[str]:
     """Yield the faults that have not come to pass in a run that is over."""
     for index, spec in enumerate(job.faults):
-        if not spec.of_node:
+        if spec.of_bag and bags is None:
+            where = locate(job, ("faults", index))
+            yield f"{where}: this fault did not happen: no bag plays {spec.name}"
+        if spec.of_message:
             faults = world.domain.transport.faults[spec.name]
             assert spec.message is not None
             if faults.reached < spec.message:
@@ -61,8 +67,9 @@ def missed_faults(job: Job, world: World, nodes: NodeFaults | None) -> Iterator[
                     f"{locate(job, ('faults', index))}: this fault did not happen: there were "
                     f"{faults.reached} {times} on {spec.name}"
                 )
-    for where, why in nodes.missed() if nodes is not None else ():
-        yield f"{where}: this fault did not happen: {why}"
+    for found in (nodes, bags):
+        for where, why in found.missed() if found is not None else ():
+            yield f"{where}: this fault did not happen: {why}"
 
 
 def _message_fault(spec: FaultSpec) -> MessageFault:

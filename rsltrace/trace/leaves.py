@@ -1,0 +1,50 @@
+"""The fields of a type that hold values, however deep in it: what there is that could be other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+
+from rsltrace.trace.wide_texts import STAND_IN_TYPE
+
+_DEPTH_MAX = 6
+_NO_FIELD = "structure_needs_at_least_one_member"
+
+
+@dataclass(frozen=True, slots=True)
+class Leaf:
+    """A field by its name, with ``[]`` behind each array that it is in, and what one value of it is
+    (``float32``, ``string``; "" for messages).
+
+    With ``length_max`` it is an array itself, of up to so many items.
+    """
+
+    name: str
+    type: str
+    length_max: int | None = None
+
+
+def leaves_of(name: str, types: dict[str, Any]) -> list[Leaf]:
+    """Return the leaves of a type, which is defined in ``types`` as a decoder has them."""
+    return list(_leaves(name, types, "", _DEPTH_MAX))
+
+
+def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator[Leaf]:
+    for field, description in types[of][1]:
+        name, (kind, detail) = f"{prefix}{field}", description
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            (inner, inner_detail), size = detail
+            if kind == Nodetype.SEQUENCE:
+                base = inner_detail[0] if inner == Nodetype.BASE else ""
+                yield Leaf(name, base, size or 1 << 20)
+            name, kind, detail = f"{name}[]", inner, inner_detail
+        if kind == Nodetype.BASE:
+            if field != _NO_FIELD:
+                yield Leaf(name, detail[0])
+        elif detail == STAND_IN_TYPE:
+            yield Leaf(name, "string")
+        elif depth > 1:
+            yield from _leaves(detail, types, f"{name}.", depth - 1)
