@@ -2,8 +2,8 @@
 
     python docs/draw_pictures.py [NAME]... [--to FOLDER]
 
-The viewer's are drawn from the sample traces, without a screen, and always with the same bytes.
-Rerun's is of the Husky job with two settings; it needs the recording (see
+The viewer's are drawn from the sample traces and the tutorial's runs, without a screen, and always
+with the same bytes. Rerun's is of the Husky job with two settings; it needs the recording (see
 ``examples/sensor_fusion/README.md``) and a graphics driver: one in software will do (Debian:
 mesa-vulkan-drivers). Its bytes vary with the driver, so the PNG says what it was drawn from. A test
 fails when a picture is stale.
@@ -12,6 +12,7 @@ fails when a picture is stale.
 from __future__ import annotations
 
 import argparse
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,9 +27,15 @@ VIEWS = {
     "view.svg": ("delayed_input", "a.mcap", "--at", "252"),
     "view_two.svg": ("nondeterministic_callback", "a.mcap", "b.mcap"),
     "view_live.svg": ("schedule", "a.mcap", "--live", "--at", "20", "--keys", LIVE),
+    "cart_two.svg": ("cart", "good.mcap", "bad.mcap"),
     "view_plot.svg": ("schedule", "a.mcap", "b.mcap", "--light", "--keys", "p"),
 }
-"""By name: the sample, and what ``rsltrace view`` is told in its folder."""
+"""By name: the sample (or the tutorial's cart), and what ``rsltrace view`` is told there."""
+CART = {
+    "good.mcap": (),
+    "bad.mcap": ("--set", 'policy={"departures": [{"choice": 222, "run": 1}]}'),
+}
+"""The tutorial's runs: its second one is what ``rsltrace explore`` tells there."""
 RERUN = "rerun_two.png"
 SETTINGS = ((), ("--set", "nodes.EkfNode.parameters.imu_mount=[0.0, 0.0, 0.0]"))
 """How the Husky's two runs differ: the second takes its IMU, which lies on its side, as upright."""
@@ -39,8 +46,19 @@ AT_S = 1_432_235_890.0
 def draw_view(name: str, folder: Path) -> Path:
     """Draw a picture of the viewer's into ``folder``; return its path."""
     sample, *words = VIEWS[name]
-    _rsltrace("view", *words, "--export", str(folder / name), at=ROOT / "sample_traces" / sample)
+    with tempfile.TemporaryDirectory() as made:
+        at = record_cart(Path(made)) if sample == "cart" else ROOT / "sample_traces" / sample
+        _rsltrace("view", *words, "--export", str(folder / name), at=at)
     return folder / name
+
+
+def record_cart(folder: Path) -> Path:
+    """Record the tutorial's two runs in a copy of the example; return its folder."""
+    at = shutil.copytree(ROOT / "examples" / "cart", folder / "cart")
+    for name, settings in CART.items():
+        words = ("record", "job.yaml", "-q", "-o", name, *settings)
+        _rsltrace(*words, at=at, status=1 if settings else 0)
+    return at
 
 
 def record_husky(folder: Path) -> Path:
@@ -61,12 +79,14 @@ def draw_rerun(folder: Path) -> Path:
     return folder / RERUN
 
 
-def _rsltrace(*words: str, at: Path) -> None:
-    _python("-m", "rsltrace", *words, at=at)
+def _rsltrace(*words: str, at: Path, status: int = 0) -> None:
+    _python("-m", "rsltrace", *words, at=at, status=status)
 
 
-def _python(*words: str, at: Path) -> None:
-    subprocess.run([sys.executable, *words], cwd=at, check=True)
+def _python(*words: str, at: Path, status: int = 0) -> None:
+    done = subprocess.run([sys.executable, *words], cwd=at, check=False)
+    if done.returncode != status:
+        raise SystemExit(f"{' '.join(words)} ended with {done.returncode}")
 
 
 def main() -> None:

@@ -125,3 +125,11 @@ def test_every_page_has_its_place_on_the_site() -> None:
     missing = sorted(pages - set(named))
     assert not missing, f"add these to nav: in mkdocs.yml, where a reader looks for them: {missing}"
     assert not set(named) - pages, "mkdocs.yml names pages that are not there"
+
+
+@pytest.mark.parametrize("name", ["cart.py", "job.yaml"])
+def test_the_tutorial_shows_the_example(name: str) -> None:
+    tutorial = (ROOT / "docs" / "tutorial" / "index.md").read_text("utf-8")
+    shown = re.search(rf"^<!-- file: {name} -->\n```\w+\n(.*?)^```", tutorial, re.M | re.S)
+    assert shown is not None
+    assert shown[1] == (ROOT / "examples" / "cart" / name).read_text("utf-8")

@@ -16,7 +16,6 @@ from pathlib import Path
 import made
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
-from mkdocs.structure.files import Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,12 +30,15 @@ _FROM_ELSEWHERE = re.compile(
 )
 
 
-def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, **_: object) -> str:
     """Return the text of a page as MkDocs is to read it."""
     parts = []
     last = 0
     for match in _APART.finditer(markdown):
-        parts += [_prose(markdown[last : match.start()], page, config), _apart(match[0])]
+        parts += [
+            _prose(markdown[last : match.start()], page, config),
+            _apart(match[0], page, config),
+        ]
         last = match.end()
     parts.append(_prose(markdown[last:], page, config))
     return "".join(parts)
@@ -49,11 +51,11 @@ def on_post_build(config: MkDocsConfig) -> None:
             raise PluginError(f"{path} is fetched from elsewhere: {found[0]}")
 
 
-def _apart(text: str) -> str:
+def _apart(text: str, page: Page, config: MkDocsConfig) -> str:
     if text.startswith("```"):
         return text
     name = re.fullmatch(r"<!-- made: (\w+) -->\n?", text)
-    return made.PARTS[name[1]]() if name else ""
+    return on_page_markdown(made.PARTS[name[1]](), page, config) if name else ""
 
 
 def _prose(text: str, page: Page, config: MkDocsConfig) -> str:
@@ -79,7 +81,7 @@ def _prose(text: str, page: Page, config: MkDocsConfig) -> str:
 
 
 def _in_repository(path: Path, config: MkDocsConfig) -> str:
-    return f"{config.repo_url.rstrip('/')}/blob/main/{path.relative_to(ROOT).as_posix()}"
+    return f"{config.extra['repository']}/blob/main/{path.relative_to(ROOT).as_posix()}"
 
 
 @cache
