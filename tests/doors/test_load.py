@@ -62,7 +62,13 @@ def growth(work: Callable[[int], int]) -> float:
     return (many - some) / (some - few)
 
 
-@pytest.mark.parametrize("make", [many_nodes, many_timers, one_topic])
+@pytest.mark.parametrize(
+    "make",
+    [
+        one_topic,
+        *(pytest.param(make, marks=pytest.mark.long) for make in (many_nodes, many_timers)),
+    ],
+)
 def test_work_grows_with_what_there_is(make: Callable[[int], Any], tmp_path: Path) -> None:
     def work(count: int) -> int:
         nodes = [NodeSpec(node=partial(make, count))]

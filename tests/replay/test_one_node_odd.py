@@ -220,7 +220,7 @@ FEATURES = {
     "clocks": "clocks: [{node: /several, offset: -20ms, "
     "random_jumps: {every: 100ms, most: 5ms}}]\n",
 }
-SHORT = ("losses", "shared executors")
+SHORT = ("shared executors",)
 
 
 def check(tmp_path: Path, feature: str, stop: str) -> None:

@@ -134,7 +134,7 @@ def compared(folder: Path, parts: Any, stops: list[dict[str, Any]]) -> Diff:
     return rsltrace.diff(folder / "a.mcap", folder / "b.mcap")
 
 
-@settings(max_examples=8, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(
     parts=st.lists(PARTS, min_size=1, max_size=3),
     first_ms=st.integers(0, 900),

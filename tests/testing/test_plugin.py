@@ -247,6 +247,7 @@ def test_assert_matches_golden_runs_a_job(team: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.ros
+@pytest.mark.long
 def test_the_option_holds_without_the_fixture(team: Run, tmp_path: Path) -> None:
     """What the message says to do has to help whoever it is shown to."""
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")

@@ -42,7 +42,9 @@ def test_there_are_classes_enough() -> None:
     assert set(faults.FAMILIES.values()) == set(FAMILIES)
 
 
-@pytest.mark.parametrize("part", range(PARTS))
+@pytest.mark.parametrize(
+    "part", [0, *(pytest.param(part, marks=pytest.mark.long) for part in range(1, PARTS))]
+)
 def test_what_is_said_of_a_third_of_the_classes_is_true(part: int) -> None:
     """Every class stands in one of the thirds; a tenth of each is tried here."""
     outcomes = list(try_cases((name, SEED) for name in NAMES[part :: 10 * PARTS]))
