@@ -1,6 +1,6 @@
 """A slice of the standing attack, and that the attack itself works.
 
-``make test`` tries a third of the slice, ``make test-long`` all; ``make attack`` goes on for an hour.
+``make test`` tries a third of it, ``make test-long`` all; ``make attack`` goes on for an hour.
 What gives way here and is not mended yet stands in ``known``.
 """
 
