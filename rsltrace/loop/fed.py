@@ -145,10 +145,12 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
 
     The recording says what ran when, so neither policy nor executors are asked. Where callbacks
     have to wait for workers (``has_workers``), what the recording knows runs when it ran there;
-    anything else is first come, first served.
+    anything else is first come, first served. A look whether something has come (``spin_once``) has
+    no event, so where nobody but the order of arrival decides, it is first come, too.
     """
 
     has_workers = False
+    by_policy = False
 
     def next_timer(self) -> Any:
         """Return the timer that is due next; those that wait for their recorded time are not."""
@@ -186,12 +188,20 @@ class FedOrderedLoop(FedLoop, OrderedLoop):
                 if not _goes_elsewhere(place.candidate.item) and self._is_that_of(place, step):
                     return place
         free = [place for place in places if not self._is_held(place)]
-        if not free or not _goes_elsewhere(free[0].candidate.item) or _looks(free[0]):
+        if not free or not _goes_elsewhere(free[0].candidate.item):
             return free[0] if free else None
+        if _looks(free[0]):
+            return self._looked_for(free, step) if self.by_policy else free[0]
         # An executor of the user's own takes them in the order in which it gets them.
         others = [p for p in free if _goes_elsewhere(p.candidate.item) and not _looks(p)]
         entity, following = self.script.entity, self.script.following
         return min(others, key=lambda place: following(entity(place.candidate.entity_id)))
+
+    def _looked_for(self, free: list[Place], step: Step | None) -> Place:
+        """Return what the recording has next, if that is here: its policy let the look wait."""
+        if step is None:
+            return free[0]
+        return next((place for place in free if self._is_that_of(place, step)), free[0])
 
     def _is_that_of(self, place: Place, step: Step) -> bool:
         candidate = place.candidate

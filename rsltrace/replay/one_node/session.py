@@ -81,6 +81,8 @@ class FedSession(Session):
             plan = scheduling_plan(self.job, self.start_ns, Fifo())
             self.world.use_scheduling(loop, replace(plan, occupies=False))
             loop.has_workers = plan.occupies
+            policy = self.job.policy
+            loop.by_policy = policy is not None and policy.order != "fifo"
 
     def _import_what_is_named(self) -> None:
         from rsltrace.doors.stand_ins import StandIns
