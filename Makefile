@@ -93,11 +93,12 @@ KILTED_TESTS ?=
 test-kilted:
 	@$(MAKE) --no-print-directory $(KILTED) unit PYTEST="$(KILTED_TESTS)"
 
-# docs/jobs.md is made from the models of rsltrace.job, the picture in docs/architecture.md from its
-# text; a test fails when one is stale.
+# docs/jobs.md is made from the models of rsltrace.job, the drawings of docs/architecture.md and
+# docs/concepts by scripts; a test fails when one is stale.
 docs: $(INSTALLED)
 	$(BIN)/python -m rsltrace.job.documents.reference > docs/jobs.md
 	$(BIN)/python docs/draw_architecture.py
+	$(BIN)/python docs/draw_concepts.py
 
 # The site: strict, so a link that leads nowhere or a page that nobody can reach is an error.
 # `make docs-serve` shows it at http://127.0.0.1:8000 while one writes.

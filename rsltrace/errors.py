@@ -208,7 +208,7 @@ class GuardError(RunError):
     """A node made a call whose answer can differ from run to run, and its job forbids that.
 
     What to do: take the value from ROS (clock, parameter, message), or let the guard record the
-    answers: ``guard: {mode: record}``, docs/guard.md.
+    answers (mode ``record``): docs/guard.md.
     """
 
 

@@ -78,6 +78,20 @@ def test_the_page_on_the_architecture_names_files_that_are_there() -> None:
     assert [path for path in named if not (ROOT / path).exists()] == []
 
 
+def test_the_drawings_of_the_concepts_are_current() -> None:
+    drawing = runpy.run_path(str(ROOT / "docs" / "draw_concepts.py"))
+    for name, draw in drawing["DRAWINGS"].items():
+        assert (drawing["PICTURES"] / name).read_text("utf-8") == draw(), "run make docs"
+
+
+def test_every_picture_is_drawn_and_shown() -> None:
+    scripts = "".join(path.read_text("utf-8") for path in ROOT.glob("docs/draw_*.py"))
+    shown = "".join(path.read_text("utf-8") for path in DOCUMENTS)
+    for path in ROOT.glob("docs/pictures/*"):
+        assert f'"{path.name}"' in scripts, f"{path}: no script draws it"
+        assert f"pictures/{path.name})" in shown, f"{path}: no document shows it"
+
+
 def test_the_picture_of_the_architecture_is_current_and_complete() -> None:
     drawing = runpy.run_path(str(ROOT / "docs" / "draw_architecture.py"))
     assert drawing["PICTURE"].read_text("utf-8") == drawing["architecture"](), "run make docs"

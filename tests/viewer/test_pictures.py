@@ -17,11 +17,6 @@ DRAWING: dict[str, Any] = runpy.run_path(
 PICTURES: Path = DRAWING["PICTURES"]
 
 
-def test_every_picture_has_a_command() -> None:
-    drawn = {*DRAWING["VIEWS"], DRAWING["RERUN"], "architecture.svg"}
-    assert {path.name for path in PICTURES.iterdir()} == drawn
-
-
 @pytest.mark.ros
 @pytest.mark.parametrize("name", DRAWING["VIEWS"])
 def test_a_picture_of_the_viewer_is_current(name: str, tmp_path: Path) -> None:
