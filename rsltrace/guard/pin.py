@@ -30,6 +30,8 @@ THREADS = (
     "BLIS_NUM_THREADS",
     "NUMEXPR_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "RAYON_NUM_THREADS",  # libraries written in Rust
 )
 PINNED = {HASH_SEED: "0", **PLACE, **dict.fromkeys(THREADS, "1")}
 

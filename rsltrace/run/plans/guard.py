@@ -9,9 +9,11 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from functools import partial
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import JobError
+from rsltrace.guard.callers import is_own, module_of
 from rsltrace.guard.guard import Guard, engage
 from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
@@ -20,6 +22,7 @@ from rsltrace.guard.virtual.original_code import READERS, show_original
 from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
+from rsltrace.guard.virtual.tbb_threads import one_tbb_thread
 from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
 from rsltrace.guard.virtual.torch_streams import torch_streams
 from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
@@ -36,6 +39,9 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.world import World
 
 
+_ONE_PROCESSOR = "'taskset --cpu-list 0' before 'rsltrace record' gives it one processor"
+
+
 class RunGuard:
     """The guard of one run; without one (``guard: false``) everything here does nothing."""
 
@@ -45,6 +51,7 @@ class RunGuard:
         self.guard: Guard | None = None
         self._world: World | None = None
         self._early: list[Finding] = []
+        self._unpinned: list[tuple[str, str]] = []
 
     def begin(self, world: World, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
@@ -72,6 +79,8 @@ class RunGuard:
                 one_policy=all(spec.guard is None for spec in job.nodes),
             )
             begin_shared(job.seed)
+            for library, why in self._unpinned:
+                self._report(self.guard, library, why, sys._getframe())
             if replay is not None:
                 with Trace.open(replay) as trace:
                     refuse_native(trace, "no answers from outside are in it")
@@ -103,6 +112,22 @@ class RunGuard:
 
         world.domain.dispatcher.on_node = on_node
         streams.enter(name_of())
+
+    def stays_threaded(self, library: str, why: str) -> None:
+        """Report a library that computes in threads of its own, which cannot be pinned."""
+        if self.guard is None:
+            self._unpinned.append((library, why))  # met before the run
+            return
+        frame = sys._getframe()
+        while is_own(module_of(frame)) and frame.f_back is not None:
+            frame = frame.f_back
+        self._report(self.guard, library, why, frame)
+
+    def _report(self, guard: Guard, library: str, why: str, frame: FrameType) -> None:
+        mode = guard.mode(Source.THREAD, frame)
+        if mode is not Mode.ALLOW:
+            call = f"the threads of TBB in {library}"
+            guard.found(Source.THREAD, mode, call, f"{why}; {_ONE_PROCESSOR}", frame)
 
     def trace_begins(self, recorder: Recorder, now_ns: int) -> None:
         """Write down what was found before there was a trace: when modules were imported."""
@@ -139,6 +164,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
     if job.guard.enabled:
         if job.guard.pins:
             stack.enter_context(pinned_place())
+            stack.enter_context(one_tbb_thread(made.stays_threaded))
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
