@@ -75,6 +75,11 @@ if TYPE_CHECKING:
     help="With --native: each entry's executor, single-threaded (default) or multi-threaded.",
 )
 @click.option(
+    "--processes",
+    is_flag=True,
+    help="With --native: a process for each entry (default: only if one is a program).",
+)
+@click.option(
     "--domain",
     type=click.IntRange(0, 232),
     metavar="ID",
@@ -103,6 +108,7 @@ def record(
     no_pin: bool,
     native: bool,
     executor: str | None,
+    processes: bool,
     domain: int | None,
     policy: str | None,
     quiet: bool,
@@ -126,7 +132,7 @@ def record(
 
     if click.get_current_context().obj is not None:  # a process that is there for this alone
         end_with_run()
-    _check_options(native, executor, domain, policy, replay, seed)
+    _check_options(native, executor, domain, policy, replay, seed, processes=processes)
     changes = all_overrides(overrides, seed, until)
     loaded, named = job_of(words, launch, skip, changes)
     if no_pin:
@@ -148,6 +154,7 @@ def record(
             quiet=quiet,
             as_json=as_json,
             executor=executor or "single",
+            processes=processes,
             domain=domain,
             policy=policy,
         )
@@ -176,12 +183,16 @@ def _check_options(
     policy: str | None,
     replay: Path | None,
     seed: int | None,
+    *,
+    processes: bool,
 ) -> None:
     """Raise a usage error for options that make no sense together."""
     if native and (replay is not None or seed is not None):
         raise click.UsageError("--native steers nothing: --replay and --seed are of no use with it")
-    if not native and (executor is not None or domain is not None):
-        raise click.UsageError("--executor and --domain are for native runs: add --native")
+    if not native and (executor is not None or domain is not None or processes):
+        raise click.UsageError(
+            "--executor, --processes and --domain are for native runs: add --native"
+        )
     if not native and policy is not None:
         raise click.UsageError(
             "--policy is for native runs: add --native, or say what a simulation goes by with "
@@ -250,6 +261,7 @@ def _record_native(
     quiet: bool,
     as_json: bool,
     executor: str,
+    processes: bool,
     domain: int | None,
     policy: str | None,
 ) -> None:
@@ -263,6 +275,7 @@ def _record_native(
         echo=not quiet,
         shows=not (quiet or as_json),
         executor=executor,
+        processes=processes,
         domain=domain,
         policy=policy,
         note=_note,

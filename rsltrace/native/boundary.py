@@ -11,11 +11,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import wraps
+from itertools import count
 from typing import Any
 
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.model.event import OutputKind
-from rsltrace.native.ledger import Ledger, Logged, Sent, Taken, now_ns
+from rsltrace.native.ledger import Ledger, Logged, Sent, Span, Taken, now_ns
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
 from rsltrace.trace.chain import hash64
@@ -54,6 +55,11 @@ _ACTION_TAKES = {
 }
 
 
+Taker = Callable[[Any, Any, bool], tuple[Any, bytes]]
+"""Takes a message from a subscription's handle, as its ``take_message`` does; returns what that
+does, and the gid of the publisher."""
+
+
 def channel_of(kind: int, name: str) -> str:
     """Return the name by which what was sent is found again by who takes it."""
     return f"{kind} {name}"
@@ -62,9 +68,11 @@ def channel_of(kind: int, name: str) -> str:
 class Boundary:
     """Tells a ledger of what is sent, and keeps what is taken for the callback that follows."""
 
-    def __init__(self, ledger: Ledger, things: Things) -> None:
+    def __init__(self, ledger: Ledger, things: Things, taker: Taker | None = None) -> None:
+        """``taker`` takes messages in place of rclpy, and says whose they are."""
         self._ledger = ledger
         self._things = things
+        self._taker = taker
         self._local = threading.local()
         self.on_message: dict[str, Callable[[bytes, Any], object]] = {}
         """What is told of the messages on a topic, and of their class."""
@@ -110,32 +118,61 @@ class Boundary:
         def publish(handle: Any, message: Any) -> None:
             begun_ns = now_ns()
             thing = self._things.find(handle)
-            sequence = 0 if thing is None else next(thing.sequence)
-            before_ns = time.time_ns()
-            begun_ns -= now_ns()
-            original(handle, message)
-            begun_ns += now_ns()
-            if thing is not None:
-                self._sent(_MESSAGE, thing, message, sequence, before_ns, begun_ns)
+            if thing is None:
+                original(handle, message)
+                return
+            sequence = next(thing.sequence)
+            with self._sending() as span:
+                before_ns = time.time_ns()
+                begun_ns -= now_ns()
+                try:
+                    original(handle, message)
+                except BaseException:
+                    thing.sequence = count(sequence)  # the middleware has not counted it
+                    raise
+                begun_ns += now_ns()
+                self._sent(span, _MESSAGE, thing, message, sequence, before_ns, begun_ns)
 
         return publish
 
+    @contextmanager
+    def _sending(self) -> Iterator[Span]:
+        """Have an event under way that sends something within the block, and says so there."""
+        span = self._ledger.sending()
+        try:
+            yield span
+        except BaseException:
+            self._ledger.sent(span, None)
+            raise
+
     def _sent(
-        self, kind: int, thing: Thing, message: Any, sequence: int, before_ns: int, begun_ns: int
+        self,
+        span: Span,
+        kind: int,
+        thing: Thing,
+        message: Any,
+        sequence: int,
+        before_ns: int,
+        begun_ns: int,
     ) -> None:
         """Note that a message was sent. ``begun_ns`` is when the observer began, were it not for
         the time that sending took."""
         after_ns = time.time_ns()
         data = self._bytes_of(thing.sends_type, message)
         digest = hash64(data) if data else 0
-        self._ledger.add(Sent(kind, thing, digest, data, sequence, after_ns, before_ns), begun_ns)
+        sent = Sent(kind, thing, digest, data, sequence, after_ns, before_ns)
+        self._ledger.sent(span, sent, begun_ns)
         if kind == _MESSAGE and (told := self.on_message.get(thing.name)) is not None:
             told(data, thing.sends_type)
 
     def _take_message(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def take_message(handle: Any, message_type: Any, raw: bool) -> Any:
-            found = original(handle, message_type, raw)
+            gid = b""
+            if self._taker is None:
+                found = original(handle, message_type, raw)
+            else:
+                found, gid = self._taker(handle, message_type, raw)
             begun_ns = now_ns()
             thing = self._things.find(handle)
             if found is not None and thing is not None:
@@ -148,6 +185,7 @@ class Boundary:
                     info.get("source_timestamp") or 0,
                     info.get("received_timestamp") or 0,
                     begun_ns,
+                    gid,
                 )
             return found
 
@@ -162,6 +200,7 @@ class Boundary:
         source_ns: int,
         ready_ns: int,
         begun_ns: int,
+        gid: bytes = b"",
     ) -> None:
         data = self._bytes_of(thing.takes_type, message)
         digest = hash64(data) if data else 0
@@ -169,7 +208,7 @@ class Boundary:
         if earlier is not None:  # an action may take several at once
             earlier.input_hash = hash64(digest.to_bytes(8, "little"), earlier.input_hash)
             return
-        taken = Taken(thing, digest, digest, channel, sequence, source_ns, ready_ns)
+        taken = Taken(thing, digest, digest, channel, sequence, source_ns, ready_ns, gid=gid)
         taken.observer_ns = now_ns() - begun_ns
         self._local.taken = taken
 
@@ -191,10 +230,13 @@ class Boundary:
     def _send_request(self, original: Callable[..., int]) -> Callable[..., int]:
         @wraps(original)
         def send_request(handle: Any, request: Any) -> int:
-            thing, before_ns = self._things.find(handle), time.time_ns()
-            sequence = original(handle, request)
-            if thing is not None:
-                self._sent(_REQUEST, thing, request, sequence, before_ns, now_ns())
+            thing = self._things.find(handle)
+            if thing is None:
+                return original(handle, request)
+            with self._sending() as span:
+                before_ns = time.time_ns()
+                sequence = original(handle, request)
+                self._sent(span, _REQUEST, thing, request, sequence, before_ns, now_ns())
             return sequence
 
         return send_request
@@ -202,11 +244,15 @@ class Boundary:
     def _send_response(self, original: Callable[..., None]) -> Callable[..., None]:
         @wraps(original)
         def send_response(handle: Any, response: Any, request_id: Any) -> None:
-            thing, before_ns = self._things.find(handle), time.time_ns()
-            original(handle, response, request_id)
-            if thing is not None:
-                sequence = request_id.sequence_number
-                self._sent(_RESPONSE, thing, response, sequence, before_ns, now_ns())
+            thing = self._things.find(handle)
+            if thing is None:
+                original(handle, response, request_id)
+                return
+            with self._sending() as span:
+                before_ns = time.time_ns()
+                original(handle, response, request_id)
+                number = request_id.sequence_number
+                self._sent(span, _RESPONSE, thing, response, number, before_ns, now_ns())
 
         return send_response
 
@@ -242,17 +288,19 @@ class Boundary:
         def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:
             @wraps(original)
             def send(handle: Any, *words: Any) -> Any:
-                parts, before_ns = self._things.parts.get(handle), time.time_ns()
-                given = original(handle, *words)
-                if parts is not None:
-                    thing = parts[part]
+                parts = self._things.parts.get(handle)
+                if parts is None:
+                    return original(handle, *words)
+                with self._sending() as span:
+                    before_ns = time.time_ns()
+                    given = original(handle, *words)
                     # A request gives its number; a response is given the one it answers.
                     if kind == _MESSAGE:  # who takes it learns no number
                         sequence = 0
                     else:
                         sequence = given if kind == _REQUEST else words[0].sequence_number
                     message = words[-1] if words else None  # a status is made by rcl
-                    self._sent(kind, thing, message, sequence, before_ns, now_ns())
+                    self._sent(span, kind, parts[part], message, sequence, before_ns, now_ns())
                 return given
 
             return send

@@ -1,7 +1,8 @@
-"""Who sent what a callback got, by channel, sequence number, content and time of sending.
+"""Who sent what a callback got, by channel, sequence number, content, and publisher or time.
 
-rclpy gives no id of the publisher. Several publishers of a topic count alike and may say the same,
-but what was received was sent (its source timestamp) while the call that sent it was under way.
+Several publishers of a topic count alike and may say the same. Their gid tells them apart where it
+is known; rclpy does not give it. Otherwise what was received was sent (its source timestamp) while
+the call that sent it was under way.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ SLACK_NS = 1_000_000
 """How far the middleware's clock may be from ours."""
 
 _Key = tuple[str, int, int]
-_Place = tuple[int, int, int, int]
+_Place = tuple[int, int, int, int, bytes]
 
 
 class Causes:
@@ -35,7 +36,7 @@ class Causes:
     def sent(self, sent: Sent, event: int, output: int) -> None:
         """Remember which output of which event a message is."""
         key = channel_of(sent.kind, sent.thing.name), sent.sequence, sent.digest
-        self._places[key].append((event, output, sent.before_ns, sent.after_ns))
+        self._places[key].append((event, output, sent.before_ns, sent.after_ns, sent.thing.gid))
         self._order.append(key)
         if len(self._order) > self._kept:
             oldest = self._order.popleft()
@@ -48,13 +49,18 @@ class Causes:
         if not taken.channel:
             return NO_EVENT, 0
         places = self._places.get((taken.channel, taken.sequence, taken.digest), ())
-        for event, output, before_ns, after_ns in places:
+        if taken.gid:
+            for event, output, *_, gid in places:
+                if gid == taken.gid:
+                    return event, output
+            places = [place for place in places if not place[4]]
+        for event, output, before_ns, after_ns, _ in places:
             if before_ns <= taken.source_ns <= after_ns:
                 return event, output
         if places and not taken.source_ns:  # of actions, which do not tell when
             return places[-1][:2]
         if len(places) == 1:
-            event, output, before_ns, after_ns = places[0]
+            event, output, before_ns, after_ns, _ = places[0]
             if before_ns - SLACK_NS <= taken.source_ns <= after_ns + SLACK_NS:
                 return event, output
         self.unknown += 1

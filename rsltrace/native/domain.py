@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import socket
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -13,6 +15,8 @@ from rsltrace.guard.pin import kept_variables
 
 DOMAIN_MAX = 101
 """The largest whose ports lie below those that Linux gives to anybody (RTPS 2.2, 9.6.1.1)."""
+
+_SIOCGIFFLAGS, _IFF_UP = 0x8913, 1  # netdevice(7)
 
 
 @contextmanager
@@ -50,6 +54,25 @@ def _free(given: int | None) -> Iterator[int]:
     raise SetupError(
         f"all DDS domains from 1 to {DOMAIN_MAX} are in use on this machine; choose one (--domain)"
     )
+
+
+def check_loopback() -> None:
+    """Raise ``SetupError`` if processes of this machine cannot reach each other.
+
+    The middleware would say nothing, and no node would find another.
+    """
+    request = struct.pack("16sH22x", b"lo", 0)
+    try:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as any_socket:
+            answer = fcntl.ioctl(any_socket, _SIOCGIFFLAGS, request)
+    except OSError:
+        return  # nobody can tell
+    flags = struct.unpack_from("H", answer, 16)[0]
+    if not flags & _IFF_UP:
+        raise SetupError(
+            "the loopback network is down, so that processes cannot find each other: ip link set "
+            "lo up"
+        )
 
 
 def _is_quiet(number: int) -> bool:

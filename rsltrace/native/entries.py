@@ -13,6 +13,7 @@ from rsltrace.model.event import EventKind
 from rsltrace.native.executors import failure_of
 from rsltrace.native.ledger import Ledger
 from rsltrace.native.nodes import Nodes
+from rsltrace.native.things import Things
 
 
 class RunningEntry(threading.Thread):
@@ -64,6 +65,16 @@ class RunningEntry(threading.Thread):
             with suppress(Exception):  # rclpy is shut down already
                 Executor.create_task(executor, _nothing)
 
+    @property
+    def node_name(self) -> str:
+        """The full name of its first node, empty if it has none."""
+        return str(self.nodes[0].get_fully_qualified_name()) if self.nodes else ""
+
+    @property
+    def failed_in(self) -> str:
+        """What went wrong if it raised, in words."""
+        return f"{'a callback of' if self.nodes else 'constructing'} {self.entry.name}"
+
     def _construct(self) -> None:
         ledger = self._ledger
         ledger.begin(int(EventKind.CONSTRUCT), None)
@@ -105,6 +116,19 @@ class RunningEntry(threading.Thread):
                 if not self.entry.log_exceptions:
                     raise
                 self.nodes[0].get_logger().error(f"{type(error).__qualname__}: {error}")
+
+
+def destroy(nodes: list[Any], ledger: Ledger, things: Things) -> None:
+    """Destroy nodes in the order of their construction, each as one event."""
+    for node in nodes:
+        ledger.begin(int(EventKind.SHUTDOWN), things.find(node))
+        failure = None
+        try:
+            node.destroy_node()
+        except Exception as error:
+            failure = failure_of(error)
+        finally:
+            ledger.end(failure)
 
 
 def _nothing() -> None:

@@ -17,6 +17,7 @@ from rsltrace.native.ledger import Failed, Ledger, Scheduled, Span, Taken
 from rsltrace.native.patches import patched
 from rsltrace.native.things import Thing, Things
 
+EXECUTORS = {"single": "SingleThreadedExecutor", "multi": "MultiThreadedExecutor"}
 _KINDS = {
     EntityKind.TIMER: EventKind.TIMER,
     EntityKind.SUBSCRIPTION: EventKind.SUBSCRIPTION,
@@ -36,16 +37,17 @@ class Executors:
         self._own = threading.local()
 
     @contextmanager
-    def watched(self) -> Iterator[None]:
-        """Be told of all callbacks meanwhile. Each thread has a global executor of its own: it
-        stands for a process."""
+    def watched(self, *, threads_are_processes: bool = True) -> Iterator[None]:
+        """Be told of all callbacks meanwhile. A thread that stands for a process has a global
+        executor of its own."""
         import rclpy
         from rclpy.executors import Executor
 
         with ExitStack() as stack:
             stack.enter_context(patched(Executor, "_make_handler", self._make_handler))
             stack.enter_context(patched(Executor, "create_task", self._create_task))
-            stack.enter_context(patched(rclpy, "get_global_executor", self._global_executor))
+            if threads_are_processes:
+                stack.enter_context(patched(rclpy, "get_global_executor", self._global_executor))
             yield
 
     def _make_handler(self, original: Callable[..., Any]) -> Callable[..., Any]:

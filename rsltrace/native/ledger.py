@@ -70,6 +70,7 @@ class Taken:
     """What a callback got. ``source_ns`` and ``ready_ns`` are system clock; 0 where unknown.
 
     Of several messages that an action takes at once all but ``input_hash`` is of the first.
+    ``gid`` is the publisher's, empty where the middleware was not asked.
     """
 
     thing: Thing
@@ -80,6 +81,7 @@ class Taken:
     source_ns: int = 0
     ready_ns: int = 0
     observer_ns: int = 0
+    gid: bytes = b""
 
 
 @dataclass(slots=True)
@@ -100,6 +102,8 @@ class Span:
     end_ns: int = 0
     observer_ns: int = 0
     outputs: list[Output] = field(default_factory=list)
+    sending: int = 0
+    """How many messages are being sent at the moment that will be its outputs."""
     index: int = -1
     """Which event of the trace it has become; -1 until then."""
 
@@ -179,21 +183,34 @@ class Ledger:
         """
         stack = self._stack()
         with self._lock:
+            span = self._under_way(stack)
             if not stack:
-                span = self._open(int(EventKind.OUTSIDE), None, None)
                 self._close(span)
-            elif (found := stack[-1].span) is not None:
-                span = found
-            else:
-                callback = stack[-1]
-                span = self._open(int(EventKind.RESUME), callback.thing, callback)
-                callback.span = span
             span.outputs.append(output)
-            if type(output) is Sent:
-                self.activity_ns = now_ns()
             if begun_ns:
                 span.observer_ns += now_ns() - begun_ns
             return span, len(span.outputs) - 1
+
+    def sending(self) -> Span:
+        """Return the event that is about to send something, which has begun then: whoever gets it
+        at once, in another process, begins later. ``sent`` has to follow."""
+        stack = self._stack()
+        with self._lock:
+            span = self._under_way(stack)
+            span.sending += 1
+            return span
+
+    def sent(self, span: Span, output: Sent | None, begun_ns: int = 0) -> None:
+        """Add what an event has sent, None if sending it has failed."""
+        with self._lock:
+            span.sending -= 1
+            if output is not None:
+                span.outputs.append(output)
+                self.activity_ns = now_ns()
+                if begun_ns:
+                    span.observer_ns += now_ns() - begun_ns
+            if span.owner is None:
+                self._close(span)
 
     def current(self) -> Callback | None:
         """Return the callback that runs in this thread."""
@@ -206,10 +223,16 @@ class Ledger:
         One that goes on for longer than ``patience_ns`` is cut in two: it must not keep all others
         from the file. None takes everything, as it is.
         """
+        return self.finished_until(patience_ns)[0]
+
+    def finished_until(self, patience_ns: int | None) -> tuple[list[Span], int]:
+        """Return ``finished``, and the steady time before which no other span begins."""
         with self._lock:
             spans, taken = self._spans, []
             while spans:
                 first = spans[0]
+                if first.sending and patience_ns is not None:
+                    break
                 if not first.end_ns:
                     if patience_ns is not None and now_ns() - first.start_ns < patience_ns:
                         break
@@ -218,7 +241,7 @@ class Ledger:
                     if first.owner is not None:
                         first.owner.span = None
                 taken.append(spans.popleft())
-            return taken
+            return taken, spans[0].start_ns if spans else now_ns()
 
     def _stack(self) -> list[Callback]:
         try:
@@ -229,6 +252,21 @@ class Ledger:
                 self._threads += 1
                 self._local.thread = self._threads
         return stack
+
+    def pause(self, thing: Thing) -> None:
+        """Note that a main waits: what comes of it afterwards is another event."""
+        stack = self._stack()
+        if stack and stack[-1].thing is thing:
+            self._suspend(stack[-1])
+
+    def _under_way(self, stack: list[Callback]) -> Span:
+        """Return what runs in this thread, which begins now if nothing has come of it so far."""
+        if not stack:
+            return self._open(int(EventKind.OUTSIDE), None, None)
+        callback = stack[-1]
+        if callback.span is None:
+            callback.span = self._open(int(EventKind.RESUME), callback.thing, callback)
+        return callback.span
 
     def _suspend(self, callback: Callback) -> None:
         with self._lock:

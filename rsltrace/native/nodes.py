@@ -26,9 +26,12 @@ _ROSOUT = "/rosout"
 class Nodes:
     """Tells ``things`` of what nodes create. ``entry`` is whose nodes this thread constructs."""
 
-    def __init__(self, things: Things) -> None:
+    def __init__(self, things: Things, gid_of: Callable[[Any], bytes] = lambda handle: b"") -> None:
         self._things = things
+        self._gid_of = gid_of
         self._local = threading.local()
+        self.main: Entry | None = None
+        """Whose nodes all others of this process are."""
 
     @contextmanager
     def constructing(self, entry: Entry) -> Iterator[None]:
@@ -91,7 +94,7 @@ class Nodes:
 
         @wraps(original)
         def construct(node: Any, node_name: str, *args: Any, **kwargs: Any) -> None:
-            entry: Entry | None = getattr(self._local, "entry", None)
+            entry: Entry | None = getattr(self._local, "entry", None) or self.main
             if entry is not None and kwargs.get("use_global_arguments", True):
                 kwargs = with_arguments(entry, node_name, kwargs)
             original(node, node_name, *args, **kwargs)
@@ -119,10 +122,11 @@ class Nodes:
         qos = qos_of(publisher.qos_profile.get_c_qos_profile())
         with publisher.handle:
             topic = publisher.handle.get_topic_name()
+            gid = self._gid_of(publisher.handle)
         thing = self._add(
             publisher, node, EntityKind.PUBLISHER, topic, publisher.msg_type, qos=qos.summary()
         )
-        thing.qos_yaml = qos.to_yaml()
+        thing.qos_yaml, thing.gid = qos.to_yaml(), gid
         _with_types(thing, publisher.msg_type)
 
     def _subscription(self, node: Thing, subscription: Any) -> None:

@@ -8,6 +8,7 @@ import time
 from array import array
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from rsltrace.model.entity import Entity
 from rsltrace.model.event import NO_EVENT, OutputKind
 from rsltrace.model.stamp import NS_PER_S
 from rsltrace.native.causes import Causes
-from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span
+from rsltrace.native.ledger import Failed, Logged, Scheduled, Sent, Span
 from rsltrace.native.things import Thing
 from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
@@ -48,10 +49,17 @@ class Clocks:
         return self.wall_ns + steady_ns - self.steady_ns
 
 
+class Spans(Protocol):
+    """Where spans come from."""
+
+    def finished(self, patience_ns: int | None) -> list[Span]:
+        """Take those before which all is over, in order of their starts."""
+
+
 class Pen(threading.Thread):
     """Takes spans from a ledger and writes them, until it is told to finish."""
 
-    def __init__(self, ledger: Ledger, recorder: Recorder, clocks: Clocks, base_dir: Path) -> None:
+    def __init__(self, ledger: Spans, recorder: Recorder, clocks: Clocks, base_dir: Path) -> None:
         super().__init__(name="rsltrace pen", daemon=True)
         self._ledger = ledger
         self._recorder = recorder
@@ -64,6 +72,11 @@ class Pen(threading.Thread):
         self._observer_ns = array("Q")
         self.cpu_ns = 0
         """Processor time of this thread."""
+
+    @property
+    def count(self) -> int:
+        """How many events have been written."""
+        return self._recorder.index
 
     @property
     def observer_ns(self) -> int:

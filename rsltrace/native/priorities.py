@@ -69,6 +69,12 @@ def real_time_class() -> str:
     )
 
 
+def order() -> str:
+    """Return what a trace says of the priorities."""
+    among = "which ready callback an executor takes"
+    return among if real_time_class() else f"SCHED_FIFO for each executor's thread, and {among}"
+
+
 class Priorities:
     """What is how urgent: by ``rules``, or without any by rate.
 
@@ -85,12 +91,6 @@ class Priorities:
         self.refused = real_time_class()
         self.levels: dict[str, int] = {}
         """The real-time priorities of the executors, by the name of their thread."""
-
-    @property
-    def description(self) -> str:
-        """What a trace says of the priorities."""
-        order = "which ready callback an executor takes"
-        return order if self.refused else f"SCHED_FIFO for each executor's thread, and {order}"
 
     @contextmanager
     def watched(self, extension: Any) -> Iterator[None]:

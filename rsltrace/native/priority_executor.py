@@ -67,7 +67,7 @@ class PriorityExecutor(SingleThreadedExecutor):  # type: ignore[misc]
             except (StopIteration, TimeoutException, ConditionReachedException, ShutdownException):
                 self._looking = None
                 return None
-            if id(task) in under_way:
+            if entity is None or id(task) in under_way:  # made by create_task
                 return task
             with self._tasks_lock:  # what only waits is none of rclpy's tasks yet
                 self._tasks = [one for one in self._tasks if one[0] is not task]

@@ -29,28 +29,29 @@ _STEERING = (
 def check(job: Job) -> None:
     """Raise ``JobError`` at the first part of a job that has to be and cannot be native."""
     for index, spec in enumerate(job.nodes):
-        if spec.node is None:
+        if spec.component is not None:
             raise JobError(
-                f"a native run has all nodes in one process, and {spec.target} is a program of its "
-                f"own ({spec.kind}): name its Node class or a function that makes it (node:)",
-                where=spec.origin or locate(job, ("nodes", index, spec.kind)),
+                f"a native run loads no components: start {spec.target} beside it, in the domain "
+                "that --domain names, or name a program of its own",
+                where=spec.origin or locate(job, ("nodes", index, "component")),
             )
-        if spec.start_after is not None:
+        if spec.stdin is not None:
             raise JobError(
-                "a native run starts all nodes at once: leave start_after out",
-                where=spec.origin or locate(job, ("nodes", index, "start_after")),
+                "a native run types nothing: leave stdin out, or give arguments",
+                where=spec.origin or locate(job, ("nodes", index, "stdin")),
             )
-    if job.bags:
-        raise JobError(
-            "a native run plays no bags: play them with ros2 bag play beside it, in the domain "
-            "that --domain names",
-            where=locate(job, ("bags", 0)),
-        )
     for name in ("before", "after"):
         if getattr(job.hooks, name) is not None:
             raise JobError("a native run has no hooks", where=locate(job, ("hooks", name)))
-    if not job.nodes:
+    if not job.nodes and not job.bags:
         raise JobError("there are no nodes to run natively", where=locate(job, ("nodes",)))
+
+
+def needs_processes(job: Job) -> bool:
+    """Return whether a job has more than nodes to construct: what is a program is a process."""
+    return bool(job.bags) or any(
+        spec.node is None or spec.start_after is not None for spec in job.nodes
+    )
 
 
 def priority_rules(job: Job, policy: str | None) -> tuple[PriorityRule, ...] | None:

@@ -34,6 +34,8 @@ class Thing:
     sends_type: Any = None
     takes_type: Any = None
     qos_yaml: str = ""
+    gid: bytes = b""
+    """A publisher's in the middleware, empty where nobody has asked."""
     sequence: count[int] = field(default_factory=lambda: count(1))
     channel: int | None = None
     """That of the trace, once something has been written to it."""
@@ -47,10 +49,17 @@ class Things:
         self._ids = count(1)
         self._lock = threading.Lock()
         self._of: WeakKeyDictionary[Any, Thing] = WeakKeyDictionary()
+        self._news: list[Thing] | None = None
         self.parts: WeakKeyDictionary[Any, dict[str, Thing]] = WeakKeyDictionary()
         """The services and topics that an end of an action has, by name."""
         self.rosout: dict[str, Thing] = {}
         """The publishers of /rosout by the names of loggers."""
+
+    def news(self) -> list[Thing]:
+        """Return what was made since this was asked last; all from the first time on."""
+        with self._lock:
+            news, self._news = self._news or [], []
+        return news
 
     def find(self, handle: Any) -> Thing | None:
         """Return what belongs to a handle or wrapper; None if nobody has told of it."""
@@ -71,12 +80,14 @@ class Things:
 
         ``runs`` is the function that its events run.
         """
-        with self._lock:
-            number = next(self._ids)
+        number = next(self._ids)
         owner = number if kind is EntityKind.NODE else 0 if node is None else node.id
         thing = Thing(number, owner, kind, name)
         for key in keys:
             self._of[key] = thing
+        with self._lock:
+            if self._news is not None:
+                self._news.append(thing)
         if source := source_of(runs):
             detail["source"] = source
         self._tell(Entity(number, owner, kind, name, type_name, 0, detail))

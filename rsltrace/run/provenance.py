@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import lru_cache
@@ -76,9 +76,13 @@ def source_files(job: Job) -> dict[str, Path]:
     return modules
 
 
-def write_sources(writer: TraceWriter, job: Job) -> None:
-    """Put hashes of the code into the trace: of its files as they are, and of what they mean."""
-    files = source_files(job)
+def write_sources(writer: TraceWriter, job: Job, files: Mapping[str, Path] | None = None) -> None:
+    """Put hashes of the code into the trace: of its files as they are, and of what they mean.
+
+    ``files`` are those that other processes have loaded, None: what there is in this one.
+    """
+    if files is None:
+        files = source_files(job)
     hashes = {n: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for n, path in files.items()}
     writer.add_metadata(METADATA_SOURCES, hashes)
     if code := module_code(files):

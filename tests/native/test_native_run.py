@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -21,42 +20,13 @@ from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.native import callback_figures, is_native, timings
 from rsltrace.trace.reader import Trace
+from tests.native.running import COMMAND, environment, events_of, job, record
 
 pytestmark = [
     pytest.mark.ros,
     pytest.mark.native,
     pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy"),
 ]
-
-ROBOT = Path(__file__).parent
-COMMAND = [sys.executable, "-m", "rsltrace"]
-
-
-def job(folder: Path, text: str) -> Path:
-    path = folder / "job.yaml"
-    path.write_text(f"search_path: ['{ROBOT}']\n{text}")
-    return path
-
-
-def environment(folder: Path) -> dict[str, str]:
-    return {**os.environ, "ROS_LOG_DIR": str(folder / "log")}
-
-
-def record(folder: Path, text: str, *words: str) -> subprocess.CompletedProcess[str]:
-    """Record a job natively to ``run.mcap``."""
-    command = [*COMMAND, "record", "--native", str(job(folder, text)), "-o", "run.mcap", *words]
-    return subprocess.run(
-        command,
-        cwd=folder,
-        env=environment(folder),
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-
-
-def events_of(trace: Trace) -> list[Any]:
-    return [trace.event(index) for index in range(trace.event_count)]
 
 
 def outputs_on(trace: Trace, node: str, topic: str) -> list[Any]:

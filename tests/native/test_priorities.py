@@ -16,6 +16,7 @@ from rsltrace.cli.record import record
 from rsltrace.model.event import EventKind
 from rsltrace.native.priorities import LEVEL_MAX, LEVEL_MIN, level_of_period
 from rsltrace.trace.reader import Trace
+from tests.native.running import record as run_natively
 
 needs_rclpy = pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy")
 COMMAND = [sys.executable, "-m", "rsltrace", "record", "--native"]
@@ -98,3 +99,13 @@ def test_shorter_periods_never_have_a_lower_real_time_priority() -> None:
 def test_options_that_make_no_sense(words: list[str], message: str) -> None:
     with pytest.raises(UsageError, match=message):
         record.main(words, standalone_mode=False)
+
+
+@pytest.mark.ros
+@pytest.mark.native
+@needs_rclpy
+def test_a_node_that_has_nothing_to_do_ends_with_the_run(tmp_path: Path) -> None:
+    text = "nodes: [{node: robot:Server}]\nstop: {duration: 500ms}\n"
+    done = run_natively(tmp_path, text, "--policy", "rate_monotonic")
+    assert done.returncode == 0, done.stderr
+    assert "did not return" not in done.stderr

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from rsltrace.cli.output.checks import Checked
     from rsltrace.job import Job
     from rsltrace.loop.stop import Stop
-    from rsltrace.native.session import NativeResult
+    from rsltrace.native.recording import NativeResult
 
 
 def run_native(
@@ -30,6 +30,7 @@ def run_native(
     echo: bool,
     shows: bool,
     executor: str,
+    processes: bool,
     domain: int | None,
     policy: str | None,
     note: Callable[[str], None],
@@ -52,6 +53,7 @@ def run_native(
             force=force,
             echo=echo,
             executor=executor,
+            processes=processes,
             domain_id=domain,
             policy=policy,
             observer=Observer(progress=on_progress, interrupt=interrupt, note=note),

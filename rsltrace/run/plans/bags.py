@@ -256,7 +256,7 @@ def start_players(
                         player.handle,
                         key[0],
                         check_type(entry.spec.path, topic),
-                        {**_qos_values(topic.qos), **_qos_override(entry.spec, topic.name)},
+                        {**qos_values(topic.qos), **qos_override(entry.spec, topic.name)},
                     )
                 ends.append(publishers[key])
             streams.append(_messages(entry.playback, ends))
@@ -279,7 +279,7 @@ def start_players(
         merged = heapq.merge(*streams, key=lambda message: message[0])
     merged = faults.played(merged)
     if told:
-        merged = _with_progress(merged, told[0], _span_ns(bags))
+        merged = with_progress(merged, told[0], bags)
     paths = " and ".join(entry.spec.path for entry in bags)
     name = f"the {'bag' if len(bags) == 1 else 'bags'} {paths}"
     Player(domain, merged, name, on_end).start()
@@ -298,11 +298,11 @@ def _span_ns(bags: list[BagInput]) -> tuple[int, int]:
     return min(entry.playback.start_ns for entry in bags), max(end for end in ends if end)
 
 
-def _with_progress(
-    messages: Iterator[tuple[int, Any, bytes]], publisher: Any, span_ns: tuple[int, int]
+def with_progress(
+    messages: Iterator[tuple[int, Any, bytes]], publisher: Any, bags: list[BagInput]
 ) -> Iterator[tuple[int, Any, bytes]]:
     """Put progress from 0 to 1 among the messages, each hundredth once, when it is reached."""
-    start_ns, end_ns = span_ns
+    start_ns, end_ns = _span_ns(bags)
     told, stamp_ns = -1, start_ns
     for message in messages:
         yield message
@@ -318,14 +318,16 @@ def _float32(percent: int) -> bytes:
     return b"\x00\x01\x00\x00" + struct.pack("<f", percent / 100)
 
 
-def _qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
+def qos_override(spec: BagSpec, topic: str) -> dict[str, Any]:
+    """Return the QoS that a job gives to a recorded topic."""
     for glob, qos in spec.qos.items():
         if fnmatchcase(topic, glob):
             return qos.values()
     return {}
 
 
-def _qos_values(qos: Any) -> dict[str, Any]:
+def qos_values(qos: Any) -> dict[str, Any]:
+    """Return what is known of a recorded QoS."""
     if qos is None:
         return {}
     return {

@@ -41,7 +41,7 @@ def node_entries(
     entries = []
     mains = Mains(job)
     processes = Processes(job, told)
-    for_all = _arguments_for_all(job)
+    for_all = arguments_for_all(job)
     keys = entry_keys(job.nodes)
     for index, (spec, key) in enumerate(zip(job.nodes, keys, strict=True)):
         if only is not None and index not in only:
@@ -84,7 +84,7 @@ def node_entries(
                 log_exceptions=spec.on_exception == "log",
                 key=key,
                 policy=policy_of(job.guard, spec.guard) if spec.guard is not None else None,
-                start_after=_start_rule(job, index, keys),
+                start_after=start_rule(job, index, keys),
                 stdin=typed_at(job, index),
                 program=program,
                 is_component=spec.component is not None,
@@ -122,7 +122,8 @@ def _component(spec: NodeSpec, arguments: Sequence[RosArguments], where: str) ->
     )
 
 
-def _start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
+def start_rule(job: Job, index: int, keys: Sequence[str]) -> StartRule | None:
+    """Return when an entry starts, None if it does so with the run."""
     spec = job.nodes[index]
     after = spec.start_after
 
@@ -242,7 +243,7 @@ def hook_entries(
     return [Entry(title, lambda: function(argument()) or [], [], key=title)]
 
 
-def _arguments_for_all(job: Job) -> list[str]:
+def arguments_for_all(job: Job) -> list[str]:
     """Return the ROS arguments of all nodes, the paths in them absolute.
 
     :raises JobError: if rcl refuses them.

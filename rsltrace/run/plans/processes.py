@@ -57,7 +57,7 @@ class Processes:
         :raises JobError: if there is no such file, or it cannot be executed.
         :raises SetupError: if the library cannot be built.
         """
-        command = self._command(spec, where)
+        command = self.command(spec, where)
         if command is None:
             return None
         words = [word for part in arguments for word in part.arguments]
@@ -71,13 +71,13 @@ class Processes:
             self._library,
             surroundings=self._surroundings,
             environment=spec.environment,
-            folder=self._folder(spec, where),
-            search_path=self._search_path,
-            prefixes=self._prefixes,
+            folder=self.folder(spec, where),
+            search_path=self.search_path,
+            prefixes=self.prefixes,
         )
 
     @cached_property
-    def _search_path(self) -> list[str]:
+    def search_path(self) -> list[str]:
         """Where modules are: those of packages that nobody has built come first, since folders
         with sources (``src/my_robot/my_robot``) look like packages themselves."""
         from rsltrace.workspace.installs import module_folders  # which loads a parser of XML
@@ -86,13 +86,17 @@ class Processes:
         return [str(path) for path in dict.fromkeys([*module_folders(given), *given])]
 
     @cached_property
-    def _prefixes(self) -> list[str]:
+    def prefixes(self) -> list[str]:
         """Where the shares of those packages are, and of wheels, as in the process of the run."""
         found = [str(path) for name in sorted(unbuilt_names()) if (path := unbuilt_prefix(name))]
         has_wheels = Path(sys.prefix, "share", "ament_index").is_dir()
         return [*found, sys.prefix] if has_wheels else found
 
-    def _folder(self, spec: NodeSpec, where: str) -> Path | None:
+    def folder(self, spec: NodeSpec, where: str) -> Path | None:
+        """Return where an entry runs, None if that is the present folder.
+
+        :raises JobError: if there is no such folder.
+        """
         if spec.working_directory is None:
             return None
         folder = self._job.resolve(spec.working_directory)
@@ -100,7 +104,11 @@ class Processes:
             raise JobError(f"there is no folder {spec.working_directory} to run in", where=where)
         return folder
 
-    def _command(self, spec: NodeSpec, where: str) -> list[str] | None:
+    def command(self, spec: NodeSpec, where: str) -> list[str] | None:
+        """Return the words that start an entry, but for its own; None if it is no process.
+
+        :raises JobError: if there is no such file, or it cannot be executed.
+        """
         if spec.program is not None:
             return _executable(self._job.resolve(spec.program), spec.program, where)
         if spec.executable is not None:

@@ -1,0 +1,189 @@
+"""The process of one entry of a native run: ``main`` is what it runs.
+
+It gets its order, says that it could begin, begins when it is told to, and tells what it observes
+until it is told to end, or ends by itself. It never outlives the run.
+"""
+
+from __future__ import annotations
+
+import atexit
+import ctypes
+import os
+import signal
+import socket
+import sys
+import threading
+from contextlib import ExitStack, suppress
+from typing import Any
+
+from rsltrace.doors.rclpy.boundary.installation import boundary
+from rsltrace.doors.rclpy.entry import Entry
+from rsltrace.doors.rclpy.error_text import exit_status
+from rsltrace.errors import JobError, RsltraceError
+from rsltrace.middleware.events.failure import text_of, user_traceback
+from rsltrace.native.apart.link import Link
+from rsltrace.native.apart.mains import RunningMain
+from rsltrace.native.apart.observers import Observers, Sender
+from rsltrace.native.apart.order import Order
+from rsltrace.native.entries import RunningEntry, destroy
+from rsltrace.native.priorities import Priorities
+from rsltrace.native.recording import ENDS_WITHIN_S, rclpy_running
+from rsltrace.run.plans.entries import node_entries
+from rsltrace.run.process import search_path
+from rsltrace.run.provenance import source_files
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main(number: int, run: int) -> None:
+    """Do what the run (a process) orders on the socket of a number."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != run:
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # until there is something to interrupt
+    link = Link(socket.socket(fileno=number))
+    frame = link.receive(trusted=True)
+    if frame is None:
+        os._exit(1)
+    order: Order = frame[0]
+    sys.path += [path for path in order.module_path if path not in sys.path]
+    if order.command:
+        _become(order, link)
+    with ExitStack() as stack:
+        status = _Child(order, link).run(stack)
+        stack.pop_all()  # user code may run up to the end of the process
+    sys.exit(status)
+
+
+def _become(order: Order, link: Link) -> None:
+    """Become another program; the kernel still ends it with the run."""
+    link.send("ready", {})
+    if link.receive() is None:
+        os._exit(1)
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        os.execvp(order.command[0], order.command)
+    except OSError as error:
+        said = f"{order.command[0]} cannot be started: {error.strerror}"
+        link.send("error", "JobError", said)
+        os._exit(1)
+
+
+class _Child:
+    """One entry. The main thread runs it, another one listens to the run."""
+
+    def __init__(self, order: Order, link: Link) -> None:
+        self._order = order
+        self._link = link
+        self._observers = Observers(boundary().real)
+        self._sender: Sender | None = None
+        self._entry: RunningEntry | None = None
+        self._priorities: Priorities | None = None
+        self._is_over = threading.Event()
+        atexit.register(self._finish)  # runs last: what others register comes before
+
+    def run(self, stack: ExitStack) -> int:
+        """Run the entry; return the exit status of the process."""
+        order = self._order
+        try:
+            stack.enter_context(search_path(order.job))
+            entry = self._find(stack)
+            if entry.argv is None:
+                stack.enter_context(rclpy_running(echo=order.echo))
+        except RsltraceError as error:
+            self._link.send("error", type(error).__name__, str(error))
+            return error.exit_code
+        sources = {name: str(path) for name, path in source_files(order.job).items()}
+        self._link.send("ready", sources)
+        if self._link.receive() != ("go",):
+            return 0
+        if order.policy is not None and entry.argv is None:
+            self._priorities = Priorities(self._observers.things, order.rules)
+            stack.enter_context(self._priorities.watched(boundary().real))
+        self._observers.watch()
+        return self._run_node(entry) if entry.argv is None else self._run_main(entry)
+
+    def _find(self, stack: ExitStack) -> Entry:
+        if self._order.plays_bags:
+            from rsltrace.native.apart.bags import player
+
+            return player(self._order.job, stack)
+        (entry,) = node_entries(self._order.job, only={self._order.index})
+        return entry
+
+    def _begin(self, is_constructed: Any) -> None:
+        self._sender = Sender(self._link, self._observers, is_constructed)
+        self._sender.start()
+        threading.Thread(target=self._listen, name="rsltrace listener", daemon=True).start()
+
+    def _run_node(self, entry: Entry) -> int:
+        observers, at_once = self._observers, threading.Event()
+        at_once.set()
+        self._entry = running = RunningEntry(
+            entry, observers.ledger, observers.nodes, self._make_executor, at_once, self._ended
+        )
+        self._begin(running.constructed.is_set)
+        running.run()  # in this thread
+        return 0
+
+    def _make_executor(self) -> Any:
+        if self._priorities is not None and self._entry is not None:
+            from rsltrace.native.priority_executor import PriorityExecutor
+
+            threading.current_thread().name = f"rsltrace {self._entry.entry.name}"
+            return PriorityExecutor(self._priorities)
+        import rclpy.executors
+
+        return getattr(rclpy.executors, self._order.executor)()
+
+    def _ended(self, one: RunningEntry, error: BaseException | None) -> None:
+        if isinstance(error, JobError):
+            self._link.send("error", type(error).__name__, str(error))
+        elif error is not None:
+            self._raised(one.failed_in, one.node_name, error)
+        elif one.stopping:
+            destroy(one.nodes, self._observers.ledger, self._observers.things)
+        else:
+            self._link.send("shutdown")
+
+    def _raised(self, what: str, node: str, error: BaseException) -> None:
+        kind = type(error).__qualname__
+        self._link.send("raised", what, node, kind, text_of(error), user_traceback(error))
+
+    def _run_main(self, entry: Entry) -> int:
+        running = RunningMain(entry, self._observers, echo=self._order.echo)
+        self._begin(running.is_constructed)
+        try:
+            running.run()
+        except SystemExit as error:
+            if error.code is not None and not isinstance(error.code, int):
+                self._link.send("exit", text_of(error))
+            return exit_status(error)
+        except KeyboardInterrupt:
+            return 128 + signal.SIGINT
+        except BaseException as error:
+            self._raised(entry.name, "", error)
+            return 1
+        finally:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left is to be told of
+        return 0
+
+    def _listen(self) -> None:
+        with suppress(OSError):
+            if self._link.receive() is None:
+                os._exit(1)
+        if self._entry is not None:
+            self._entry.stop()
+        if not self._is_over.wait(ENDS_WITHIN_S):
+            self._finish()
+            with suppress(OSError):
+                self._link.send("stuck")
+            os._exit(0)
+
+    def _finish(self) -> None:
+        self._is_over.set()
+        if self._sender is not None:
+            self._sender.finish()
+        if self._priorities is not None:
+            with suppress(OSError):
+                self._link.send("levels", dict(self._priorities.levels))

@@ -1,0 +1,265 @@
+"""What all native runs have in common: when they end, what goes wrong, and the trace of it."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from rsltrace.doors.rclpy.exit_code_topic import watch_exit_code
+from rsltrace.errors import RsltraceError, RunError, SetupError
+from rsltrace.job import Job, locate
+from rsltrace.loop.policy import PriorityRule
+from rsltrace.loop.stop import Progress, Stop
+from rsltrace.mcap.sink import unfinished
+from rsltrace.middleware.events.failure import text_of
+from rsltrace.native import support
+from rsltrace.native.pen import Clocks, Pen, Spans
+from rsltrace.native.priorities import order, real_time_class
+from rsltrace.run.inputs import check_output
+from rsltrace.run.plans.stopping import end_ns_of, stop_conditions
+from rsltrace.run.process import Observer
+from rsltrace.run.provenance import environment, payload_filter, write_job, write_sources
+from rsltrace.trace.format import METADATA_ENVIRONMENT, METADATA_NATIVE
+from rsltrace.trace.recorder import Recorder
+from rsltrace.trace.writer import TraceWriter
+
+LOOK_EVERY_S = 0.01
+ENDS_WITHIN_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class NativeResult:
+    """How a native run went. ``duration_ns`` is real time, from when the nodes began to spin.
+
+    ``observer_ns`` is the median of what observing a callback took in its thread, ``pen_ns`` the
+    processor time of writing it down beside it. ``stuck`` are entries with a callback that did not
+    come back at the end.
+    """
+
+    path: Path
+    events: int
+    duration_ns: int
+    stop_reason: str
+    exit_code: int
+    observer_ns: int
+    pen_ns: int
+    error: RunError | None = None
+    stuck: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    kept: str = ""
+
+
+@dataclass
+class Recording:
+    """A native run. Only its own thread calls it, but for ``stop`` and ``fail``.
+
+    ``rules`` are those of ``policy``, None if it goes by rate; ``levels`` are the real-time
+    priorities that threads had.
+    """
+
+    job: Job
+    observer: Observer
+    executor: str
+    domain_id: int | None
+    policy: str | None = None
+    rules: tuple[PriorityRule, ...] | None = None
+    notes: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.error: RunError | None = None
+        self.ending: Stop | None = None
+        self.stopped = threading.Event()
+        self.levels: dict[str, int] = {}
+        self.begun_ns = 0
+        self.ended_ns = 0
+        self._lock = threading.Lock()
+        self._start_ns = self.job.start_ns or 0
+
+    def note(self, text: str) -> None:
+        """Tell whoever watches, before the run begins."""
+        if self.observer.note is not None:
+            self.observer.note(text)
+
+    def prepare(self, output: Path) -> None:
+        """Find what can be known to be wrong before anything is started."""
+        self.conditions = tuple(stop_conditions(self.job, self._start_ns))
+        if self.policy is not None and (refused := real_time_class()):
+            self.note(f"{refused}; executors go by priorities all the same")
+        if without := support.ignored(self.job, self.policy):
+            self.note(
+                f"a native run is not steered; without effect in the job: {', '.join(without)}"
+            )
+        for place in (output, unfinished(output)):
+            check_output(self.job, place, None)
+
+    def create(
+        self,
+        stack: ExitStack,
+        output: Path,
+        spans: Spans,
+        described: Mapping[str, str],
+        sources: Mapping[str, Path] | None = None,
+        *,
+        force: bool,
+    ) -> None:
+        """Create the trace, which ``spans`` come to. ``sources`` are the files of the user's code,
+        None if they are loaded here."""
+        job = self.job
+        discovery = "this machine" if self.domain_id is None else "as the environment says"
+        self.writer = stack.enter_context(
+            TraceWriter(output, force=force, events_per_segment=job.record.segment_events)
+        )
+        if self.observer.interrupt is not None:
+            self.observer.interrupt(self.stop)
+        recorder = Recorder(self.writer, keep_payload=payload_filter(job))
+        self.clocks = Clocks.now()
+        write_job(self.writer, job)
+        self.writer.add_metadata(METADATA_ENVIRONMENT, environment(job))
+        write_sources(self.writer, job, sources)
+        self.writer.add_metadata(
+            METADATA_NATIVE,
+            {
+                "mode": "native",
+                **described,
+                "discovery": discovery,
+                "wall_ns": str(self.clocks.wall_ns),
+                "steady_ns": str(self.clocks.steady_ns),
+                "ignored": ", ".join(support.ignored(job, self.policy)),
+                **({} if self.policy is None else {"policy": self.policy, "priorities": order()}),
+            },
+        )
+        self.pen = Pen(spans, recorder, self.clocks, job.base_dir)
+
+    def watch_topic(self, on_message: dict[str, Any]) -> None:
+        """Let the topic of ``stop:`` end the run; ``on_message`` is told of bytes and class."""
+        spec = self.job.stop.topic
+        if spec is None:
+            return
+        stops = SimpleNamespace(stop_after_step=self.stop)
+        where = locate(self.job, ("stop", "topic", "exit_code"))
+        watch = watch_exit_code(stops, spec, where=where)  # type: ignore[arg-type]
+
+        def told(data: bytes, type: Any) -> None:
+            try:
+                watch(SimpleNamespace(msg_type=type), data)
+            except RsltraceError as error:
+                self.fail(RunError(str(error)))
+
+        on_message[spec.name] = told
+
+    def wait(self) -> Iterator[None]:
+        """Yield again and again until the run is over. ``begun_ns`` says since when it lasts."""
+        while not self.stopped.wait(LOOK_EVERY_S) and self.pen.error is None:
+            yield
+        self.ended_ns = time.monotonic_ns()
+
+    def look(self, events: int, activity_ns: int) -> None:
+        """End the run if it is time. ``activity_ns`` is when something was last sent, steady."""
+        now_ns = time.monotonic_ns() - self.begun_ns + self._start_ns
+        last_ns = max(activity_ns - self.begun_ns, 0) + self._start_ns
+        progress = Progress(now_ns, None, self._start_ns, events, last_ns)
+        for condition in self.conditions:
+            stop = condition(progress)
+            if stop is not None:
+                self.stop(stop)
+                return
+        size = self.job.stop.size
+        if size is not None and self.writer.size >= size:
+            self.stop(Stop(f"a trace of {size} bytes"))
+        if self.observer.progress is not None:
+            self.observer.progress(now_ns, end_ns_of(self.job, self._start_ns), events)
+
+    def stop(self, stop: Stop) -> None:
+        """End the run, from any thread; the first reason counts."""
+        with self._lock:
+            if self.ending is None:
+                self.ending = stop
+        self.stopped.set()
+
+    def fail(self, error: RunError, reason: str = "") -> None:
+        """End the run because of an error, from any thread."""
+        with self._lock:
+            if self.error is None and self.ending is None:
+                self.error = error
+        self.stop(Stop(reason or str(error).splitlines()[0], error.exit_code))
+
+    def close(self, ended_after: int, stuck: tuple[str, ...], unreadable: int) -> NativeResult:
+        """Write what is left, close the trace, and say how it went.
+
+        :raises OutputError: if the trace cannot be written.
+        """
+        self.pen.finish()
+        events = self.pen.count
+        stop = self.ending or Stop("nothing is left")
+        exit_code = self.error.exit_code if self.error is not None else stop.exit_code
+        observer_ns = self.pen.observer_ns
+        pen_ns = self.pen.cpu_ns // max(events, 1)
+        self.writer.close(
+            result={
+                "start_time": str(self.clocks.wall_ns),
+                "end_time": str(self.clocks.stamp(time.monotonic_ns())),
+                "stop_reason": stop.reason,
+                "exit_code": str(exit_code),
+                "ended_after": str(ended_after),
+                "observer_ns": str(observer_ns),
+                "pen_ns": str(pen_ns),
+                "unknown_causes": str(self.pen.causes.unknown),
+                **self._levels(),
+            },
+            replace=self.begun_ns > 0 or exit_code == 0,
+        )
+        return NativeResult(
+            path=self.writer.place,
+            events=events,
+            duration_ns=self.ended_ns - self.begun_ns,
+            stop_reason=stop.reason,
+            exit_code=exit_code,
+            observer_ns=observer_ns,
+            pen_ns=pen_ns,
+            error=self.error,
+            stuck=stuck,
+            notes=(*self.notes, *_said(stuck, unreadable)),
+            kept=self.writer.kept,
+        )
+
+    def _levels(self) -> dict[str, str]:
+        if self.policy is None:
+            return {}
+        levels = sorted(self.levels.items(), key=lambda one: (-one[1], one[0]))
+        return {"thread_priorities": ", ".join(f"{name} {level}" for name, level in levels)}
+
+
+def _said(stuck: tuple[str, ...], unreadable: int) -> Iterator[str]:
+    for name in stuck:
+        yield f"a callback of {name} did not return within {ENDS_WITHIN_S:g} s of the end"
+    if unreadable:
+        yield f"{unreadable} messages could not be read as bytes: no hash of them"
+
+
+@contextmanager
+def rclpy_running(*, echo: bool) -> Iterator[None]:
+    """Initialize rclpy, and shut it down afterwards.
+
+    :raises SetupError: if the middleware cannot be started.
+    """
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    quiet = [] if echo else ["--ros-args", "--disable-stdout-logs"]
+    try:
+        rclpy.init(args=quiet, signal_handler_options=SignalHandlerOptions.NO)
+    except Exception as error:
+        raise SetupError(
+            f"ROS's middleware cannot be started: {text_of(error)}; see RMW_IMPLEMENTATION, and "
+            "whether the loopback network is up (ip link)"
+        ) from error
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()

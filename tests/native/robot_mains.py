@@ -1,0 +1,89 @@
+"""Mains that number what they send, and write down what they have sent and got."""
+
+import json
+import os
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from std_msgs.msg import String, UInt64
+
+
+class Counting(Node):
+    """Publishes numbers on ``out`` and a text that all others of its kind publish, too, and counts
+    all that it does and gets."""
+
+    def __init__(self, name: str, first: int = 0) -> None:
+        super().__init__(name)
+        self.first = self.next = self.declare_parameter("first", first).value
+        self.got: list[int] = []
+        self.same = 0
+        self.out = self.create_publisher(UInt64, "/numbers", 100)
+        self.say = self.create_publisher(String, "/same", 100)
+        self.create_subscription(UInt64, "/numbers", self.on_number, 100)
+        self.create_subscription(String, "/same", self.on_same, 100)
+        self.create_timer(self.declare_parameter("period", 0.01).value, self.on_timer)
+
+    def on_timer(self) -> None:
+        self.out.publish(UInt64(data=self.next))
+        self.say.publish(String(data="the same"))
+        self.next += 1
+
+    def on_number(self, message: UInt64) -> None:
+        self.got.append(message.data)
+
+    def on_same(self, message: String) -> None:
+        self.same += 1
+
+    def counted(self) -> dict[str, Any]:
+        return {"sent": self.next - self.first, "got": self.got, "same": self.same}
+
+
+def count() -> None:
+    """Spin a node that counts; the argument is where to write what it counted."""
+    rclpy.init()
+    node = Counting("counting")
+    try:
+        rclpy.spin(node)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    finally:
+        Path(sys.argv[1]).write_text(json.dumps(node.counted()))
+
+
+def talk() -> None:
+    """Publish in a loop, without a spin."""
+    rclpy.init()
+    publisher = Node("talk").create_publisher(UInt64, "/numbers", 100)
+    for number in range(int(sys.argv[1])):
+        publisher.publish(UInt64(data=number))
+        time.sleep(0.05)
+
+
+def crash() -> None:
+    """Be killed in the middle of something."""
+    rclpy.init()
+    Node("crash").create_publisher(String, "/last_words", 10).publish(String(data="farewell"))
+    time.sleep(0.5)
+    os.kill(os.getpid(), signal.SIGSEGV)
+
+
+def fail() -> None:
+    rclpy.init()
+    Node("fail")
+    raise ValueError("of the main")
+
+
+def deaf() -> None:
+    """Ignore whoever asks it to end."""
+    rclpy.init(signal_handler_options=rclpy.signals.SignalHandlerOptions.NO)
+    Node("deaf").create_publisher(String, "/deaf", 10).publish(String())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Path(sys.argv[1]).write_text(str(os.getpid()))
+    threading.Event().wait()

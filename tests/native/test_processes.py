@@ -1,0 +1,321 @@
+"""Native runs with a process for each entry: nothing is lost, and the causes are right."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from rsltrace.model.entity import EntityKind
+from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.trace.contents import check_contents
+from rsltrace.trace.native import callback_figures, timings
+from rsltrace.trace.reader import Trace
+from tests.native.running import COMMAND, environment, events_of, job, record
+
+pytestmark = [
+    pytest.mark.ros,
+    pytest.mark.native,
+    pytest.mark.skipif(importlib.util.find_spec("rclpy") is None, reason="needs rclpy"),
+]
+
+FOUR = """
+nodes:
+  - {main: robot_mains:count, arguments: [a], name: a, parameters: {first: 100000}}
+  - {main: robot_mains:count, arguments: [b], name: b, parameters: {first: 200000}}
+  - {main: robot_mains:count, arguments: [c], name: c, parameters: {first: 300000, period: 0.013}}
+  - {main: robot_mains:count, arguments: [d], name: d, parameters: {first: 400000, period: 0.1}}
+stop: {duration: 4s}
+"""
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Trace, dict[str, Any]]]:
+    """A run of four processes, which all hear each other, and what they counted themselves."""
+    folder = tmp_path_factory.mktemp("four")
+    done = record(folder, FOUR)
+    assert done.returncode == 0, done.stderr
+    counted = {name: json.loads((folder / name).read_text()) for name in "abcd"}
+    with Trace.open(folder / "run.mcap") as trace:
+        yield trace, counted
+
+
+def callbacks(trace: Trace, node: str, name: str, kind: EventKind) -> list[Any]:
+    """Return the events of one entity of a node."""
+    (entity,) = [
+        one.id
+        for one in trace.entities.values()
+        if one.name == name and trace.node_of(one).name == f"/{node}" and one.id != one.node
+        if one.kind is (EntityKind.TIMER if kind is EventKind.TIMER else EntityKind.SUBSCRIPTION)
+    ]
+    return [e for e in events_of(trace) if e.entity == entity and e.kind is kind]
+
+
+def test_nothing_that_the_nodes_counted_is_missing(four: tuple[Trace, dict[str, Any]]) -> None:
+    trace, counted = four
+    trace.check()
+    check_contents(trace)
+    assert trace.metadata("rsltrace:native")["processes"] == "4"
+    for name, own in counted.items():
+        assert len(callbacks(trace, name, "Counting.on_timer", EventKind.TIMER)) == own["sent"]
+        heard = callbacks(trace, name, "/numbers", EventKind.SUBSCRIPTION)
+        assert len(heard) == len(own["got"])
+        assert len(callbacks(trace, name, "/same", EventKind.SUBSCRIPTION)) == own["same"]
+        assert own["sent"] > 20
+        assert {number // 100000 for number in own["got"]} == {1, 2, 3, 4}
+
+
+def test_every_message_has_its_cause(four: tuple[Trace, dict[str, Any]]) -> None:
+    trace, counted = four
+    for name, own in counted.items():
+        heard = callbacks(trace, name, "/numbers", EventKind.SUBSCRIPTION)
+        for event, number in zip(heard, own["got"], strict=True):
+            assert event.cause_event < event.index
+            output = trace.outputs_of(event.cause_event)[event.cause_output]
+            payload = trace.payload(output)
+            assert payload is not None
+            assert trace.decode("/numbers", payload[2]).data == number  # type: ignore[attr-defined]
+    assert trace.result["unknown_causes"] == "0"
+
+
+def test_equal_messages_of_four_publishers_are_told_apart(
+    four: tuple[Trace, dict[str, Any]],
+) -> None:
+    """Whoever has heard one of a publisher gets all that follow, each once and from its number."""
+    trace, counted = four
+    rows = timings(trace)
+    numbers: dict[int, dict[tuple[int, int], int]] = defaultdict(dict)
+    for event in events_of(trace):
+        for place, output in enumerate(trace.outputs_of(event.index)):
+            if output.kind == 1 and trace.entity(output.entity).name == "/same":
+                own = numbers[output.entity]
+                own[event.index, place] = len(own) + 1
+    assert len(numbers) == 4
+    for name in counted:
+        by_sender: dict[int, list[int]] = defaultdict(list)
+        for event in callbacks(trace, name, "/same", EventKind.SUBSCRIPTION):
+            output = trace.outputs_of(event.cause_event)[event.cause_output]
+            number = numbers[output.entity][event.cause_event, event.cause_output]
+            assert int(rows[event.index]["sequence"]) == number
+            cause, row = rows[event.cause_event], rows[event.index]
+            assert cause["wall"] <= row["source"] <= cause["wall"] + cause["duration"]
+            by_sender[output.entity].append(number)
+        assert len(by_sender) == 4
+        for heard in by_sender.values():
+            assert heard == list(range(heard[0], heard[0] + len(heard)))
+
+
+def test_times_are_in_order_and_threads_are_not_mixed_up(
+    four: tuple[Trace, dict[str, Any]],
+) -> None:
+    trace, counted = four
+    rows = timings(trace)
+    assert (rows["steady"][1:] >= rows["steady"][:-1]).all()
+    threads = defaultdict(set)
+    for event in events_of(trace):
+        node = trace.node_of(trace.entity(event.entity)).name
+        threads[node].add(int(rows[event.index]["thread"]))
+    own = [threads[f"/{name}"] for name in counted]
+    assert all(own)
+    assert sum(map(len, own)) == len(set.union(*own))
+    lost = [one.lost for one in callback_figures(trace) if one.lost is not None]
+    assert len(lost) == 8
+    assert not any(lost)
+
+
+def test_nodes_of_all_kinds_run_in_processes_of_their_own(tmp_path: Path) -> None:
+    text = """
+nodes:
+  - {node: robot:Talker, name: fast, parameters: {period: 0.01}}
+  - {node: robot:Listener, remappings: {/echo: /heard}, start_after: {topic: /same}}
+  - node: robot:Server
+  - node: robot:Asker
+  - node: robot:Nested
+  - {main: robot_mains:talk, arguments: [5], start_after: {service: /ask, delay: 200ms}}
+  - {main: robot_mains:talk, arguments: [3], name: last, start_after: {ended: 5}, required: true}
+stop: {timeout: 120s}
+"""
+    done = record(tmp_path, text, "--processes", "--executor", "multi")
+    assert done.returncode == 0, done.stderr
+    assert "talk ended at" in done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        trace.check()
+        assert "which the run requires" in trace.result["stop_reason"]
+        events = events_of(trace)
+        met = {(trace.entity(e.entity).name, e.kind) for e in events}
+        assert {
+            ("Talker.on_timer", EventKind.TIMER),
+            ("/same", EventKind.SUBSCRIPTION),
+            ("/ask", EventKind.SERVICE),
+            ("/ask", EventKind.CLIENT),
+            ("/count/_action/send_goal", EventKind.ACTION),
+            ("Nested.on_timer", EventKind.RESUME),
+            ("robot_mains:talk", EventKind.RESUME),
+            ("/listener", EventKind.SHUTDOWN),
+        } <= met
+        for event in events:
+            if event.kind in (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT):
+                assert event.cause_event != NO_EVENT, trace.entity(event.entity)
+        made = {e.name: e.created_ns for e in trace.entities.values() if e.kind is EntityKind.NODE}
+        sent = Counter(
+            trace.node_of(trace.entity(output.entity)).name
+            for event in events
+            for output in trace.outputs_of(event.index)
+            if output.kind == 1 and trace.entity(output.entity).name == "/numbers"
+        )
+        assert (sent["/talk"], sent["/last"]) == (5, 3)
+        assert made["/server"] + 200_000_000 <= made["/talk"] < made["/last"]
+
+
+def test_a_bag_is_played_in_real_time(tmp_path: Path, command: Any) -> None:
+    made = "nodes: [{node: robot:Talker}]\nstop: {duration: 1s}\n"
+    assert command("record", job(tmp_path, made), "-o", "x.mcap", "--bag", "bag").returncode == 0
+    text = "nodes: [{node: robot:Listener}]\nbags: [{path: bag, topics: [/numbers, /same]}]\n"
+    simulated = command("record", job(tmp_path, text), "-o", "simulated.mcap")
+    assert simulated.returncode == 0, simulated.stderr
+    done = record(tmp_path, text)
+    assert done.returncode == 0, done.stderr
+    simulation = Trace.open(tmp_path / "simulated.mcap")
+    with Trace.open(tmp_path / "run.mcap") as trace, simulation as planned:
+        assert trace.result["stop_reason"] == "end of the bag"
+        assert trace.end_ns - trace.start_ns > 900_000_000
+        heard = callbacks(trace, "listener", "/numbers", EventKind.SUBSCRIPTION)
+        assert len(heard) == len(callbacks(planned, "listener", "/numbers", EventKind.SUBSCRIPTION))
+        assert all(event.cause_event != NO_EVENT for event in heard)
+    same = command("diff", "run.mcap", "simulated.mcap", "--topic", "/numbers")
+    assert same.returncode == 3, same.stdout
+
+
+@pytest.mark.parametrize(
+    ("main", "said"),
+    [
+        ("crash", "rsltrace: error: robot_mains:crash was killed by SIGSEGV, 0."),
+        ("fail", "rsltrace: error: robot_mains:fail raised ValueError: of the main"),
+    ],
+)
+def test_a_process_that_fails_is_named_and_the_trace_is_kept(
+    main: str, said: str, tmp_path: Path
+) -> None:
+    text = f"nodes: [{{main: robot_mains:{main}}}, {{node: robot:Talker}}]\nstop: {{timeout: 60s}}"
+    done = record(tmp_path, text)
+    assert done.returncode == 3
+    assert said in done.stderr
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        trace.check()
+        assert trace.result["exit_code"] == "3"
+        assert f"/{main}" in {entity.name for entity in trace.entities.values()}
+        if main == "crash":
+            (words,) = [e.id for e in trace.entities.values() if e.name == "/last_words"]
+            outputs = [o for e in events_of(trace) for o in trace.outputs_of(e.index)]
+            assert words in {output.entity for output in outputs if output.kind == 1}
+
+
+def started(folder: Path, text: str) -> tuple[subprocess.Popen[str], int]:
+    """Start a run with a main that ends by nothing; return it, and the number of that process."""
+    process = subprocess.Popen(
+        [*COMMAND, "record", "--native", str(job(folder, text)), "-o", "run.mcap"],
+        cwd=folder,
+        env=environment(folder),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    deadline = time.monotonic() + 120
+    told = folder / "pid"
+    while not (told.exists() and told.read_text()):
+        if time.monotonic() > deadline or process.poll() is not None:
+            process.kill()
+            pytest.fail(process.communicate()[1])
+        time.sleep(0.05)
+    return process, int(told.read_text())
+
+
+def is_gone(number: int) -> bool:
+    """Wait until a process is there no more."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            state = Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0]
+        except OSError:
+            return True
+        if state == "Z":
+            return True
+        time.sleep(0.05)
+    return False
+
+
+DEAF = "nodes: [{main: robot_mains:deaf, arguments: [pid]}, {node: robot:Talker}]\n"
+
+
+def test_ctrl_c_ends_all_processes_even_one_that_does_not_listen(tmp_path: Path) -> None:
+    process, deaf = started(tmp_path, DEAF)
+    try:
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=120)
+    finally:
+        process.kill()
+        process.wait()
+    assert process.returncode == 130, said
+    assert "robot_mains:deaf did not" in said
+    assert is_gone(deaf)
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        trace.check()
+        assert trace.result["stop_reason"] == "interrupted"
+        assert "/deaf" in {entity.name for entity in trace.entities.values()}
+        assert ("/talker0", EventKind.SHUTDOWN) in {
+            (trace.entity(e.entity).name, e.kind) for e in events_of(trace)
+        }
+
+
+def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
+    process, deaf = started(tmp_path, DEAF)
+    children = [
+        int(number)
+        for number in Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    ]
+    assert deaf in children
+    assert len(children) == 2
+    process.kill()
+    process.communicate()
+    assert all(map(is_gone, children))
+
+
+def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:
+    for text, said in (
+        ("nodes: [{node: robot:Talker}, {main: robot:nothing}]", "job.yaml:2:"),
+        ("nodes: [{main: robot_mains:talk, stdin: [x]}]", "a native run types nothing"),
+        ("nodes: [{node: robot:Talker}]\nbags: [{path: nowhere}]", "nowhere"),
+    ):
+        done = record(tmp_path, text, "--processes")
+        assert (done.returncode, said in done.stderr) == (2, True), done.stderr
+        assert "Traceback" not in done.stderr
+        assert not (tmp_path / "run.mcap").exists()
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs unshare")
+def test_without_a_network_it_says_so(tmp_path: Path) -> None:
+    apart = ["unshare", "-rn"]
+    if subprocess.run([*apart, "true"], capture_output=True).returncode:
+        pytest.skip("may not make namespaces")
+    path = job(tmp_path, "nodes: [{node: robot:Talker}]\nstop: {duration: 1s}")
+    done = subprocess.run(
+        [*apart, *COMMAND, "record", "--native", "--processes", str(path), "-o", "run.mcap"],
+        cwd=tmp_path,
+        env={**environment(tmp_path), "PATH": os.environ["PATH"]},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 2
+    assert "loopback network is down" in done.stderr
+    assert not (tmp_path / "run.mcap").exists()
