@@ -286,7 +286,7 @@ class DistributionSpec(Part):
     )
     empirical: Annotated[EmpiricalSpec | None, given] = Field(
         default=None,
-        description="A table of quantiles, of measured values for example.",
+        description="A table of quantiles: what `rsltrace fit` writes.",
         examples=[{"values": ["1ms", "1.2ms", "4ms"], "percent": [0, 90, 100]}],
     )
     series: Annotated[SeriesSpec | None, given] = Field(

@@ -1,0 +1,222 @@
+"""``rsltrace fit``: the delays and execution times of a native run, as parts of a job."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rsltrace.cli.output.fit_text import as_json, checked_text, text
+from rsltrace.cli.output.text_file import write_text
+from rsltrace.errors import OutputError, RunError, TraceError
+from rsltrace.model.printable import printable
+from rsltrace.terminal import say, tell
+from rsltrace.trace.reader import Trace
+
+if TYPE_CHECKING:
+    from rsltrace.fit.checked import Chains
+    from rsltrace.fit.parts import Fit
+    from rsltrace.job import Job
+
+
+@click.command()
+@click.argument("trace", type=click.Path(path_type=Path))
+@click.argument("job_file", metavar="[JOB]", type=click.Path(path_type=Path), required=False)
+@click.option(
+    "-o",
+    "--output",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Job to write: JOB with the measured times. It can be run as it is.",
+)
+@click.option("--force", is_flag=True, help="Replace the job, the picture and the trace.")
+@click.option(
+    "--as",
+    "how",
+    type=click.Choice(("tables", "families")),
+    default="tables",
+    show_default=True,
+    help="Write tables of quantiles, or uniform, normal, lognormal and gamma distributions where "
+    "one is near enough.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Draw what was measured and what a simulation draws (.png, .svg, .pdf).",
+)
+@click.option(
+    "--check",
+    "second",
+    type=click.Path(path_type=Path),
+    metavar="SECOND",
+    help="Run the fitted job and compare the latencies of its chains with those of SECOND, another "
+    "native run.",
+)
+@click.option(
+    "--simulated",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="With --check: keep the trace of that run.",
+)
+@click.option("--json", "as_values", is_flag=True, help="Print one JSON object.")
+def fit(
+    trace: Path,
+    job_file: Path | None,
+    output: Path | None,
+    force: bool,
+    how: str,
+    plot: Path | None,
+    second: Path | None,
+    simulated: Path | None,
+    as_values: bool,
+) -> None:
+    """Measure the delays and execution times of TRACE, a native run, and write them as the delay:
+    and execution: of a job: so that a simulation has the robot's timing.
+
+    JOB is the job that was run; without it, the file of that name beside TRACE or here.
+
+    A delay is the time from publishing to reception. An execution time is that for which a callback
+    keeps its executor: its own, and what rclpy needs to begin it when its input is there and the
+    executor is free.
+
+    With --check nothing is taken on trust: quantiles of end-to-end latencies of the second run and
+    of the simulated one, their ratio with its 95 % interval, and a two-sample test; beside them the
+    ratio of the second run to the first, which no simulation can be expected to better.
+    """
+    from rsltrace.fit.checked import check
+    from rsltrace.fit.measured import measured
+    from rsltrace.fit.parts import fit as fitted_to
+    from rsltrace.fit.parts import notes
+
+    if simulated is not None and second is None:
+        raise click.UsageError("--simulated goes with --check")
+    if second is not None and output is None:
+        raise click.UsageError(
+            "--check runs the fitted job: say where to write it (-o fitted.yaml)"
+        )
+    for path in (output, plot, simulated):
+        if path is not None and path.exists() and not force:
+            raise OutputError(f"{path} exists; --force replaces it")
+    with ExitStack() as stack:
+        first = stack.enter_context(Trace.open(trace))
+        wanted = None if second is None else _chains(stack.enter_context(Trace.open(second)))
+        found = fitted_to(measured(first), family=how == "families")
+        path = _job_file(first, job_file)
+        job = _load(path)
+        said = list(notes(found, job))
+        if job_file is None and path.read_bytes().decode("utf-8-sig", "replace") != first.job_text:
+            said.append(f"{path} has changed since the run, or was run with other options")
+        if output is not None:
+            _write(output, found, job, path, trace, first)
+        if plot is not None:
+            from rsltrace.fit.picture import draw
+
+            draw(found, plot, first.name)
+        checked = None
+        if wanted is not None:
+            assert output is not None
+            with _simulated(output, simulated, force=force) as made:
+                checked = check(first, wanted, made)
+        if as_values:
+            say(json.dumps(as_json(found, said, checked), indent=2))
+            return
+        say("\n".join(map(printable, text(found))))
+        for note in said:
+            tell(printable(f"rsltrace: note: {note}"))
+        for written in (output, plot, simulated):
+            if written is not None:
+                tell(f"wrote {written}")
+        if checked is not None:
+            say("\n".join(map(printable, ("", *checked_text(checked)))))
+        elif output is not None:
+            tell(f"next: rsltrace record {shlex.quote(str(output))}")
+
+
+def _job_file(trace: Trace, given: Path | None) -> Path:
+    """Return the file of the job that was run.
+
+    :raises TraceError: if it is not here.
+    """
+    if given is not None:
+        return given
+    name = Path(trace.job.get("name", "")).name
+    for folder in (Path(trace.name).parent, Path()):
+        if name and name != "<python>" and (folder / name).is_file():
+            return folder / name
+    raise TraceError(
+        f"the job of {trace.name} ({name or 'without a file'}) is neither beside it nor here; name "
+        f"it: rsltrace fit {shlex.quote(trace.name)} job.yaml"
+    )
+
+
+def _load(path: Path) -> Job:
+    from rsltrace.job import load_job
+
+    return load_job(path)
+
+
+def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, first: Trace) -> None:
+    """Write the fitted job, and see that it can be read."""
+    from rsltrace.fit.parts import fitted_job
+
+    if output.exists() and job_file.exists() and output.samefile(job_file):
+        raise OutputError(f"{output} is the job itself, which the fitted one extends: name another")
+    base = os.path.relpath(job_file.absolute(), output.absolute().parent).replace(os.sep, "/")
+    head = (
+        f"The job {job_file.name} with the times of {trace.name}, a native run of "
+        f"{first.event_count} events:\n"
+        "delay: from publishing to reception; execution: how long executors were busy with a "
+        "callback.\nMeasured by rsltrace fit."
+    )
+    before = output.read_bytes() if output.is_file() else None
+    write_text(output, fitted_job(found, job, base, head))
+    try:
+        _load(output)
+    except BaseException:
+        if before is None:
+            output.unlink(missing_ok=True)
+        else:
+            output.write_bytes(before)
+        raise
+
+
+@contextmanager
+def _simulated(job_file: Path, kept: Path | None, *, force: bool) -> Iterator[Trace]:
+    """Record a job in a process of its own; the trace is gone afterwards unless it is ``kept``.
+
+    :raises RunError: if that does not work.
+    """
+    with tempfile.TemporaryDirectory(prefix="rsltrace-fit-") as folder:
+        path = kept or Path(folder, "simulated.mcap")
+        command = [sys.executable, "-m", "rsltrace", "record", str(job_file), "-o", str(path)]
+        done = subprocess.run([*command, *["--force"] * force], capture_output=True)
+        said = done.stderr.decode("utf-8", "replace")
+        if done.returncode:
+            raise RunError(
+                f"the simulation of {job_file} ended with exit status {done.returncode}\n{said}"
+            )
+        tell("".join(line for line in said.splitlines(keepends=True) if "note:" in line), end="")
+        with Trace.open(path) as trace:
+            yield trace
+
+
+def _chains(second: Trace) -> Chains:
+    """Return the chains to check against.
+
+    :raises SetupError: if what compares them is missing.
+    :raises TraceError: if there are none.
+    """
+    from rsltrace.fit.checked import chains_of
+    from rsltrace.fit.comparison import need_scipy
+
+    need_scipy()
+    return chains_of(second)

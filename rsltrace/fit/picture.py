@@ -1,0 +1,82 @@
+"""What was measured and what a simulation draws, as a picture: shares of values below a time."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rsltrace.errors import OutputError, SetupError
+from rsltrace.fit.models import Durations, Model
+from rsltrace.fit.parts import Fit
+from rsltrace.model.printable import printable
+
+Numbers = npt.NDArray[np.float64]
+FORMATS = (".png", ".svg", ".pdf")
+_COLUMNS = 3
+_INCHES = (4.2, 2.8)
+_PANELS_MAX = 60
+_POINTS_MAX = 2_000
+_MS = 1e6
+
+
+def draw(fit: Fit, path: Path, title: str) -> None:
+    """Draw a panel for each link and each callback, up to 60, those with the most values first.
+
+    :raises SetupError: if matplotlib is missing.
+    :raises OutputError: if the file cannot be written.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise OutputError(f"{path}: a picture is one of {', '.join(FORMATS)}")
+    if importlib.util.find_spec("matplotlib") is None:
+        raise SetupError("a picture of the fit needs matplotlib: pip install 'rsltrace[fit]'")
+    from matplotlib.figure import Figure
+
+    panels = sorted(_panels(fit), key=lambda panel: -len(panel[1]))[:_PANELS_MAX]
+    rows = -(-len(panels) // _COLUMNS) or 1
+    width, height = _INCHES
+    figure = Figure(figsize=(width * _COLUMNS, height * rows + 0.6), layout="constrained")
+    figure.suptitle(printable(f"{os.path.basename(title)}: measured, and what a simulation draws"))
+    for place, (name, durations, model) in enumerate(panels):
+        axes = figure.add_subplot(rows, _COLUMNS, place + 1)
+        for values, label, line in (
+            (durations, f"measured ({len(durations)})", "-"),
+            (model.draws(), f"{model.kind}, D {model.distance:.3f}", "--"),
+        ):
+            x, y = _shares(values)
+            axes.plot(x, y, line, label=label, drawstyle="steps-post")
+        axes.set_title(_plain(name), fontsize=8)
+        axes.set_xlabel("ms", fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.set_ylim(0, 100)
+        axes.set_ylabel("% below", fontsize=8)
+        axes.legend(fontsize=7, loc="lower right")
+    work = path.with_name(f".{path.name}.part-{os.getpid()}")
+    try:
+        figure.savefig(work, format=path.suffix[1:].lower(), dpi=110)
+        os.replace(work, path)
+    except OSError as error:
+        work.unlink(missing_ok=True)
+        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+
+
+def _panels(fit: Fit) -> Iterator[tuple[str, Durations, Model]]:
+    for link, model in fit.links:
+        yield f"delay  {link}", link.delays, model
+    for one, model in fit.executions:
+        yield f"execution  {one.node}: {one.kind} {one.entity}", one.busy, model
+
+
+def _plain(name: str) -> str:
+    """Return a name without what matplotlib takes for mathematics."""
+    return printable(name).replace("$", r"\$")
+
+
+def _shares(values: Durations) -> tuple[Numbers, Numbers]:
+    """Return times in ms, and the percentage of values that do not exceed each."""
+    places = np.unique(np.linspace(0, len(values) - 1, min(len(values), _POINTS_MAX)).astype(int))
+    return np.sort(values)[places] / _MS, (places + 1) * 100 / len(values)

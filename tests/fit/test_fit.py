@@ -1,0 +1,364 @@
+"""From a run of known delays and execution times, as if it had been observed, back to them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+pytest.importorskip("rclpy")
+
+from rsltrace import Trace, record
+from rsltrace.chance.stream import Stream
+from rsltrace.cli.main import cli
+from rsltrace.fit.measured import Measured, measured
+from rsltrace.fit.models import ks_distance
+from rsltrace.job import load_job
+from rsltrace.model.draw import Draw
+from rsltrace.model.event import OutputKind
+from rsltrace.run.plans.network import distribution_of
+from tests.fit.native_like import AHEAD_NS, BITS, as_native
+
+pytestmark = pytest.mark.ros
+MS = 1_000_000
+
+NODES = """\
+import time
+
+from rclpy.node import Node
+from std_msgs.msg import Int64
+from std_srvs.srv import Trigger
+
+
+class Camera(Node):
+    def __init__(self):
+        super().__init__("camera")
+        self.image = self.create_publisher(Int64, "/image", 10)
+        self.count = 0
+        self.create_timer(0.05, self.tick)
+
+    def tick(self):
+        self.count += 1
+        self.image.publish(Int64(data=self.count))
+
+
+class Stage(Node):
+    def __init__(self, name, hears, says):
+        super().__init__(name)
+        self.says = self.create_publisher(Int64, says, 10)
+        self.create_subscription(Int64, hears, self.hear, 10)
+
+    def hear(self, message):
+        self.says.publish(message)
+
+
+class Asker(Node):
+    def __init__(self):
+        super().__init__("asker")
+        self.client = self.create_client(Trigger, "/ask")
+        self.create_subscription(Int64, "/objects", self.hear, 10)
+        self.create_subscription(Int64, "/never", self.hear, 10)
+
+    def hear(self, message):
+        self.client.call_async(Trigger.Request())
+
+
+class Server(Node):
+    def __init__(self):
+        super().__init__("server")
+        self.create_service(Trigger, "/ask", lambda request, response: response)
+"""
+GRAPH = """\
+nodes:
+  - node: robot:Camera
+  - {node: robot:Stage, arguments: {name: detector, hears: /image, says: /objects}}
+  - {node: robot:Stage, arguments: {name: tracker, hears: /objects, says: /tracks}}
+  - node: robot:Asker
+  - node: robot:Server
+stop: {duration: 40s}
+"""
+KNOWN = """\
+seed: 5
+delay:
+  default: {uniform: {min: 1ms, max: 4ms}}
+  links: [{topic: /objects, to: /tracker, lognormal: {median: 2ms, sigma: 0.8}}]
+execution:
+  default: {constant: 700us}
+  nodes:
+    /detector: {gamma: {mean: 20ms, sd: 8ms}}
+    /tracker: {normal: {mean: 9ms, sd: 2ms}}
+"""
+
+
+@dataclass
+class Known:
+    """A folder with ``truth.yaml`` and its run as if native, ``native.mcap``."""
+
+    folder: Path
+    simulated: Path
+
+    def fit(self, *words: str) -> Result:
+        return CliRunner().invoke(cli, ["fit", *words], catch_exceptions=False)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Known:
+    folder = tmp_path_factory.mktemp("fit")
+    (folder / "robot.py").write_text(NODES)
+    (folder / "job.yaml").write_text(GRAPH)
+    (folder / "truth.yaml").write_text(f"base: job.yaml\n{KNOWN}")
+    simulated = folder / "simulated.mcap"
+    record(load_job(folder / "truth.yaml"), simulated)
+    as_native(simulated, folder / "native.mcap")
+    return Known(folder, simulated)
+
+
+def drawn(path: Path) -> dict[tuple[int, str, str, str], list[int]]:
+    """Return what a simulated run has drawn, by kind of draw, sender, name and receiver."""
+    found: dict[tuple[int, str, str, str], list[int]] = {}
+    with Trace.open(path) as trace:
+        for index in range(trace.event_count):
+            sender = -1
+            for output in trace.outputs_of(index):
+                if output.kind is not OutputKind.DRAW:
+                    sender = output.entity
+                    continue
+                kind, value = output.hash >> BITS, output.hash & (1 << BITS) - 1
+                entity = trace.entity(output.entity)
+                node = trace.node_of(entity).name
+                key = (
+                    kind,
+                    "" if kind == Draw.EXECUTION else nodes_of(trace, sender),
+                    entity.name,
+                    node,
+                )
+                found.setdefault(key, []).append(value)
+    return found
+
+
+def nodes_of(trace: Trace, entity: int) -> str:
+    return trace.node_of(trace.entity(entity)).name
+
+
+def look(path: Path) -> Measured:
+    with Trace.open(path) as trace:
+        return measured(trace)
+
+
+def test_what_was_drawn_is_what_is_measured(known: Known) -> None:
+    """Each time of a callback; of messages those that arrived before the end."""
+    truth, found = drawn(known.simulated), look(known.folder / "native.mcap")
+    times = {(one.node, one.entity): one.busy.tolist() for one in found.executions}
+    expected = {
+        (node, name): values
+        for (kind, _, name, node), values in truth.items()
+        if kind == Draw.EXECUTION
+    }
+    assert times == expected
+    assert len(times) == 6
+    links = {(one.topic, one.sender, one.receiver): one for one in found.links}
+    assert set(links) == {
+        ("/ask", None, ""),
+        ("/image", "/camera", "/detector"),
+        ("/objects", "/detector", "/asker"),
+        ("/objects", "/detector", "/tracker"),
+    }
+    for (topic, sender, receiver), link in links.items():
+        if not link.is_service:
+            values = truth[int(Draw.DELAY), sender or "", topic, receiver]
+            assert link.delays.tolist() == values[: len(link.delays)]
+            assert len(values) - len(link.delays) <= 2
+    assert found.idle == (("/asker", "/never"),)
+    nodes = ("/asker", "/camera", "/detector", "/server", "/tracker")
+    assert sorted(one.nodes for one in found.executors) == [(name,) for name in nodes]
+
+
+@pytest.mark.parametrize("how", ["tables", pytest.param("families", marks=pytest.mark.long)])
+def test_the_job_that_comes_out_has_the_distributions_that_went_in(
+    known: Known, how: str, tmp_path: Path
+) -> None:
+    """Each is within what sampling makes of it: D of two samples of this size, at 1 in 1000."""
+    output = known.folder / f"{how}.yaml"
+    done = known.fit(str(known.folder / "native.mcap"), "-o", str(output), "--as", how, "--json")
+    assert done.exit_code == 0, done.output
+    truth, job = load_job(known.folder / "truth.yaml"), load_job(output)
+    assert job.nodes == truth.nodes
+    assert truth.delay is not None
+    assert truth.execution is not None
+    assert job.delay is not None
+    assert job.execution is not None
+    by_entity = {(one.node, one.entity): one for one in job.execution.entities}
+    pairs = [
+        (truth.execution.nodes["/detector"], by_entity["/detector", "/image"]),
+        (truth.execution.nodes["/tracker"], by_entity["/tracker", "/objects"]),
+        (truth.execution.default, by_entity["/camera", "Camera.tick"]),
+        (truth.delay.default, job.delay.services["/ask"]),
+    ]
+    of_link = {(one.topic, one.receiver): one for one in job.delay.links}
+    pairs.append((truth.delay.default, of_link["/image", "/detector"]))
+    pairs.append((truth.delay.links[0], of_link["/objects", "/tracker"]))
+    for given, found in pairs:
+        samples = []
+        for spec in (given, found):
+            assert spec is not None
+            draw = distribution_of(job, spec).sampler(Stream(1, "any"), 0)
+            samples.append(np.array([draw(0) for _ in range(20_000)]))
+        assert ks_distance(*samples) < 1.95 / np.sqrt(780) + 0.02, (given, found)
+        if how == "families":
+            assert found.kinds() == given.kinds()
+
+
+@pytest.mark.long
+def test_the_simulation_of_the_fitted_job_has_the_latencies_of_the_run(
+    known: Known, tmp_path: Path
+) -> None:
+    """Against a run with another seed, as a second run of the robot would be."""
+    shutil.copytree(known.folder, tmp_path, dirs_exist_ok=True)
+    other = load_job(tmp_path / "truth.yaml", overrides=["seed=99"])
+    record(other, tmp_path / "other.mcap")
+    as_native(tmp_path / "other.mcap", tmp_path / "second.mcap")
+    done = known.fit(
+        str(tmp_path / "native.mcap"),
+        str(tmp_path / "job.yaml"),
+        *("-o", str(tmp_path / "fitted.yaml"), "--check", str(tmp_path / "second.mcap")),
+        *("--simulated", str(tmp_path / "again.mcap"), "--json"),
+    )
+    assert done.exit_code == 0, done.output
+    chains = {one["chain"]: one for one in json.loads(done.stdout)["check"]}
+    whole = chains["/image → /objects → /tracks"]
+    assert whole["far"] == []
+    for one in whole["simulated"]["quantiles"]:
+        assert one["low"] <= one["ratio"] <= one["high"]
+        assert 0.9 < one["ratio"] < 1.1
+    assert whole["simulated"]["distance"] < 1.95 * np.sqrt(2 / 780)
+    assert whole["simulated"]["p_value"] > 0.001
+    with Trace.open(tmp_path / "again.mcap") as trace:
+        assert trace.complete
+
+
+def test_what_an_executor_needs_before_a_callback_is_part_of_its_time(
+    known: Known, tmp_path: Path
+) -> None:
+    late = look(as_native(known.simulated, tmp_path / "late.mcap", before_ns=300_000))
+    for one, same in zip(
+        late.executions, look(known.folder / "native.mcap").executions, strict=True
+    ):
+        assert one.busy.tolist() == same.busy.tolist()
+        assert (one.runs <= one.busy).all()
+        assert one.runs.mean() < same.runs.mean()
+
+
+def test_a_clock_that_is_set_and_one_that_is_behind(known: Known, tmp_path: Path) -> None:
+    """A step leaves out what was on its way; delays are never negative, nor a second long."""
+
+    def stepping(at_ns: int) -> int:
+        return at_ns + AHEAD_NS + (10**9 if at_ns % (1 << 50) > 20 * 10**9 else 0)
+
+    start_ns = int(next(iter(_stamps(known.simulated))))
+    found = look(
+        as_native(
+            known.simulated,
+            tmp_path / "set.mcap",
+            clock=lambda at_ns: stepping(at_ns - start_ns) + start_ns,
+        )
+    )
+    assert found.steps == 1
+    for link in found.links:
+        assert link.delays.max() < 100 * MS
+        assert link.delays.min() >= 0
+    assert sum(link.stepped for link in found.links) > 0
+    exact = look(known.folder / "native.mcap")
+    for one, other in zip(found.executions, exact.executions, strict=True):
+        assert len(one.busy) == len(other.busy)
+        assert abs(int(one.busy.max()) - int(other.busy.max())) < 100 * MS
+
+
+def _stamps(path: Path) -> list[int]:
+    with Trace.open(path) as trace:
+        return [trace.event(0).stamp_ns]
+
+
+def test_messages_of_unknown_senders(known: Known, tmp_path: Path) -> None:
+    path = as_native(known.simulated, tmp_path / "unknown.mcap", unknown=frozenset({"/image"}))
+    found = look(path)
+    senders = {one.topic: one.sender for one in found.links}
+    assert senders["/image"] is None
+    assert found.unknown > 700
+    output = tmp_path / "fitted.yaml"
+    done = known.fit(str(path), str(known.folder / "job.yaml"), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    assert "nobody knows who sent them" in done.stderr
+    job = load_job(output)
+    assert job.delay is not None
+    (link,) = (one for one in job.delay.links if one.topic == "/image")
+    assert (link.sender, link.receiver) == ("*", "/detector")
+
+
+def test_the_jobs_own_times_are_replaced(known: Known) -> None:
+    """Those had no effect natively; the note says so."""
+    output = known.folder / "replaced.yaml"
+    done = known.fit(
+        str(known.folder / "native.mcap"), str(known.folder / "truth.yaml"), "-o", str(output)
+    )
+    assert done.exit_code == 0, done.output
+    assert "in place of the job's own delay, execution" in done.stderr
+    job = load_job(output)
+    assert job.delay is not None
+    assert job.execution is not None
+    assert (job.delay.default, job.execution.default, job.execution.nodes) == (None, None, {})
+    assert "/asker: the callback of /never never ran" in done.stderr
+
+
+@pytest.mark.long
+def test_a_picture(known: Known) -> None:
+    pytest.importorskip("matplotlib")
+    picture = known.folder / "fit.svg"
+    native = str(known.folder / "native.mcap")
+    done = known.fit(native, str(known.folder / "job.yaml"), "--plot", str(picture))
+    assert done.exit_code == 0, done.output
+    drawn_text = picture.read_text()
+    assert drawn_text.count('<g id="axes_') == len(look(Path(native)).links) + 6
+    bad = known.fit(native, str(known.folder / "job.yaml"), "--plot", str(known.folder / "fit.gif"))
+    assert (bad.exit_code, bad.stderr.count("a picture is one of .png, .svg, .pdf")) == (2, 1)
+
+
+def test_without_the_libraries_the_message_says_what_to_install(
+    known: Known, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from importlib import util
+
+    real = util.find_spec
+    gone = ("scipy", "matplotlib")
+    monkeypatch.setattr(util, "find_spec", lambda name: None if name in gone else real(name))
+    native = [str(known.folder / "native.mcap"), str(known.folder / "job.yaml")]
+    for words in (["--as", "families"], ["--plot", str(known.folder / "none.png")]):
+        done = known.fit(*native, *words)
+        assert done.exit_code == 2
+        assert "pip install 'rsltrace[fit]'" in done.stderr
+    assert not (known.folder / "none.png").exists()
+
+
+def test_mistakes(known: Known, tmp_path: Path) -> None:
+    native, job = str(known.folder / "native.mcap"), str(known.folder / "job.yaml")
+    simulated = known.fit(str(known.simulated), job)
+    assert simulated.exit_code == 2
+    assert "is of a simulated run" in simulated.stderr
+    assert "rsltrace record --native" in simulated.stderr
+    (tmp_path / "native.mcap").symlink_to(native)
+    alone = known.fit(str(tmp_path / "native.mcap"))
+    assert alone.exit_code == 2
+    assert "(truth.yaml) is neither beside it nor here" in alone.stderr
+    itself = known.fit(native, job, "-o", job, "--force")
+    assert itself.exit_code == 2
+    assert "is the job itself" in itself.stderr
+    there = known.fit(native, job, "-o", job)
+    assert (there.exit_code, "--force replaces it" in there.stderr) == (2, True)
+    for words in (["--check", native], ["--simulated", "x.mcap"]):
+        assert known.fit(native, job, *words).exit_code == 2
+    wrong = known.fit(native, job, "-o", str(tmp_path / "f.yaml"), "--check", str(known.simulated))
+    assert (wrong.exit_code, "is not of a native run" in wrong.stderr) == (2, True)
