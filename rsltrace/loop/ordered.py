@@ -102,11 +102,15 @@ class OrderedLoop(EventLoop):
         """What the policy has chosen so far, where somebody wants to know."""
         self.on_choice: Callable[[Sequence[Candidate], int, Moment], None] | None = None
         """Told of every choice, of one alone, too, if somebody has to know."""
+        self.hold_until: Callable[[Sequence[Candidate], Moment], int | None] | None = None
+        """Says until when all that is ready has to wait, if somebody wants that; None: it need
+        not."""
         self.on_lull: Callable[[], None] | None = None
         """Told each time that nothing is left that could run, if somebody has to know."""
         self.has_begun = False
         """Whether it has run anything yet."""
         self._forced: Place | None = None
+        self._held_until_ns = -1
         self._held: dict[object, None] = {}
         self._ready = _Waiting(lambda item: self.place(item), self._runs)
         self._tasks = _Waiting(lambda item: self.place(item), self._runs)
@@ -116,7 +120,8 @@ class OrderedLoop(EventLoop):
     def next_timer(self) -> TimerState | None:
         """Return the timer that is due next; those that are overdue wait for a worker."""
         due, after = self.timers.due(self.now_ns)
-        if any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
+        held = self._held_until_ns > self.now_ns
+        if not held and any(self._runs(self.place(timer.owner)) for timer in due):  # type: ignore[arg-type]
             return due[0]
         return after
 
@@ -158,9 +163,22 @@ class OrderedLoop(EventLoop):
         places = self._waiting()
         if not places:
             return None
-        place = places[self.choose([place.candidate for place in places])]
+        candidates = [place.candidate for place in places]
+        if self.hold_until is not None and self._holds(candidates):
+            return None
+        place = places[self.choose(candidates)]
         self._take_out(place)
         return place
+
+    def _holds(self, ready: list[Candidate]) -> bool:
+        """Whether what is ready is to wait, and then look again when it need not any more."""
+        assert self.hold_until is not None
+        until_ns = self.hold_until(ready, Moment(self.now_ns, self.events))
+        self._held_until_ns = -1 if until_ns is None else until_ns
+        if until_ns is None:
+            return False
+        self.schedule(until_ns, lambda: None)
+        return True
 
     def runnable(self) -> list[Place]:
         """Return all that could run now beside the event under way: tasks, what is ready, timers

@@ -94,7 +94,7 @@ class Recorded:
             same = (index for index in fitting if ready[index].entity_id == expected.entity_id)
             return next(same, fitting[0])
         for index, candidate in enumerate(ready):
-            if not _has_event(candidate.item):
+            if not has_event(candidate.item):
                 return index
         raise self._cannot_choose(ready, moment, expected)
 
@@ -118,12 +118,12 @@ class Recorded:
 
     def _is(self, candidate: Candidate, expected: RecordedEvent) -> bool:
         goes_on = candidate.kind == "resume"
-        if goes_on != (expected.kind == EventKind.RESUME) or not _has_event(candidate.item):
+        if goes_on != (expected.kind == EventKind.RESUME) or not has_event(candidate.item):
             return False
         return self.name_of(candidate.entity_id) == expected.name
 
 
-def _has_event(item: Any) -> bool:
+def has_event(item: Any) -> bool:
     """Say whether there is an event if something runs.
 
     There is none if a full queue has dropped the message it stood for, if an executor of the user's

@@ -81,6 +81,7 @@ if TYPE_CHECKING:
     from rsltrace.doors.rclpy.entry import Entry
     from rsltrace.doors.rclpy.faults import NodeFaults
     from rsltrace.doors.rclpy.world import World
+    from rsltrace.middleware.events.observed_run import ObservedRun
     from rsltrace.middleware.events.recorded_run import RecordedRun
     from rsltrace.run.plans.bag_faults import BagFaults
 
@@ -171,7 +172,7 @@ class Session:
         self._guarded: RunGuard
         self._entries: list[Entry]
         self._plan: NetworkPlan | None
-        self._recorded: RecordedRun | None
+        self._recorded: RecordedRun | ObservedRun | None
         self._late: LateLibraries
         self._processes: ProcessDoor
         self._numerics_known = True

@@ -13,30 +13,33 @@ from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.loop.choices import Choices, decoded
 from rsltrace.loop.loop import EventLoop
+from rsltrace.loop.observed_order import CALLBACKS, Observed, ObservedOrder
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
 from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
 from rsltrace.loop.search_policies import Departure, Departures, Pct
 from rsltrace.model.event import EventKind
 from rsltrace.run.plans.scheduling import of_order, own_policy
-from rsltrace.trace.native import refuse_native
+from rsltrace.trace.native import is_native
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.writer import TraceWriter
 
 if TYPE_CHECKING:
     from rsltrace.middleware.domain import Domain
+    from rsltrace.middleware.events.observed_run import ObservedRun
     from rsltrace.middleware.events.recorded_run import RecordedRun
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
 
 
-def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | None:
+def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | ObservedRun | None:
     """Have a run follow the order of a recording, if the job says so; it stays open as long as
-    ``stack``.
+    ``stack``. That of a native run is followed where it can be.
 
     :raises JobError: if the recording cannot be read, or has nothing to follow.
     """
+    from rsltrace.middleware.events.observed_run import ObservedRun
     from rsltrace.middleware.events.recorded_run import RecordedRun
 
     if job.policy is None or job.policy.recorded is None:
@@ -45,6 +48,10 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | No
     census = domain.entities.census
     assert census is not None, "a job with a policy has rules"
     file = Path(job.policy.recorded).name
+    if is_native(trace):
+        events = enumerate(_events(trace))
+        observed = [Observed(index, one) for index, one in events if one.kind in CALLBACKS]
+        return ObservedRun(domain.dispatcher, ObservedOrder(file, observed, census.describe_all()))
     order = Recorded(file, _Events(trace).event, _chosen(trace), census.describe_all())
     return RecordedRun(domain.dispatcher, order, is_whole=trace.complete)
 
@@ -53,7 +60,6 @@ def _opened(job: Job, path: str, stack: ExitStack) -> Trace:
     where = locate(job, ("policy", "recorded"))
     try:
         trace = stack.enter_context(Trace.open(job.resolve(path)))
-        refuse_native(trace, "its order is not one that a simulation can follow")
         trace.check()
     except TraceError as error:
         raise JobError(str(error), where=where) from None
