@@ -22,6 +22,8 @@ _INCHES = (4.2, 2.8)
 _PANELS_MAX = 60
 _POINTS_MAX = 2_000
 _MS = 1e6
+_WIDE = 5
+"""From so many medians to the longest on, the axis is logarithmic."""
 
 
 def draw(fit: Fit, path: Path, title: str) -> None:
@@ -37,6 +39,7 @@ def draw(fit: Fit, path: Path, title: str) -> None:
     from matplotlib.figure import Figure
 
     panels = sorted(_panels(fit), key=lambda panel: -len(panel[1]))[:_PANELS_MAX]
+    panels.sort(key=lambda panel: panel[0])
     rows = -(-len(panels) // _COLUMNS) or 1
     width, height = _INCHES
     figure = Figure(figsize=(width * _COLUMNS, height * rows + 0.6), layout="constrained")
@@ -49,6 +52,8 @@ def draw(fit: Fit, path: Path, title: str) -> None:
         ):
             x, y = _shares(values)
             axes.plot(x, y, line, label=label, drawstyle="steps-post")
+        if model.draws().min() > 0 and durations.max() > _WIDE * np.median(durations):
+            axes.set_xscale("log")
         axes.set_title(_plain(name), fontsize=8)
         axes.set_xlabel("ms", fontsize=8)
         axes.tick_params(labelsize=7)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import NO_EVENT, OutputKind
@@ -24,18 +25,21 @@ def as_native(
     clock: Callable[[int], int] = lambda at_ns: at_ns + AHEAD_NS,
     unknown: frozenset[str] = frozenset(),
     before_ns: int = 0,
+    together: Mapping[str, str] = MappingProxyType({}),
+    executor: str = "",
 ) -> Path:
     """Write a simulated run as if it had been observed: what was drawn there has been measured.
 
     ``clock`` is the system clock at a steady time; of messages on topics that are ``unknown`` the
     sender is. ``before_ns`` is what an executor needs before a callback begins: that much of what
-    was drawn as its time.
+    was drawn as its time. Nodes that are ``together`` with another one ran in its thread;
+    ``executor`` is what the trace says of executors.
     """
     with Trace.open(simulated) as trace, TraceWriter(path, force=False) as writer:
         writer.add_metadata("rsltrace:job", dict(trace.job))
-        writer.add_metadata(METADATA_NATIVE, {"mode": "native"})
+        writer.add_metadata(METADATA_NATIVE, {"mode": "native", "executor": executor})
         recorder = Recorder(writer, keep_payload=lambda topic: False)
-        threads: dict[int, int] = {}
+        threads: dict[str, int] = {}
         places: dict[tuple[int, int], int] = {}
         left: dict[tuple[int, int], int] = {}
         delays: dict[tuple[int, int, int], int] = {}
@@ -60,6 +64,7 @@ def as_native(
             cause = event.cause_event, event.cause_output
             source_ns = left.get(cause, 0)
             ready_ns = source_ns + delays.get((*cause, event.entity), 0) if source_ns else 0
+            node = trace.node_of(entity).name
             late_ns = min(before_ns, busy_ns)
             known = event.cause_event != NO_EVENT and entity.name not in unknown
             recorder.writer.add_timing(
@@ -72,7 +77,7 @@ def as_native(
                     clock(source_ns) if source_ns else 0,
                     clock(ready_ns if source_ns else event.stamp_ns),
                     0,
-                    threads.setdefault(entity.node, len(threads) + 1),
+                    threads.setdefault(together.get(node, node), len(threads) + 1),
                 ),
                 event.stamp_ns,
             )

@@ -314,6 +314,23 @@ def test_the_jobs_own_times_are_replaced(known: Known) -> None:
     assert "/asker: the callback of /never never ran" in done.stderr
 
 
+def test_nodes_that_shared_an_executor_share_one(known: Known, tmp_path: Path) -> None:
+    path = as_native(
+        known.simulated,
+        tmp_path / "shared.mcap",
+        together={"/server": "/asker"},
+        executor="SingleThreadedExecutor per entry of the job",
+    )
+    output = tmp_path / "fitted.yaml"
+    done = known.fit(str(path), str(known.folder / "job.yaml"), "-o", str(output))
+    assert done.exit_code == 0, done.output
+    job = load_job(output)
+    assert job.executors is not None
+    assert [(one.nodes, one.workers) for one in job.executors] == [(("/asker", "/server"), 1)]
+    assert job.policy is not None
+    assert job.policy.order == "rclpy"
+
+
 @pytest.mark.long
 def test_a_picture(known: Known) -> None:
     pytest.importorskip("matplotlib")
