@@ -242,8 +242,8 @@ def test_ctrl_c_ends_it_properly_even_if_a_callback_is_stuck(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("text", "words", "said"),
     [
-        ("nodes: [{main: robot:main}]", (), "job.yaml:2:"),
-        ("nodes: [{node: robot:Talker, start_after: 1s}]", (), "leave start_after out"),
+        ("nodes: [{component: a/b, container: /c}]", (), "job.yaml:2:"),
+        ("nodes: [{node: robot:Talker}]\nhooks: {before: robot:Talker}", (), "has no hooks"),
         ("nodes: [{node: robot:Talker}]", ("--seed", "1"), "--native steers nothing"),
     ],
 )

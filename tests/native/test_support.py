@@ -6,11 +6,11 @@ from rsltrace.job import Job
 from rsltrace.native.support import ignored
 
 FOLLOWED = {
-    *("nodes", "launch", "ros_arguments", "search_path", "stop"),
+    *("nodes", "bags", "launch", "ros_arguments", "search_path", "stop"),
     *("progress", "record", "checks", "metrics"),
     *("source_name", "given_text", "base_dir", "composed"),
 }
-REFUSED = {"bags", "hooks"}
+REFUSED = {"hooks"}
 
 
 def test_every_key_of_a_job_is_followed_refused_or_named_as_without_effect() -> None:
