@@ -87,6 +87,7 @@ class Pen(threading.Thread):
         try:
             while not self._over.wait(_EVERY_S):
                 self.write(CUT_AFTER_NS)
+                self.cpu_ns = time.thread_time_ns()
         except BaseException as error:
             self.error = error
         self.cpu_ns = time.thread_time_ns()

@@ -38,8 +38,9 @@ class NativeResult:
     """How a native run went. ``duration_ns`` is real time, from when the nodes began to spin.
 
     ``observer_ns`` is the median of what observing a callback took in its thread, ``pen_ns`` the
-    processor time of writing it down beside it. ``stuck`` are entries with a callback that did not
-    come back at the end.
+    processor time of writing it down beside it; ``callback_ns`` is that of a callback, with
+    all of rclpy and the middleware. ``stuck`` are entries with a callback that did not come back at
+    the end.
     """
 
     path: Path
@@ -49,10 +50,20 @@ class NativeResult:
     exit_code: int
     observer_ns: int
     pen_ns: int
+    callback_ns: int
     error: RunError | None = None
     stuck: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     kept: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Spent:
+    """Processor time in nanoseconds: ``callbacks_ns`` of the nodes with rclpy and the middleware
+    (and what observes them in their threads), ``beside_ns`` of telling of it, the pen's aside."""
+
+    callbacks_ns: int
+    beside_ns: int = 0
 
 
 @dataclass
@@ -189,7 +200,9 @@ class Recording:
                 self.error = error
         self.stop(Stop(reason or str(error).splitlines()[0], error.exit_code))
 
-    def close(self, ended_after: int, stuck: tuple[str, ...], unreadable: int) -> NativeResult:
+    def close(
+        self, ended_after: int, stuck: tuple[str, ...], unreadable: int, spent: Spent
+    ) -> NativeResult:
         """Write what is left, close the trace, and say how it went.
 
         :raises OutputError: if the trace cannot be written.
@@ -199,7 +212,8 @@ class Recording:
         stop = self.ending or Stop("nothing is left")
         exit_code = self.error.exit_code if self.error is not None else stop.exit_code
         observer_ns = self.pen.observer_ns
-        pen_ns = self.pen.cpu_ns // max(events, 1)
+        pen_ns = (self.pen.cpu_ns + spent.beside_ns) // max(events, 1)
+        callback_ns = spent.callbacks_ns // max(events, 1)
         self.writer.close(
             result={
                 "start_time": str(self.clocks.wall_ns),
@@ -209,6 +223,7 @@ class Recording:
                 "ended_after": str(ended_after),
                 "observer_ns": str(observer_ns),
                 "pen_ns": str(pen_ns),
+                "callback_ns": str(callback_ns),
                 "unknown_causes": str(self.pen.causes.unknown),
                 **self._levels(),
             },
@@ -222,6 +237,7 @@ class Recording:
             exit_code=exit_code,
             observer_ns=observer_ns,
             pen_ns=pen_ns,
+            callback_ns=callback_ns,
             error=self.error,
             stuck=stuck,
             notes=(*self.notes, *_said(stuck, unreadable)),

@@ -27,6 +27,7 @@ from rsltrace.native.recording import (
     LOOK_EVERY_S,
     NativeResult,
     Recording,
+    Spent,
     rclpy_running,
 )
 from rsltrace.native.things import Things
@@ -88,6 +89,7 @@ class InThreads(Recording):
         self.priorities: Priorities | None = None
         if self.policy is not None:
             self.priorities = Priorities(self.things, self.rules)
+        self._cpu_ns = time.process_time_ns()
         self._start = threading.Event()
         self._running: list[RunningEntry] = []
         self.entries = node_entries(self.job, told=self.note)
@@ -121,7 +123,7 @@ class InThreads(Recording):
             self._running.append(one)
             one.start()
             self._wait_for(one)
-        self.begun_ns = time.monotonic_ns()
+        self.begun_ns, self._cpu_ns = time.monotonic_ns(), time.process_time_ns()
         self._start.set()
         for _ in self.wait():
             self.look(self.ledger.count, self.ledger.activity_ns)
@@ -180,4 +182,5 @@ class InThreads(Recording):
                 destroy(one.nodes, self.ledger, self.things)
         if self.priorities is not None:
             self.levels.update(self.priorities.levels)
-        return self.close(ended_after, stuck, self.boundary.unreadable)
+        spent = Spent(time.process_time_ns() - self._cpu_ns - self.pen.cpu_ns)
+        return self.close(ended_after, stuck, self.boundary.unreadable, spent)

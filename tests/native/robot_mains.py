@@ -41,6 +41,13 @@ class Counting(Node):
     def on_same(self, message: String) -> None:
         self.same += 1
 
+    def destroy_node(self) -> None:
+        """Write down what it has counted, if it is to be told."""
+        told = self.declare_parameter("told", "").value
+        if told:
+            Path(told).write_text(json.dumps(self.counted()))
+        super().destroy_node()
+
     def counted(self) -> dict[str, Any]:
         return {"sent": self.next - self.first, "got": self.got, "same": self.same}
 

@@ -89,6 +89,7 @@ def _values(result: NativeResult, checked: Checked | None) -> dict[str, Any]:
         "duration_ns": result.duration_ns,
         "observer_ns": result.observer_ns,
         "pen_ns": result.pen_ns,
+        "callback_ns": result.callback_ns,
         "stop_reason": result.stop_reason,
         "exit_code": result.exit_code,
         "error": None if result.error is None else str(result.error),

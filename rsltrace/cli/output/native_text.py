@@ -40,6 +40,9 @@ def native_lines(trace: Trace) -> list[str]:
     if observer.isdigit() and pen.isdigit():
         text = f"{format_duration(int(observer))} per callback in its thread (median), and "
         rows.append(("  observer", f"{text}{format_duration(int(pen))} beside it"))
+    if (spent := trace.result.get("callback_ns", "")).isdigit():
+        whole = "of processor time per callback: all of the nodes, rclpy and the middleware"
+        rows.append(("  callbacks", f"{format_duration(int(spent))} {whole}"))
     busy = ", ".join(f"{part:.1%}" for part in busy_threads(trace).values())
     if busy:
         rows.append(("  threads busy", busy))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from typing import Any
@@ -17,7 +18,7 @@ from rsltrace.native.nodes import Nodes
 from rsltrace.native.things import Things
 from rsltrace.trace.native import CUT_AFTER_NS
 
-_EVERY_S = 0.02
+_EVERY_S = 0.05
 _AT_ONCE = 2_000
 """Spans in one frame, at most."""
 
@@ -55,12 +56,16 @@ class Sender(threading.Thread):
         self._is_constructed = is_constructed
         self._has_told = False
         self._over = threading.Event()
+        self._begun_ns = time.process_time_ns()
+        self._own_ns = 0
+        """Processor time of this thread."""
         self._lock = threading.Lock()
 
     def run(self) -> None:
         with suppress(OSError):  # the run is gone, and so is this process in a moment
             while not self._over.wait(_EVERY_S):
                 self._tell(CUT_AFTER_NS)
+                self._own_ns = time.thread_time_ns()
 
     def finish(self) -> None:
         """Tell all that is left; callbacks that go on are told of as far as they have come."""
@@ -76,7 +81,13 @@ class Sender(threading.Thread):
             ledger, writer = self._observers.ledger, self._writer
             spans, until_ns = ledger.finished_until(patience_ns)
             definitions = writer.definitions()
-            counts = ledger.count, ledger.activity_ns, self._observers.boundary.unreadable
+            counts = (
+                ledger.count,
+                ledger.activity_ns,
+                self._observers.boundary.unreadable,
+                time.process_time_ns() - self._begun_ns,
+                self._own_ns,
+            )
             parts = [spans[at : at + _AT_ONCE] for at in range(0, len(spans), _AT_ONCE)]
             for number, part in enumerate(parts or [[]]):
                 upto_ns = until_ns if number >= len(parts) - 1 else part[-1].start_ns

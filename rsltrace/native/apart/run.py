@@ -28,12 +28,15 @@ from rsltrace.native.apart.wire import SpanReader
 from rsltrace.native.domain import check_loopback, domain
 from rsltrace.native.executors import EXECUTORS
 from rsltrace.native.ledger import Sent, Span
-from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording
+from rsltrace.native.recording import ENDS_WITHIN_S, LOOK_EVERY_S, NativeResult, Recording, Spent
 from rsltrace.run.plans.starts import missed_starts
 from rsltrace.run.plans.stopping import has_stop
 
 _KILLED_AFTER_S = ENDS_WITHIN_S + 3.0
 """A process that is stuck ends itself before; this is for one that cannot."""
+Counts = tuple[int, int, int, int, int]
+"""Of a process: its events, when it was last active (steady), messages that could not be read,
+its processor time, and that of telling of it."""
 _QUIET_ENDS = ("KeyboardInterrupt", "ExternalShutdownException")
 
 
@@ -47,7 +50,7 @@ class InProcesses(Recording):
         self.children: list[Child] = []
         self._ids, self._threads = count(1), count(1)
         self._told: dict[Child, tuple[SpanReader, Source]] = {}
-        self._counts: dict[Child, tuple[int, int, int]] = {}
+        self._counts: dict[Child, Counts] = {}
         self._sources: dict[str, Path] = {}
         self._refusal: RsltraceError | None = None
         self._restarts: list[tuple[int, Start]] = []
@@ -131,7 +134,7 @@ class InProcesses(Recording):
         self,
         child: Child,
         until_ns: int,
-        counts: tuple[int, int, int],
+        counts: Counts,
         definitions: list[tuple[Any, ...]],
         spans: list[tuple[Any, ...]],
     ) -> None:
@@ -289,8 +292,10 @@ class InProcesses(Recording):
             )
         self.notes += missed_starts(self.job, self.starts.missed())
         stuck = tuple(child.what.name for child in self.children if child.is_stuck)
-        unreadable = sum(one[2] for one in self._counts.values())
-        return self.close(ended_after, stuck, unreadable)
+        unreadable, cpu_ns, beside_ns = (
+            sum(one[place] for one in self._counts.values()) for place in (2, 3, 4)
+        )
+        return self.close(ended_after, stuck, unreadable, Spent(cpu_ns - beside_ns, beside_ns))
 
     def _kill_all(self) -> None:
         """Leave no process behind, whatever has happened."""
