@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import click
-from click.shell_completion import get_completion_class
+from click.shell_completion import CompletionItem, get_completion_class
 
 from rsltrace.terminal import say
 
 _PROGRAM = "rsltrace"
+
+
+def complete_files(
+    context: click.Context, parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Have the shell offer files, for arguments that may be something else, too (addresses)."""
+    return [CompletionItem(incomplete, type="file")]
 
 
 @click.command()

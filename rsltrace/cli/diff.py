@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.completion import complete_files
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.diff.options import BY_ORDER, BY_STAMP, DiffOptions
 from rsltrace.errors import EXIT_USAGE, RsltraceError, TraceFormatError
@@ -56,8 +57,8 @@ class Tolerance(_Type):
 
 
 @click.command()
-@click.argument("golden", metavar="A")
-@click.argument("others", metavar="B...", nargs=-1, required=True)
+@click.argument("golden", metavar="A", shell_complete=complete_files)
+@click.argument("others", metavar="B...", nargs=-1, required=True, shell_complete=complete_files)
 @click.option(
     "--format",
     "form",

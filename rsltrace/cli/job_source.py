@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from rsltrace.cli.completion import complete_files
 from rsltrace.job.values.ros_arguments import split_ros_arguments
 
 if TYPE_CHECKING:
@@ -37,7 +38,12 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add what ``job_of`` needs to a command: ``words``, ``launch``, ``skip``, ``overrides``."""
     for decorate in reversed(
         (
-            click.argument("words", nargs=-1, metavar="[JOB] [NAME:=VALUE]..."),
+            click.argument(
+                "words",
+                nargs=-1,
+                metavar="[JOB] [NAME:=VALUE]...",
+                shell_complete=complete_files,
+            ),
             click.option(
                 "--launch",
                 type=click.Path(path_type=Path),
