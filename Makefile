@@ -6,6 +6,7 @@
 #   make test-long     long campaigns, planted faults in numbers, a hundred perturbed runs
 #   make test-random   property tests with many more examples (not in CI)
 #   make truth         a thousand planted faults, and what diff says of them
+#   make dist          wheel and sdist, tried in empty environments
 #   make attack        hostile files, jobs, nodes, servers and disks, for an hour
 # Needs Python 3.10 to 3.13 (with venv) on Linux x86_64, and nothing else.
 
@@ -17,7 +18,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve samples bench pictures clean
+.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -93,10 +94,11 @@ KILTED_TESTS ?=
 test-kilted:
 	@$(MAKE) --no-print-directory $(KILTED) unit PYTEST="$(KILTED_TESTS)"
 
-# docs/jobs.md is made from the models of rsltrace.job, the drawings of docs/architecture.md and
-# docs/concepts by scripts; a test fails when one is stale.
+# docs/jobs.md is made from the models of rsltrace.job, the manual pages in man/ from the commands, the
+# drawings of docs/architecture.md and docs/concepts by scripts; a test fails when one is stale.
 docs: $(INSTALLED)
 	$(BIN)/python -m rsltrace.job.documents.reference > docs/jobs.md
+	$(BIN)/python docs/make_man_pages.py
 	$(BIN)/python docs/draw_architecture.py
 	$(BIN)/python docs/draw_concepts.py
 
@@ -108,6 +110,10 @@ site: $(INSTALLED)
 
 docs-serve: $(INSTALLED)
 	$(MKDOCS) serve
+
+# A wheel and an sdist in dist/, installed where there is nothing else and tried there.
+dist: $(INSTALLED)
+	$(BIN)/python tests/packaging/check_dist.py dist
 
 samples: $(INSTALLED)
 	$(BIN)/python sample_traces/make_samples.py
