@@ -147,3 +147,9 @@ def test_the_tutorial_shows_the_example(name: str) -> None:
     shown = re.search(rf"^<!-- file: {name} -->\n```\w+\n(.*?)^```", tutorial, re.M | re.S)
     assert shown is not None
     assert shown[1] == (ROOT / "examples" / "cart" / name).read_text("utf-8")
+
+
+def test_the_manual_pages_are_current() -> None:
+    pages = runpy.run_path(str(ROOT / "docs" / "make_man_pages.py"))["pages"]()
+    found = {path.name: path.read_text("utf-8") for path in ROOT.glob("man/*.1")}
+    assert found == pages, "run make docs"
