@@ -21,12 +21,12 @@ from rsltrace.debug.conditions.message_fields import loaded_fields
 from rsltrace.debug.conditions.names import Names, names_of
 from rsltrace.debug.conditions.text import parse_condition
 from rsltrace.debug.debuggers import debugger
-from rsltrace.debug.forking import end_process, fork_beside, why_not
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described
 from rsltrace.debug.lines import Lines, Message
 from rsltrace.debug.view import NO_CALL, Call, View, call_of
 from rsltrace.errors import DebugError, RsltraceError
+from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage
 from rsltrace.guard.redirect import copy_of
 from rsltrace.model.event import EventKind

@@ -15,9 +15,9 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.debug.forking import die_with_parent, end_process
 from rsltrace.debug.lines import Lines
 from rsltrace.errors import ReplayError, RsltraceError
+from rsltrace.forking import die_with_parent, end_process
 from rsltrace.guard.pin import pin, unpin
 
 if TYPE_CHECKING:
@@ -126,8 +126,8 @@ def _serve(
 
 def _middleware_threads() -> frozenset[int]:
     """Return the threads that DDS starts when it is loaded, and nobody uses in a simulation."""
-    from rsltrace.debug.forking import other_threads
     from rsltrace.doors.rclpy.boundary.installation import check_free
+    from rsltrace.forking import other_threads
 
     check_free()
     with suppress(ImportError):  # the session says what is missing

@@ -9,9 +9,9 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
-from rsltrace.debug.forking import end_process
 from rsltrace.errors import RsltraceError
 from rsltrace.explore.trial import JobSource
+from rsltrace.forking import end_process
 
 _HIGH = 900
 """Descriptors from here on are not those that nodes get first."""

@@ -19,11 +19,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.debug.forking import die_with_parent, end_process, fork_beside, why_not
 from rsltrace.debug.lines import Lines
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.explore.copies import answer_and_end, source_of, take_ends
 from rsltrace.explore.trial import Trial
+from rsltrace.forking import die_with_parent, end_process, fork_beside, why_not
 
 if TYPE_CHECKING:
     from rsltrace.explore.outcome import Wants
@@ -220,7 +220,8 @@ class _Standing:
         why = why_no_branch(self.session, job)
         if why:
             return {"why": why}
-        self.session.becomes(job, Path(task["trace"]))
+        self.session.becomes(job)
+        self.session.settle(Path(task["trace"]))
         self.session.go_on()
         ran = self.session.finish()
         self._stack.close()

@@ -21,12 +21,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from rsltrace.debug.forking import die_with_parent, other_threads
 from rsltrace.debug.lines import Lines
 from rsltrace.errors import RsltraceError
 from rsltrace.explore.copies import answer_and_end, source_of, take_ends
 from rsltrace.explore.prefix import Prefixes
 from rsltrace.explore.trial import CRASH, TIMEOUT, Failure, Trial, TrialResult
+from rsltrace.forking import die_with_parent, other_threads
 from rsltrace.guard.libraries import is_library
 from rsltrace.guard.pin import pin
 

@@ -436,16 +436,14 @@ class Session:
             self.world.domain.outcome.error = failed
             self.stop = Stop(str(error).splitlines()[0], failed.exit_code)
 
-    def becomes(self, job: Job, path: Path) -> None:
+    def becomes(self, job: Job) -> None:
         """Go on as the run of another job, which is like this one's but for what is yet to come:
         its policy, and faults beside those of this one's. ``why_not`` of ``rsltrace.run.branching``
-        says if that can be. What the ``writer`` has been given so far goes to ``path``.
+        says if that can be.
 
         :raises JobError: its policy cannot be made.
-        :raises OutputError: the trace cannot be written.
         """
-        writer, old = self._recorded_by, self.job
-        assert writer is not None, "it has no trace of its own"
+        old = self.job
         self.job = job = without_launch_files(job).job
         if isinstance(self.loop, OrderedLoop) and job.policy != old.policy:
             with self._guarded.engaged():
@@ -455,8 +453,16 @@ class Session:
         if self.bag_faults is not None:
             self.bag_faults.add(job, len(old.faults))
         self._faults = arm_nodes(job, self.world, self.start_ns)
-        check_output(job, path, None)
-        write_job(writer, job)
+
+    def settle(self, path: Path) -> None:
+        """Have what the ``writer`` has been given so far, and all to come, in a trace.
+
+        :raises OutputError: the trace cannot be written.
+        """
+        writer = self._recorded_by
+        assert writer is not None, "it has no trace of its own"
+        check_output(self.job, path, None)
+        write_job(writer, self.job)
         writer.settle(path, force=self._force)
         self._writer = self._stack.enter_context(writer)
 

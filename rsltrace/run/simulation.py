@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from rsltrace.errors import DeadlockError, RunError, did_you_mean
-from rsltrace.job import Job, load_job
+from rsltrace.job import FaultSpec, Job, load_job
 from rsltrace.job.values.names import check_topic
 from rsltrace.job.values.times import parse_time
 from rsltrace.loop.loop import NOTHING_LEFT
 from rsltrace.loop.stop import Stop
 from rsltrace.model.stamp import format_seconds
 from rsltrace.run.driver import Driver
+from rsltrace.run.forked import ForkedRun, ForkResult
 from rsltrace.run.session import RunResult, Session
 from rsltrace.run.tap import Tap
 
+T = TypeVar("T")
 Time = str | int | float
 """As in a job: seconds as a number, or text with a unit (``5ms``)."""
 
@@ -45,16 +47,24 @@ class Simulation:
         *,
         force: bool = False,
         echo: bool = False,
+        forks: bool = False,
     ) -> None:
         """Take a job (or the path of a job file) and, to record it, the trace to write.
 
-        ``force`` overwrites a trace, ``echo`` prints the nodes' log records on stderr.
+        ``force`` overwrites a trace, ``echo`` prints the nodes' log records on stderr. With
+        ``forks`` the run can be continued in several ways (``fork``): its trace is kept in memory
+        until it is over.
 
         :raises JobError: if the job file is wrong.
         """
         loaded = job if isinstance(job, Job) else load_job(job)
         path = None if output is None else Path(output)
-        self._session = Session(loaded, path, force=force, echo=echo)
+        if forks:
+            self._forking: ForkedRun | None = ForkedRun(loaded, path, force=force, echo=echo)
+            self._session = self._forking.session
+        else:
+            self._forking = None
+            self._session = Session(loaded, path, force=force, echo=echo)
         self._entered: Driver | None = None
         self._taps: dict[str, list[Tap]] = {}
         self._result: RunResult | None = None
@@ -68,6 +78,8 @@ class Simulation:
         """
         if self._entered is not None:
             raise RunError("a Simulation is entered once: make another one for another run")
+        if self._forking is not None:
+            self._forking.begin()
         self._session.__enter__()
         self._entered = Driver(self._session)
         try:
@@ -92,6 +104,8 @@ class Simulation:
             driver.leave()
             if not driver.ended:
                 driver.loop.stop(self._left_because(error))
+            if self._forking is not None:
+                self._forking.settle()
             self._result = self._session.finish()
             if error is None:
                 driver.raise_error()
@@ -220,6 +234,44 @@ class Simulation:
             if self._driver.position() == before:
                 return bool(goal())
         return True
+
+    def fork(
+        self,
+        function: Callable[[Simulation], T],
+        output: str | os.PathLike[str] | None = None,
+        *,
+        faults: Sequence[FaultSpec | dict[str, Any]] = (),
+    ) -> ForkResult[T]:
+        """Call ``function`` with this simulation in a copy of the process, which goes on from here;
+        return what it returns (pickled on the way) and how that run went. Here nothing changes.
+
+        ``output`` is the trace to write of the whole run, from its beginning; ``faults`` go wrong
+        in it beside those of the job. The copy has none of your own threads.
+
+        :raises RunError: the simulation was made without ``forks=True``, cannot be copied, or the
+            faults are not of what is to come; what goes wrong in the copy.
+        :raises OutputError: the trace cannot be written.
+        """
+        self._driver.check_driver()
+        self._check_going()
+        if self._forking is None:
+            raise RunError("a simulation forks if it is made with forks=True")
+        job = self._forking.job_with(faults)
+        path = None if output is None else Path(output)
+
+        def go_on() -> ForkResult[T]:
+            assert self._forking is not None
+            self._forking.begin_copy(job, path)
+            try:
+                value = function(self)
+            except BaseException as error:
+                self.__exit__(type(error), error, error.__traceback__)
+                raise
+            self.__exit__(None, None, None)
+            return ForkResult(value, self.result)
+
+        found: ForkResult[T] = self._forking.in_copy(go_on)
+        return found
 
     def _run_to(self, time_ns: int) -> None:
         if time_ns < self.now_ns:

@@ -14,8 +14,8 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from rsltrace.debug.forking import die_with_parent
 from rsltrace.errors import SetupError
+from rsltrace.forking import die_with_parent
 from rsltrace_viewer.rerun_export.sdk import LOOPBACK, require, require_control, viewer
 
 LOADED_S_MAX = 20.0

@@ -114,8 +114,32 @@ def fork_beside(parent: int, pairs: Pairs) -> int:
     return int(_PID.unpack(data)[0])
 
 
+def fork_below(pairs: Pairs) -> int:
+    """Fork a process that is a child of this one and dies with it; return its id, 0 in itself. It
+    has files and ``pairs`` of its own, as from ``fork_beside``.
+
+    :raises DebugError: if no process can be made.
+    """
+    parent = os.getpid()
+    pid = _c.fork() if other_threads() else _clone(0)
+    if not _is_copy(pid):
+        return int(pid)
+    try:
+        die_with_parent(parent)
+        _reopen_files()
+        _renew(pairs)
+    except BaseException:
+        end_process(1)
+    return 0
+
+
 def _is_copy_of_one() -> bool:
-    """Fork a process with the same parent; say whether this is the new one.
+    """Fork a process with the same parent; say whether this is the new one."""
+    return _is_copy(_clone(_CLONE_PARENT))
+
+
+def _clone(more_flags: int) -> int:
+    """Fork a process; return its id, 0 in itself, less than 0 where none can be made.
 
     The kernel is called as the C library's ``fork`` calls it. In a process with one thread, that
     does nothing else but call handlers (``pthread_atfork``), which see to locks and threads of
@@ -124,13 +148,13 @@ def _is_copy_of_one() -> bool:
     tid, robust, size = ctypes.c_void_p(), ctypes.c_void_p(), ctypes.c_size_t()
     _c.prctl(_PR_GET_TID_ADDRESS, ctypes.byref(tid), _NULL, _NULL, _NULL)
     _c.syscall(_GET_ROBUST_LIST, _NULL, ctypes.byref(robust), ctypes.byref(size))
-    flags = _CLONE_PARENT | _SIGCHLD
+    flags = more_flags | _SIGCHLD
     if tid:
         flags |= _CLONE_CHILD_SETTID | _CLONE_CHILD_CLEARTID
     pid = _c.syscall(_CLONE, ctypes.c_long(flags), _NULL, _NULL, tid, _NULL)
     if pid == 0 and robust:
         _c.syscall(_SET_ROBUST_LIST, robust, size)
-    return _is_copy(pid)
+    return int(pid)
 
 
 def _is_copy_of_many() -> bool:
