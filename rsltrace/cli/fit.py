@@ -90,7 +90,7 @@ def fit(
 
     With --check nothing is taken on trust: quantiles of end-to-end latencies of the second run and
     of the simulated one, their ratio with its 95 % interval, and a two-sample test; beside them the
-    ratio of the second run to the first, which no simulation can be expected to better.
+    same of the first run, since the robot is not like itself every time.
     """
     from rsltrace.fit.checked import check
     from rsltrace.fit.measured import measured

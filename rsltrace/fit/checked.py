@@ -19,19 +19,13 @@ NEAR = 0.1
 
 @dataclass(frozen=True, slots=True)
 class CheckedChain:
-    """A chain by its topics: the simulated run against the second native one, and that against the
-    first, the yardstick; None where one of them has no such chain."""
+    """A chain by its topics: the simulated run and the first native one against the second, and the
+    simulated one against the first, to which it is fitted; None where one has no such chain."""
 
     name: str
     simulated: Compared | None
     native: Compared | None
-
-    @property
-    def far(self) -> list[float]:
-        """The quantiles, in percent, that do not match."""
-        if self.simulated is None:
-            return []
-        return [one.percent for one in self.simulated.quantiles if not abs(one.ratio - 1.0) <= NEAR]
+    own: Compared | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +61,7 @@ def check(first: Trace, second: Chains, simulated: Trace) -> Checked:
                 chain.name,
                 _against(chain, of_simulated.get(hops)),
                 _against(chain, of_first.get(hops)),
+                _against(of_first.get(hops), of_simulated.get(hops)),
             )
             for hops, chain in second.items()
         )
@@ -77,9 +72,14 @@ def _by_hops(found: Latencies) -> Chains:
     return {one.hops: one for one in found.chains if len(one.hops) > 1}
 
 
-def _against(chain: ChainLatency, other: ChainLatency | None) -> Compared | None:
+def far(of: Compared) -> list[float]:
+    """Return the quantiles, in percent, that do not match."""
+    return [one.percent for one in of.quantiles if not abs(one.ratio - 1.0) <= NEAR]
+
+
+def _against(chain: ChainLatency | None, other: ChainLatency | None) -> Compared | None:
     """Compare ``other`` with a chain: ratios are those of the other to the chain."""
-    if other is None:
+    if chain is None or other is None:
         return None
     a, b = chain.durations("latency"), other.durations("latency")
     return compared(a, b) if len(a) and len(b) else None

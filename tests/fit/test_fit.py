@@ -237,6 +237,7 @@ def test_the_simulation_of_the_fitted_job_has_the_latencies_of_the_run(
         assert 0.9 < one["ratio"] < 1.1
     assert whole["simulated"]["distance"] < 1.95 * np.sqrt(2 / 780)
     assert whole["simulated"]["p_value"] > 0.001
+    assert whole["simulated_to_first"]["distance"] < 1.95 * np.sqrt(2 / 780)
     with Trace.open(tmp_path / "again.mcap") as trace:
         assert trace.complete
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rsltrace.fit.checked import NEAR, Checked, CheckedChain
+from rsltrace.fit.checked import NEAR, Checked, CheckedChain, far
 from rsltrace.fit.comparison import Compared
 from rsltrace.fit.measured import Durations
 from rsltrace.fit.models import Model, as_job_has_it
@@ -96,13 +96,25 @@ def _chain(chain: CheckedChain) -> list[str]:
     lines.append(f"  simulated and second run: {_tested(of)}")
     if chain.native is not None:
         lines.append(f"  first and second run: {_tested(chain.native)}")
-    far = chain.far
-    within = f"within {NEAR * 100:g} % of the second run"
-    if far:
-        lines.append(f"  not {within}: {', '.join(f'p{percent:g}' for percent in far)}")
-    else:
-        lines.append(f"  all of these are {within}")
+    if chain.own is not None:
+        ratios = ", ".join(f"p{q.percent:g} {_ratio(q.ratio)}" for q in chain.own.quantiles)
+        lines.append(f"  simulated and first run: {_tested(chain.own)}; ratios {ratios}")
+    lines.append(f"  {_verdict(of, chain.native)}")
     return lines
+
+
+def _verdict(simulated: Compared, native: Compared | None) -> str:
+    within = f"within {NEAR * 100:g} % of the second run"
+    if not far(simulated):
+        return f"the simulated run is {within}"
+    said = f"the simulated run is not {within}: {_named(far(simulated))}"
+    if native is not None and far(native):
+        said += f"; neither is the first: {_named(far(native))}"
+    return said
+
+
+def _named(percent: list[float]) -> str:
+    return ", ".join(f"p{one:g}" for one in percent)
 
 
 def _ratio(ratio: float) -> str:
@@ -187,5 +199,6 @@ def _checked(chain: CheckedChain) -> dict[str, Any]:
         "chain": chain.name,
         "simulated": plain(chain.simulated),
         "first_run": plain(chain.native),
-        "far": [f"p{percent:g}" for percent in chain.far],
+        "simulated_to_first": plain(chain.own),
+        "far": [] if chain.simulated is None else [f"p{one:g}" for one in far(chain.simulated)],
     }
