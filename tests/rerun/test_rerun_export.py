@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import rerun_gallery as gallery
 import trace_maker
@@ -200,6 +201,14 @@ def test_what_is_drawn_is_where_it_was(recording: Recording) -> None:
     assert recording.static["/topics/voltage"]["SeriesLines:names"] == ["data"]
     track = recording.static["/topics/odom/track"]["LineStrips3D:strips"]
     assert len(track[0]) == STEPS
+    assert recording.static["/topics/odom/track"]["Points3D:labels"] == ["/odom"]
+    clouds = recording.values("/topics/cloud", "Points3D:positions")
+    colours = recording.values("/topics/cloud", "Points3D:colors")
+    for cloud, colour in zip(clouds, colours, strict=True):
+        order = np.argsort([point[2] for point in cloud], kind="stable")
+        greens = [colour[at] >> 16 & 255 for at in order]
+        assert greens == sorted(greens), "the higher the brighter"
+        assert greens[0] < greens[-1]
 
 
 def test_markers_go_when_they_are_deleted(recording: Recording) -> None:

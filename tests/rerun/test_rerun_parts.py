@@ -18,6 +18,7 @@ from rsltrace_viewer.rerun_export.divergence import document
 from rsltrace_viewer.rerun_export.events.labels import hashes
 from rsltrace_viewer.rerun_export.events.rates import step_for
 from rsltrace_viewer.rerun_export.frames import FrameTree
+from rsltrace_viewer.rerun_export.messages.clouds import extent, shaded
 from rsltrace_viewer.rerun_export.messages.fields import curves_of
 from rsltrace_viewer.rerun_export.messages.markers import MarkerBoard
 from rsltrace_viewer.rerun_export.messages.shapes import SHAPES, Paint
@@ -202,3 +203,29 @@ def test_texts_of_a_trace_are_no_markdown() -> None:
     assert (title, fence, end) == ("# The runs diverge", "````text", "````")
     assert "a```.mcap" in "\n".join(lines)
     assert not any(line.startswith(("#", "````")) or "\x1b" in line for line in lines)
+
+
+def _clouds(*clouds: list[list[float]]) -> pa.ListArray:
+    points = np.array([point for cloud in clouds for point in cloud]).reshape(-1, 3)
+    flat = pa.array(points.astype(np.float32).reshape(-1))
+    return lists(np.array([len(c) for c in clouds]), pa.FixedSizeListArray.from_arrays(flat, 3))
+
+
+def test_a_cloud_is_brighter_above_and_a_stray_point_does_not_matter() -> None:
+    ground = [[float(x), 0.0, 0.0] for x in range(200)]
+    clouds = _clouds(ground, [[0, 0, 2.0], [0, 0, 4.0], *[[0.0, 0.0, 4.0]] * 50, [9e9, 0, 9e9]])
+    dark, bright = shaded(clouds, Paint(0xFF8000FF)).to_pylist()
+    assert set(dark) == {0x4C2600FF}
+    assert bright[0] == 0xA55300FF
+    assert set(bright[1:]) == {0xFF8000FF}
+    box = extent(clouds)
+    assert box is not None
+    assert box[1].tolist() == [pytest.approx(193, abs=5), 0, 4]
+
+
+def test_clouds_without_points_or_without_places_are_nothing_to_look_at() -> None:
+    nan = float("nan")
+    assert shaded(_clouds([], []), Paint(0xFF8000FF)).to_pylist() == [[], []]
+    assert shaded(_clouds([[nan, nan, nan]]), Paint(0xFF8000FF)).to_pylist() == [[0xFF8000FF]]
+    assert extent(_clouds([])) is None
+    assert extent(_clouds([[nan, 0, 0]])) is None

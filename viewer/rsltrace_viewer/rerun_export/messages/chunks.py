@@ -36,6 +36,7 @@ from rsltrace_viewer.rerun_export.columns import (
     make_chunk,
 )
 from rsltrace_viewer.rerun_export.frames import FrameTree
+from rsltrace_viewer.rerun_export.messages.clouds import extent, shaded
 from rsltrace_viewer.rerun_export.messages.fields import Curves, curves_of
 from rsltrace_viewer.rerun_export.messages.marker_rows import MarkerRows
 from rsltrace_viewer.rerun_export.messages.readable import left_out
@@ -69,6 +70,7 @@ _MARKERS = ("visualization_msgs.msg.Marker", "visualization_msgs.msg.MarkerArray
 _IMAGES = {"Image:buffer", "EncodedImage:blob", "DepthImage:buffer", "EncodedDepthImage:blob"}
 _SOLID = {"Points3D:positions", "GridMap:data", "Pinhole:image_from_camera"}
 """What the loader draws, flat and in space."""
+_CLOUD, _CLOUD_COLOURS = "Points3D:positions", "Points3D:colors"
 _RAW_CLOUD = "sensor_msgs.msg.PointCloud2:"
 """The bytes of a cloud, beside its points: the same once more."""
 
@@ -95,7 +97,7 @@ class Seen:
     extents: dict[str, tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]] = field(
         default_factory=dict
     )
-    """By path of a track, the corners of the box around it."""
+    """By path of a track or a cloud, the corners of the box around it."""
 
 
 class MessageRows:
@@ -205,6 +207,20 @@ class MessageRows:
         self.seen.topic_of.setdefault(rows.path, rows.topic)
         if columns:
             yield from loaded_chunk(rows.path, rows.times, columns)
+        if _CLOUD in names:
+            yield from self._cloud(rows, names)
+
+    def _cloud(self, rows: Rows, names: set[str]) -> Iterator[Chunk]:
+        """Colour a cloud that has no colours of its own, and note where it is."""
+        positions = next(column for f, column in rows.columns if f.name == _CLOUD)
+        if _CLOUD_COLOURS not in names:
+            colours = shaded(positions, self._paint(rows.topic))
+            columns = ((rr.Points3D.descriptor_colors(), colours),)
+            yield from make_chunk(rows.path, rows.times, columns)
+        box, known = extent(positions), self.seen.extents.get(rows.path)
+        if box is not None:
+            low, high = box if known is None else known
+            self.seen.extents[rows.path] = np.minimum(low, box[0]), np.maximum(high, box[1])
 
     def _derived(self, rows: Rows) -> Iterator[Chunk]:
         by_name = {f.name: column for f, column in rows.columns}
@@ -289,7 +305,8 @@ class MessageRows:
         yield from make_chunk(path, rows.times, columns)
         if drawing.position is not None:
             first = f"{self._prefix}{frames[0]}"
-            self._trails.add_poses(rows.path, first, self._paint(rows.topic), drawing.position)
+            paint = self._paint(rows.topic)
+            self._trails.add_poses(rows.path, rows.topic, first, paint, drawing.position)
 
     def _loaded_pose(self, rows: Rows, by_name: dict[str, pa.Array]) -> Iterator[Chunk]:
         """The loader knows poses, but draws nothing where they are."""

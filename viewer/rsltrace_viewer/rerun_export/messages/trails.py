@@ -24,20 +24,21 @@ from rsltrace_viewer.rerun_export.messages.tracks import Track
 _WIDTH = -1.0
 """On the screen."""
 _LABEL_AT = {"a": 0.5, "b": 0.65}
+_FIRST_LABEL_AT, _LABELS_APART = 0.4, 0.27
 
 
 class Trails:
     """Gathers the positions of topics; each has a track at ``TOPIC/track``."""
 
     def __init__(self) -> None:
-        self._poses: dict[str, tuple[Track, str, Paint]] = {}
+        self._poses: dict[str, tuple[Track, str, str, Paint]] = {}
         self._fixes: dict[str, tuple[Track, Paint]] = {}
 
     def add_poses(
-        self, path: str, frame: str, paint: Paint, positions: npt.NDArray[np.float64]
+        self, path: str, topic: str, frame: str, paint: Paint, positions: npt.NDArray[np.float64]
     ) -> None:
         """Add positions, shape (n, 3), in the frame of the first ones."""
-        self._poses.setdefault(path, (Track(), frame, paint))[0].add(positions)
+        self._poses.setdefault(path, (Track(), topic, frame, paint))[0].add(positions)
 
     def add_fixes(self, path: str, paint: Paint, positions: npt.NDArray[np.float64]) -> None:
         """Add latitudes and longitudes, shape (n, 2)."""
@@ -45,9 +46,11 @@ class Trails:
 
     def poses(self, label: str) -> Iterator[tuple[str, str, npt.NDArray[np.float64], list[Chunk]]]:
         """Yield path, frame (with its prefix), points and chunk of every track of poses. ``label``
-        is written beside them, if there is one."""
-        for topic_path, (track, frame, paint) in self._poses.items():
+        is written beside them, if there is one; otherwise the topic, if there are several."""
+        names = len(self._poses) > 1 and not label
+        for number, (topic_path, (track, topic, frame, paint)) in enumerate(self._poses.items()):
             points = track.points
+            at = _LABEL_AT.get(label, _FIRST_LABEL_AT + number * _LABELS_APART) % 1
             if len(points):
                 path = f"{topic_path}/track"
                 strip = strip_lists(np.array([len(points)]), vectors(points))
@@ -56,7 +59,7 @@ class Trails:
                     (rr.LineStrips3D.descriptor_colors(), paint.faint.column(1)),
                     (rr.LineStrips3D.descriptor_radii(), constant(_WIDTH, 1, pa.float32())),
                     (rr.CoordinateFrame.descriptor_frame(), pa.array([frame])),
-                    *(_named(label, points, paint) if label else ()),
+                    *(_named(label or topic, at, points, paint) if label or names else ()),
                 )
                 yield path, frame, points, make_chunk(path, (), columns)
 
@@ -76,10 +79,12 @@ class Trails:
                 yield from make_chunk(f"{topic_path}/track", (), columns)
 
 
-def _named(label: str, points: npt.NDArray[np.float64], paint: Paint) -> tuple[Column, ...]:
-    """Return what writes ``label`` on a track: elsewhere for ``b`` than for ``a``, as their tracks
-    may be one."""
-    at = int(len(points) * _LABEL_AT.get(label, 0.5))
+def _named(
+    label: str, part: float, points: npt.NDArray[np.float64], paint: Paint
+) -> tuple[Column, ...]:
+    """Return what writes ``label`` on a track, after a part of it: elsewhere than on others, as
+    tracks may be one."""
+    at = int(len(points) * part)
     return (
         (rr.Points3D.descriptor_positions(), vectors(points[at : at + 1])),
         (rr.Points3D.descriptor_colors(), paint.column(1)),
