@@ -37,6 +37,7 @@ from rsltrace.trace.format import (
     METADATA_ENVIRONMENT,
     METADATA_GUARD,
     METADATA_JOB,
+    METADATA_NATIVE,
     METADATA_OWN,
     METADATA_RESULT,
     PREFIX_OWN,
@@ -468,31 +469,33 @@ class Trace:
         return Tables(self, self._decoder)
 
     def _repr_html_(self) -> str:
-        """Return what a notebook shows of it. Raises TraceError where it is damaged."""
+        """Return what a notebook shows of it; of one that cannot be read, why."""
         from rsltrace.model.html import Sheet
 
         sheet = Sheet(f"trace {Path(self.name).name}")
         if not self.complete:
             sheet.line("cut off: the run was killed or crashed, or is still going on")
-        sheet.facts(
-            (
-                ("ended", self.result.get("stop_reason", "")),
-                ("digest", self.digest),
+        try:
+            native = bool(self.metadata(METADATA_NATIVE))
+            start, end = format_seconds(self.start_ns), format_seconds(self.end_ns)
+            sheet.facts(
                 (
-                    "simulated",
-                    f"{format_seconds(self.start_ns)} s to {format_seconds(self.end_ns)} s",
-                ),
-                ("events", self.event_count),
-                ("outputs", self.output_count),
+                    ("ended", self.result.get("stop_reason", "")),
+                    ("digest", "none, it is a native run" if native else self.digest),
+                    ("recorded" if native else "simulated", f"{start} s to {end} s"),
+                    ("events", self.event_count),
+                    ("outputs", self.output_count),
+                )
             )
-        )
-        nodes = [entity for entity in self.entities.values() if entity.kind is EntityKind.NODE]
-        sheet.table(("node", "class"), ((node.name, node.type) for node in nodes))
-        topics = [c for c in self.channels.values() if not c.topic.startswith(PREFIX_OWN)]
-        sheet.table(
-            ("topic", "type", "messages"),
-            ((one.topic, one.type, self.message_counts.get(one.id, 0)) for one in topics),
-        )
+            nodes = [entity for entity in self.entities.values() if entity.kind is EntityKind.NODE]
+            sheet.table(("node", "class"), ((node.name, node.type) for node in nodes))
+            topics = [c for c in self.channels.values() if not c.topic.startswith(PREFIX_OWN)]
+            sheet.table(
+                ("topic", "type", "messages"),
+                ((one.topic, one.type, self.message_counts.get(one.id, 0)) for one in topics),
+            )
+        except TraceError as error:  # it is closed, say
+            sheet.line(str(error))
         return sheet.html()
 
     def _decoder(self, channel: ChannelInfo) -> Decoder:

@@ -59,6 +59,12 @@ def test_a_trace_says_what_ran() -> None:
         assert text in page.texts
 
 
+def test_a_trace_that_was_closed_says_so() -> None:
+    trace = Trace.open(SAMPLES / "nondeterministic_callback" / "a.mcap")
+    trace.close()
+    assert "closed file" in shown(trace).texts[-1]
+
+
 def test_a_diff_says_where_and_why() -> None:
     folder = SAMPLES / "nondeterministic_callback"
     diff = rsltrace.diff(folder / "a.mcap", folder / "b.mcap")

@@ -13,7 +13,9 @@ NOTEBOOK = Path(__file__).parents[2] / "examples" / "notebooks" / "traces.ipynb"
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("default")  # Jupyter's own are not for us
-def test_the_notebook_runs_and_draws() -> None:
+def test_the_notebook_runs_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("JUPYTER_RUNTIME_DIR", "JUPYTER_CONFIG_DIR", "IPYTHONDIR", "MPLCONFIGDIR"):
+        monkeypatch.setenv(name, str(tmp_path / name))
     nbformat = pytest.importorskip("nbformat")
     client = pytest.importorskip("nbclient").NotebookClient
     pytest.importorskip("ipykernel")

@@ -125,4 +125,7 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "dist")
+    try:
+        main(Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "dist")
+    except Failed as error:
+        sys.exit(f"make dist: {error}")
