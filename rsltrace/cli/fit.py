@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 @click.option(
     "--as",
     "how",
-    type=click.Choice(("tables", "families")),
+    type=click.Choice(("tables", "families", "series")),
     default="tables",
     show_default=True,
-    help="Write tables of quantiles, or uniform, normal, lognormal and gamma distributions where "
-    "one is near enough.",
+    help="Write tables of quantiles; or uniform, normal, lognormal and gamma distributions where "
+    "one is near enough; or all times in the course of the run, in files.",
 )
 @click.option(
     "--plot",
@@ -109,7 +109,7 @@ def fit(
     with ExitStack() as stack:
         first = stack.enter_context(Trace.open(trace))
         wanted = None if second is None else _chains(stack.enter_context(Trace.open(second)))
-        found = fitted_to(measured(first), family=how == "families")
+        found = fitted_to(measured(first), how)
         path = _job_file(first, job_file)
         job = _load(path)
         said = list(notes(found, job))
@@ -166,7 +166,7 @@ def _load(path: Path) -> Job:
 
 def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, first: Trace) -> None:
     """Write the fitted job, and see that it can be read."""
-    from rsltrace.fit.parts import fitted_job
+    from rsltrace.fit.parts import fitted_job, with_files
 
     if output.exists() and job_file.exists() and output.samefile(job_file):
         raise OutputError(f"{output} is the job itself, which the fitted one extends: name another")
@@ -177,6 +177,14 @@ def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, firs
         "delay: from publishing to reception; execution: how long executors were busy with a "
         "callback.\nMeasured by rsltrace fit."
     )
+    found, files = with_files(found, f"{output.stem}.series")
+    if files:
+        try:
+            (output.parent / f"{output.stem}.series").mkdir(exist_ok=True)
+        except OSError as error:
+            raise OutputError(f"{error.filename} cannot be made: {error.strerror}") from error
+    for name, written in files.items():
+        write_text(output.parent / name, written)
     before = output.read_bytes() if output.is_file() else None
     write_text(output, fitted_job(found, job, base, head))
     try:

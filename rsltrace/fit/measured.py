@@ -48,17 +48,19 @@ _EXCHANGES = (int(EventKind.SERVICE), int(EventKind.CLIENT))
 class Link:
     """A link, or a service where ``is_service``: how long each message was on its way, in ns.
 
-    ``sender`` is the publisher's node, None where nobody knows who sent (another process that was
-    not observed). ``waits`` are the times from reception to callback, in the same order as
-    ``delays``; a wait before which the clock was set is missing from both. ``negative`` counts what
-    was received before it was sent, ``stepped`` what was on its way while the clock was set,
-    ``missing`` the numbers between those that came, None where that is unknown.
+    ``since`` has when each was sent, since the beginning. ``sender`` is the publisher's node, None
+    where nobody knows who sent (another process that was not observed). ``waits`` are the times
+    from reception to callback, in the same order as ``delays``; a wait before which the clock was
+    set is missing from both. ``negative`` counts what was received before it was sent, ``stepped``
+    what was on its way while the clock was set, ``missing`` the numbers between those that came,
+    None where that is unknown.
     """
 
     topic: str
     sender: str | None
     receiver: str
     is_service: bool
+    since: Durations
     delays: Durations
     waits: Durations
     negative: int
@@ -75,7 +77,8 @@ class Link:
 class Execution:
     """A callback: how long it kept its executor, each time, in ns, shape (runs,).
 
-    ``runs`` are the times of the callback itself; ``busy`` has what the executor needed before it
+    ``since`` has when its executor began with each, since the beginning. ``runs`` are the times of
+    the callback itself; ``busy`` has what the executor needed before it
     on top: from the moment when the input was there and the executor was free. ``parts`` counts
     those that were suspended, of which only the first part is known to the simulation, ``cut``
     those that went on for so long that the trace has them in parts. ``tail_ns`` is the median time
@@ -85,6 +88,7 @@ class Execution:
     node: str
     entity: str
     kind: str
+    since: Durations
     runs: Durations
     busy: Durations
     parts: int
@@ -161,12 +165,25 @@ class _Run:
         self.steady, self.wall = rows["steady"].astype(np.int64), rows["wall"].astype(np.int64)
         self.source, self.ready = rows["source"].astype(np.int64), rows["ready"].astype(np.int64)
         self.ends = self.steady + rows["duration"].astype(np.int64)
+        self.begin_ns = self._begin()
         self.senders = senders_of(self.trace, self.events)
         last = len(rows) - 1
         self.steps = [
             (int(self.wall[first]), int(self.wall[min(after, last)]))
             for first, after in clock_steps(self.wall - self.steady)
         ]
+
+    def _begin(self) -> int:
+        """Return when the run began as a simulated one does, with timers that are made then: a
+        period before the first of them was due (else when all nodes were there), steady."""
+        kinds = self.events["kind"]
+        for place in np.flatnonzero(kinds == int(EventKind.TIMER))[:1].tolist():
+            period = self.trace.entity(int(self.events["entity"][place])).detail.get("period_ns")
+            if isinstance(period, int) and self.ready[place]:
+                due = self.steady[place] + self.ready[place] - self.wall[place]
+                return int(due) - period
+        made = self.ends[kinds == int(EventKind.CONSTRUCT)]
+        return int(made.max()) if len(made) else int(self.steady[0])
 
     def measured(self) -> Measured:
         executor_of, executors = self._executors()
@@ -232,6 +249,7 @@ class _Run:
             sender,
             receiver,
             is_service,
+            (self.steady[places] + source - self.wall[places] - self.begin_ns)[good],
             delays[good],
             np.maximum(waits[good], 0),
             int(negative.sum()),
@@ -260,6 +278,7 @@ class _Run:
                 node,
                 name,
                 EventKind(int(kinds[places[0]])).name.lower(),
+                self.steady[places] - overhead[places] - self.begin_ns,
                 runs,
                 runs + overhead[places],
                 int((suspended & ~cut).sum()),

@@ -19,6 +19,7 @@ from rsltrace.chance.distribution import (
     Gamma,
     Lognormal,
     Normal,
+    Series,
     Uniform,
 )
 from rsltrace.chance.stream import Stream
@@ -49,7 +50,7 @@ class Model:
     ``values`` is the value of ``kind`` in a job, times in ns. ``distance`` is the largest
     difference between the shares of measured and of drawn values up to any time (Kolmogorov and
     Smirnov's D), times within 1 % of each other being the same. ``passed_over`` says which family
-    was nearest where none was near enough.
+    was nearest where none was near enough. ``points`` are those of a series: when, and how long.
     """
 
     kind: str
@@ -57,9 +58,12 @@ class Model:
     distribution: Distribution
     distance: float = 0.0
     passed_over: str = ""
+    points: tuple[tuple[int, int], ...] = ()
 
     def draws(self, count: int = _DRAWS) -> Durations:
-        """Return what a simulation would draw, in ns, shape (count,)."""
+        """Return what a simulation would draw, in ns, shape (count,); of a series what is in it."""
+        if self.points:
+            return np.array([value for _, value in self.points], dtype=np.int64)
         draw = self.distribution.sampler(Stream(0, "fit"), 0)
         return np.array([draw(0) for _ in range(count)], dtype=np.int64)
 
@@ -89,6 +93,19 @@ def model_of(durations: Durations, *, family: bool = False) -> Model:
     made = Model("empirical", values, table)
     distance = ks_distance(ordered, made.draws(), same=_NEAR)
     return Model("empirical", values, table, distance, passed_over)
+
+
+def series_of(since: Durations, durations: Durations) -> Model:
+    """Return durations as they were in the course of the run; ``since`` says when each began.
+
+    A constant where they are all the same, or where there is only one.
+    """
+    if durations.min() == durations.max():
+        return model_of(durations)
+    times, places = np.unique(np.maximum(since, 0), return_index=True)
+    values = np.minimum(durations[places], LONGEST_NS)
+    points = tuple(zip(times.tolist(), values.tolist(), strict=True))
+    return Model("series", {"file": "", "steps": True}, Series(points, steps=True), points=points)
 
 
 def table_of(ordered: Durations) -> tuple[tuple[float, ...], tuple[int, ...]]:
@@ -173,7 +190,7 @@ def _gamma(shape: float, scale: float) -> Model:
     return Model("gamma", {"shape": of, "scale": by}, Gamma(of, by))
 
 
-NOT_TIMES = frozenset(("percent", "sigma", "shape"))
+NOT_TIMES = frozenset(("percent", "sigma", "shape", "file", "steps"))
 
 
 def as_job_has_it(model: Model, time: Any) -> dict[str, Any]:
@@ -189,5 +206,5 @@ def as_job_has_it(model: Model, time: Any) -> dict[str, Any]:
     return {model.kind: values}
 
 
-def _plain(number: float) -> float:
-    return int(number) if number == int(number) else number
+def _plain(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value == int(value) else value

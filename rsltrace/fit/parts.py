@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from typing import Any
 
-from rsltrace.fit.measured import Execution, Link, Measured
-from rsltrace.fit.models import FEW, Model, as_job_has_it, model_of
+from rsltrace.fit.measured import Durations, Execution, Link, Measured
+from rsltrace.fit.models import FEW, Model, as_job_has_it, model_of, series_of
 from rsltrace.job import Job
-from rsltrace.model.stamp import format_duration
+from rsltrace.model.printable import printable
+from rsltrace.model.stamp import format_duration, format_seconds
 
 _UNITS = ((1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"))
+TABLES, FAMILIES, SERIES = HOW = ("tables", "families", "series")
 OWN_POLICY = "priority"
 """What native executors go by whose priorities are those of the job's own policy."""
 _TAIL_NS = 500_000
@@ -30,16 +32,41 @@ class Fit:
     measured: Measured
 
 
-def fit(measured: Measured, *, family: bool = False) -> Fit:
-    """Return models of all that was measured; see ``model_of``.
+def fit(measured: Measured, how: str = TABLES) -> Fit:
+    """Return models of all that was measured: ``tables`` or ``families`` (see ``model_of``), or
+    ``series`` (see ``series_of``).
 
-    :raises SetupError: with ``family``, if SciPy is missing.
+    :raises SetupError: of ``families``, if SciPy is missing.
     """
-    links = [
-        (link, model_of(link.delays, family=family)) for link in measured.links if len(link.delays)
-    ]
-    executions = [(one, model_of(one.busy, family=family)) for one in measured.executions]
+
+    def model(since: Durations, durations: Durations) -> Model:
+        if how == SERIES:
+            return series_of(since, durations)
+        return model_of(durations, family=how == FAMILIES)
+
+    links = [(one, model(one.since, one.delays)) for one in measured.links if len(one.delays)]
+    executions = [(one, model(one.since, one.busy)) for one in measured.executions]
     return Fit(tuple(links), tuple(executions), measured)
+
+
+def with_files(fit: Fit, folder: str) -> tuple[Fit, dict[str, str]]:
+    """Return a fit whose series are in files of a folder, and these: names and texts."""
+    texts: dict[str, str] = {}
+
+    def placed(model: Model, what: str) -> Model:
+        if not model.points:
+            return model
+        name = f"{folder}/{len(texts) + 1}.csv"
+        rows = (f"{format_seconds(at)},{format_seconds(took)}\n" for at, took in model.points)
+        texts[name] = f"s since the start,{printable(what).replace(',', ' ')} in s\n{''.join(rows)}"
+        return replace(model, values={**model.values, "file": name})
+
+    links = tuple((one, placed(model, f"delay of {one}")) for one, model in fit.links)
+    executions = tuple(
+        (one, placed(model, f"execution of {one.node}: {one.entity}"))
+        for one, model in fit.executions
+    )
+    return Fit(links, executions, fit.measured), texts
 
 
 def fitted_job(fit: Fit, job: Job, base: str, head: str) -> str:
@@ -146,6 +173,13 @@ def notes(fit: Fit, job: Job) -> Iterator[str]:
         )
     for one in found.executions:
         yield from _of_execution(one)
+    tied = [(one.tied, one) for one, model in fit.executions if not model.points]
+    for by, one in tied:
+        if len(one.busy) >= FEW and by > _TIED:
+            yield (
+                f"{one.node}: {one.kind} {one.entity}: its times hang together (correlation with "
+                f"the one before {by:.2f}), those of the simulation do not (--as series)"
+            )
     for node, entity in found.idle:
         yield f"{node}: the callback of {entity} never ran: it takes no time in the simulation"
     if found.tasks:
@@ -193,12 +227,6 @@ def _of_execution(one: Execution) -> Iterator[str]:
         yield (
             f"{name}: what it sends leaves {format_duration(one.tail_ns)} (median) before its end, "
             "in the simulation at its end"
-        )
-    tied = one.tied
-    if count >= FEW and tied > _TIED:
-        yield (
-            f"{name}: its times hang together (correlation with the one before {tied:.2f}), those "
-            "of the simulation do not"
         )
 
 

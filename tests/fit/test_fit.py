@@ -19,6 +19,7 @@ from rsltrace.cli.main import cli
 from rsltrace.fit.measured import Measured, measured
 from rsltrace.fit.models import ks_distance
 from rsltrace.job import load_job
+from rsltrace.latency.measure import measure_latencies
 from rsltrace.model.draw import Draw
 from rsltrace.model.event import OutputKind
 from rsltrace.run.plans.network import distribution_of
@@ -240,6 +241,26 @@ def test_the_simulation_of_the_fitted_job_has_the_latencies_of_the_run(
     assert whole["simulated_to_first"]["distance"] < 1.95 * np.sqrt(2 / 780)
     with Trace.open(tmp_path / "again.mcap") as trace:
         assert trace.complete
+
+
+@pytest.mark.long
+def test_a_series_goes_through_the_run_again(known: Known, tmp_path: Path) -> None:
+    """Bursts of load come when they came: not only quantiles, each latency is that of the run."""
+    shutil.copytree(known.folder, tmp_path, dirs_exist_ok=True)
+    native, output = str(tmp_path / "native.mcap"), tmp_path / "again.yaml"
+    done = known.fit(native, str(tmp_path / "job.yaml"), "-o", str(output), "--as", "series")
+    assert done.exit_code == 0, done.output
+    assert "series of 7" in done.stdout
+    record(load_job(output), tmp_path / "again.mcap")
+    with Trace.open(native) as first, Trace.open(tmp_path / "again.mcap") as again:
+        (one,), (other,) = (
+            measure_latencies(trace, start="/image", end="/tracks").chains
+            for trace in (first, again)
+        )
+        a, b = one.durations("latency"), other.durations("latency")
+    count = min(len(a), len(b))
+    assert count > 750
+    assert np.mean(np.abs(a[:count] - b[:count]) < 10_000) > 0.98
 
 
 def test_what_an_executor_needs_before_a_callback_is_part_of_its_time(

@@ -56,6 +56,8 @@ def _written(model: Model) -> tuple[str, str]:
     said = model.kind
     if model.kind == "empirical":
         said = f"table of {len(model.values['values'])}"
+    if model.points:
+        said = f"series of {len(model.points)}"
     if model.passed_over:
         said += f" (nearest: {model.passed_over})"
     return said, f"{model.distance:.3f}"
