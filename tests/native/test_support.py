@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-from rsltrace.job import Job
+import pickle
+from pathlib import Path
+
+import pytest
+
+from rsltrace.job import Job, load_job
 from rsltrace.native.support import ignored
 
 FOLLOWED = {
@@ -18,3 +23,14 @@ def test_every_key_of_a_job_is_followed_refused_or_named_as_without_effect() -> 
     named = ignored(Job.model_construct(everything, nodes=()))
     keys = {name for name in everything if name.removesuffix("_ns") in named}
     assert everything - keys == FOLLOWED | REFUSED
+
+
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*/job*.yaml"))
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_jobs_are_the_same_in_another_process(path: Path) -> None:
+    job = load_job(path)
+    other = pickle.loads(pickle.dumps(job))
+    assert other == job
+    assert other.resolved() == job.resolved()

@@ -69,6 +69,9 @@ class ExactFloat(float):
         self.text = text
         return self
 
+    def __getnewargs__(self) -> tuple[float, str]:  # type: ignore[override]
+        return float(self), self.text
+
 
 @dataclass(frozen=True)
 class Nanoseconds:

@@ -21,7 +21,7 @@ from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.error_text import exit_status
 from rsltrace.errors import JobError, RsltraceError
 from rsltrace.middleware.events.failure import text_of, user_traceback
-from rsltrace.native.apart.link import Link
+from rsltrace.native.apart.link import Link, LinkError
 from rsltrace.native.apart.mains import RunningMain
 from rsltrace.native.apart.observers import Observers, Sender
 from rsltrace.native.apart.order import Order
@@ -42,7 +42,12 @@ def main(number: int, run: int) -> None:
         os._exit(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # until there is something to interrupt
     link = Link(socket.socket(fileno=number))
-    frame = link.receive(trusted=True)
+    try:
+        frame = link.receive(trusted=True)
+    except LinkError as error:
+        said = f"the job cannot be read in a process of its own ({error}): write functions and "
+        link.send("error", "JobError", f"{said}classes in it as module:name")
+        os._exit(2)
     if frame is None:
         os._exit(1)
     order: Order = frame[0]
