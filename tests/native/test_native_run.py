@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from rsltrace.diff.traces.native import said_of_parameters
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.trace.contents import check_contents
@@ -198,6 +199,26 @@ def test_diff_tells_content_from_timing(tmp_path: Path, command: Any) -> None:
     assert values["native"]["first"]["topic"] == "/numbers"
     assert values["native"]["first"]["fields"][0]["path"] == "data"
     assert "next: rsltrace record" not in differs.stdout
+
+
+def test_nodes_that_are_made_at_once_say_the_same_of_their_parameters(
+    tmp_path: Path, command: Any
+) -> None:
+    """Their messages mix on /parameter_events, each with its time."""
+    rest = "parameters: {period: 0.1}}"
+    talkers = [f"{{node: robot:Talker, name: {name}, {rest}" for name in "ab"]
+    stop = "stop: {events: 1}\n"
+    traces = []
+    for number, nodes in enumerate(
+        (talkers, [*reversed(talkers)], [talkers[0].replace("0.1", "0.2"), talkers[1]])
+    ):
+        path = job(tmp_path, f"nodes: [{', '.join(nodes)}]\nstart: {number}s\n{stop}")
+        done = command("record", path, "-o", f"{number}.mcap", "-q")
+        assert done.returncode == 0, done.stderr
+        with Trace.open(Path(f"{number}.mcap")) as trace:
+            traces.append(said_of_parameters(trace))
+    assert traces[0] == traces[1]
+    assert traces[0] != traces[2]
 
 
 def test_a_node_that_raises_ends_the_run(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,6 +31,9 @@ from rsltrace.words.entities import EntityKey
 
 TIMES = ("stamp", "*.stamp")
 """Fields that are not compared: what they hold is real time, or was simulated."""
+
+_PARAMETERS = "/parameter_events"
+"""Nodes that are made at once mix there, with the times of it in their messages."""
 
 _CALLBACKS = tuple(
     int(kind)
@@ -56,7 +60,12 @@ def compare_native(a: Trace, b: Trace, options: DiffOptions) -> Diff:
     sides = (_Callbacks(a), _Callbacks(b))
     compared, moved, first = _order(*sides)
     tails = tuple(text for topic in content.topics if (text := _tail(topic)))
-    others = [topic for topic in content.topics if _says_something_else(topic)]
+    others = [
+        topic
+        for topic in content.topics
+        if _says_something_else(topic)
+        and not (topic.topic == _PARAMETERS and said_of_parameters(a) == said_of_parameters(b))
+    ]
     firsts = [topic.first for topic in others if topic.first is not None]
     native = tuple(name for name, trace in (("a", a), ("b", b)) if is_native(trace))
     found = NativeComparison(
@@ -94,6 +103,18 @@ def _verdict(a: Trace, b: Trace, found: NativeComparison) -> Verdict:
     if not (a.complete and b.complete):
         return Verdict.AS_FAR_AS_THEY_GO
     return Verdict.SAME_CONTENT
+
+
+def said_of_parameters(trace: Trace) -> Counter[str]:
+    """Return what nodes have said of their parameters, in any order."""
+    found: Counter[str] = Counter()
+    for _, _, data in trace.messages(_PARAMETERS):
+        message: Any = trace.decode(_PARAMETERS, data)
+        found[repr((message.node, *(getattr(message, name) for name in _KINDS)))] += 1
+    return found
+
+
+_KINDS = ("new_parameters", "changed_parameters", "deleted_parameters")
 
 
 def _says_something_else(topic: TopicDiff) -> bool:
