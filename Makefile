@@ -102,11 +102,11 @@ docs: $(INSTALLED)
 	$(BIN)/python docs/draw_architecture.py
 	$(BIN)/python docs/draw_concepts.py
 
-# The site: strict, so a link that leads nowhere or a page that nobody can reach is an error.
+# The site: strict (which --quiet would undo), so a link that leads nowhere or a page that nobody can reach is an error.
 # `make docs-serve` shows it at http://127.0.0.1:8000 while one writes.
 MKDOCS := NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs
 site: $(INSTALLED)
-	$(MKDOCS) build --quiet --strict
+	$(MKDOCS) build --strict
 
 docs-serve: $(INSTALLED)
 	$(MKDOCS) serve

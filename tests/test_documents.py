@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 import pytest
 
+import rsltrace
 from rsltrace.cli.main import cli
 
 ROOT = Path(__file__).parent.parent
@@ -139,6 +140,12 @@ def test_every_page_has_its_place_on_the_site() -> None:
     missing = sorted(pages - set(named))
     assert not missing, f"add these to nav: in mkdocs.yml, where a reader looks for them: {missing}"
     assert not set(named) - pages, "mkdocs.yml names pages that are not there"
+
+
+def test_the_page_on_the_python_api_has_every_public_name() -> None:
+    page = (ROOT / "docs" / "reference" / "python.md").read_text("utf-8")
+    shown = re.findall(r"^::: rsltrace\.(\w+)$", page, re.M)
+    assert sorted(shown) == sorted({*rsltrace.__all__} - {"__version__"})
 
 
 @pytest.mark.parametrize("name", ["cart.py", "job.yaml"])
