@@ -36,7 +36,7 @@ BOXES = (
     Box(646, 44, 444, 54, "cli", "the commands", SHARED),
     Box(180, 108, 145, 54, "campaign · explore", "many runs", RUNNING),
     Box(335, 108, 146, 54, "replay · debug · native", "checked again; observed", RUNNING),
-    Box(491, 108, 145, 54, "audit · checks", "may differ; must hold", RUNNING),
+    Box(491, 108, 145, 54, "audit · checks · timing", "may differ; must hold", RUNNING),
     Box(180, 172, 456, 54, "run", "puts the floors below together for one job", RUNNING),
     Box(180, 236, 456, 212, "doors", "who speaks for nodes, bags and test drivers", RUNNING),
     Box(192, 284, 432, 128, "rclpy", "", ROOM),

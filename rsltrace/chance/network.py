@@ -62,24 +62,32 @@ class NetworkPlan:
 
         Ends are (node, which of its endpoints of that topic, from 0).
         """
-        model = self._link_model(topic, sender[0], receiver[0])
+        model = self.topic_model(topic, sender[0], receiver[0])
+        outages = self._outages("topic", topic, (sender[0], receiver[0]))
+        name = f"topic\0{topic}\0{_end(sender)}\0{_end(receiver)}"
+        return self._channel(model, outages, name, reliable=reliable)
+
+    def topic_model(self, topic: str, sender: str, receiver: str) -> Model | None:
+        """Return the model of a link from node to node, None if it has none."""
+        model = self._link_model(topic, sender, receiver)
         if model is None:
             model = _by_name(self.topics, topic)
         if model is None:
             model = _by_name(self.table, topic)
         if model is None and topic not in QUIET_TOPICS:
             model = self.default
-        outages = self._outages("topic", topic, (sender[0], receiver[0]))
-        name = f"topic\0{topic}\0{_end(sender)}\0{_end(receiver)}"
-        return self._channel(model, outages, name, reliable=reliable)
+        return model
+
+    def service_model(self, service: str) -> Model | None:
+        """Return the model of a service's requests and responses, None if they have none."""
+        model = _by_name(self.services, service)
+        return self.default if model is None else model
 
     def service_channel(
         self, service: str, client: tuple[str, int], server: tuple[str, int], direction: str
     ) -> Channel | None:
         """Return the channel of requests or responses (``direction``) of a client to a server."""
-        model = _by_name(self.services, service)
-        if model is None:
-            model = self.default
+        model = self.service_model(service)
         if model is not None and model.duplicate > 0.0:
             model = replace(model, duplicate=0.0)  # a request is answered once
         outages = self._outages("service", service, (client[0], server[0]))

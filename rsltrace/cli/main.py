@@ -34,6 +34,7 @@ _COMMANDS = {
     "cat": "Print the events of a trace, one per line.",
     "latency": "Show how long data takes through chains of nodes.",
     "fit": "Give a job the delays and execution times of a native run.",
+    "analyze": "Bound the response times of a job's chains, and compare with runs.",
     "view": "Look at a trace in the terminal, or at two side by side.",
     "rerun": "Show a trace, or two side by side, in Rerun.",
     "export": "Write the messages of a trace as a plain rosbag2 bag.",

@@ -44,7 +44,7 @@ _DUPLICATES = "KMP_DUPLICATE_LIB_OK"
 _ADDR_NO_RANDOMIZE = 0x0040000
 _ASK = 0xFFFFFFFF
 _UNPINNED = "off"
-_RUNS_NODES = frozenset(("record", "replay", "debug"))
+_RUNS_NODES = frozenset(("record", "replay", "debug", "analyze"))
 _NOTHING_TO_PIN = frozenset(("--no-pin", "--help", "-h"))
 
 _before = ""

@@ -88,9 +88,10 @@ class Priority:
         self._default = default
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
-        return max(range(len(ready)), key=lambda i: (self._priority(ready[i]), -i))
+        return max(range(len(ready)), key=lambda i: (self.priority(ready[i]), -i))
 
-    def _priority(self, candidate: Candidate) -> int:
+    def priority(self, candidate: Candidate) -> int:
+        """Return the priority of something that may run."""
         for rule in self._rules:
             if rule.fits(candidate):
                 return rule.priority

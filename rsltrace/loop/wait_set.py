@@ -31,20 +31,21 @@ class WaitSet:
         mine = [index for index, one in enumerate(ready) if one.executor == executor]
         at_once = [index for index in mine if self._needs_no_polling(ready[index])]
         if at_once:
-            return min(at_once, key=lambda index: self._order(ready[index]))
+            return min(at_once, key=lambda index: self.place(ready[index]))
         found = self._found.get(executor, set())
         left = [index for index in mine if _key(ready[index]) in found]
         if not left:  # a polling point
             left = mine
             found = self._found[executor] = {_key(ready[index]) for index in mine}
-        chosen = min(left, key=lambda index: self._order(ready[index]))
+        chosen = min(left, key=lambda index: self.place(ready[index]))
         found.discard(_key(ready[chosen]))
         return chosen
 
     def _needs_no_polling(self, candidate: Candidate) -> bool:
         return candidate.kind == "timer"
 
-    def _order(self, candidate: Candidate) -> tuple[int, ...]:
+    def place(self, candidate: Candidate) -> tuple[int, ...]:
+        """Return what those that a polling point has found are sorted by."""
         return _rank(_RCLCPP, candidate.kind, last=True), candidate.entity_id
 
 
@@ -55,7 +56,7 @@ class RclpyWaitSet(WaitSet):
     def _needs_no_polling(self, candidate: Candidate) -> bool:
         return False
 
-    def _order(self, candidate: Candidate) -> tuple[int, ...]:
+    def place(self, candidate: Candidate) -> tuple[int, ...]:
         rank = _rank(_RCLPY, candidate.kind, last=False)
         node = getattr(getattr(candidate.item, "node", None), "entity_id", 0)
         return min(rank, 0), node, rank, candidate.entity_id

@@ -91,6 +91,8 @@ class Priorities:
         self.refused = real_time_class()
         self.levels: dict[str, int] = {}
         """The real-time priorities of the executors, by the name of their thread."""
+        self.at_end: list[Callable[[], None]] = []
+        """What is called when the run is over."""
 
     @contextmanager
     def watched(self, extension: Any) -> Iterator[None]:
@@ -99,6 +101,8 @@ class Priorities:
             for owner, method in _SENDS:
                 stack.enter_context(patched(getattr(extension, owner), method, self._sends))
             yield
+        for forget in self.at_end:
+            forget()
 
     def _sends(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)

@@ -29,6 +29,7 @@ class PriorityExecutor(SingleThreadedExecutor):  # type: ignore[misc]
         self._priorities = priorities
         self._waiting: list[tuple[Any, Any, Any]] = []
         self._looking: Iterator[tuple[Any, Any, Any]] | None = None
+        priorities.at_end.append(self._forget)
 
     def add_node(self, node: Any) -> bool:
         """Add a node; its timers say what the thread's priority is to begin with."""
@@ -72,6 +73,14 @@ class PriorityExecutor(SingleThreadedExecutor):  # type: ignore[misc]
             with self._tasks_lock:  # what only waits is none of rclpy's tasks yet
                 self._tasks = [one for one in self._tasks if one[0] is not task]
             self._waiting.append((task, entity, node))
+
+    def _forget(self) -> None:
+        """Let go of what was ready at the end; Python warns of coroutines that never ran."""
+        for task, _, _ in self._waiting:
+            close = getattr(task._handler, "close", None)
+            if close is not None:
+                close()
+        self._waiting = []
 
     def _run(self, task: Any) -> None:
         task()

@@ -57,6 +57,7 @@ def test_the_most_urgent_of_what_is_ready_runs_first(tmp_path: Path) -> None:
     order, said = recorded_order(tmp_path, "--policy", "rate_monotonic")
     assert order == ["fast", "middle", "slow"]
     assert "'policy': 'rate_monotonic'" in said
+    assert "Warning" not in said
     order, said = recorded_order(tmp_path, "--policy", "priority")
     assert order == ["middle", "slow", "fast"]
     assert "without effect" not in said

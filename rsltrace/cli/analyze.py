@@ -1,0 +1,216 @@
+"""``rsltrace analyze``: bounds of response times, beside the worst that runs have shown."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from rsltrace.errors import TraceError
+from rsltrace.job.values.times import parse_time
+from rsltrace.model.printable import printable
+from rsltrace.terminal import say, tell
+
+if TYPE_CHECKING:
+    from rsltrace.job import Job
+    from rsltrace.timing.analysis import Analysis
+    from rsltrace.timing.curves import Supply
+    from rsltrace.timing.observed import Observed
+
+
+@click.command()
+@click.argument("job", type=click.Path(path_type=Path))
+@click.argument("traces", nargs=-1, type=click.Path(path_type=Path))
+@click.option(
+    "--times",
+    type=click.Choice(("job", "max", "p99")),
+    help="How long callbacks take: as the job's execution: says (default where it does), or as "
+    "measured in the TRACES, the longest or the 99 % quantile.",
+)
+@click.option(
+    "--deadline",
+    "deadlines",
+    multiple=True,
+    metavar="[END=]TIME",
+    help="Deadline of all chains, or of those that end in a topic, service or node: "
+    "/cmd_vel=50ms. Default: the period of each. Can be given several times.",
+)
+@click.option(
+    "--reservation",
+    metavar="BUDGET/PERIOD",
+    help="Each executor has a reservation, 2ms/5ms, not a processor of its own.",
+)
+@click.option(
+    "--one-processor",
+    is_flag=True,
+    help="All executors share one processor: those with faster timers interrupt the others.",
+)
+@click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set any key of the job: policy=rate_monotonic.",
+)
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Draw bounds and observations: .png, .svg or .pdf (needs matplotlib).",
+)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("text", "json")),
+    default="text",
+    show_default=True,
+    help="What to print: a table, or JSON (times in nanoseconds).",
+)
+def analyze(
+    job: Path,
+    traces: tuple[Path, ...],
+    times: str | None,
+    deadlines: tuple[str, ...],
+    reservation: str | None,
+    one_processor: bool,
+    overrides: tuple[str, ...],
+    plot: Path | None,
+    form: str,
+) -> None:
+    """Print how long the chains of JOB take at most, in any run: from the release of a timer (or a
+    message from outside) to the end of the last callback; beside that the worst that a simulated
+    run has shown, and each of the native TRACES.
+
+    The job is simulated to see who sends what to whom, unless one of the TRACES is a simulated
+    one. Which analysis holds depends on the job's policy (see docs/real-time.md). The exit status
+    is 0 if every chain meets its deadline, 1 if one does not, or may not.
+
+    \b
+      rsltrace analyze job.yaml
+      rsltrace analyze job.yaml native.mcap --times max --plot bounds.png
+    """
+    from rsltrace.job import load_job
+    from rsltrace.run.launch_files import without_launch_files
+    from rsltrace.timing import analysis as timing
+    from rsltrace.timing.model import Wanted, check_job
+
+    supply = _supply(reservation)
+    by_end = dict(_deadline(text) for text in deadlines)
+    if plot is not None:
+        from rsltrace.cli.output.analysis_plot import check_plot
+
+        check_plot(plot)
+    loaded = without_launch_files(load_job(job, overrides=list(overrides))).job
+    check_job(loaded)
+    with ExitStack() as stack:
+        simulated, native = _opened(traces, stack)
+        measured = times if times is not None else "job" if loaded.execution else "max"
+        given = None
+        if measured != "job":
+            sources = native or simulated
+            if not sources:
+                raise click.UsageError(
+                    "nothing says how long callbacks take: give native traces of the job "
+                    "(rsltrace record --native), or execution: in it"
+                )
+            given = timing.measured_times(sources, measured)
+            loaded = timing.with_times(loaded, given)
+        elif not loaded.execution:
+            raise click.UsageError(f"{job} has no execution:, which --times job would take")
+        shown = simulated[0] if simulated else _simulated(loaded, stack)
+        found = timing.analyze(
+            loaded,
+            shown,
+            native,
+            times=given,
+            deadlines=by_end,
+            wanted=Wanted(supply, one_processor),
+        )
+    if form == "json":
+        from rsltrace.cli.output.analysis_text import as_json
+
+        say(json.dumps(as_json(found, measured), indent=2))
+    else:
+        _print(found, measured, [one.trace.name for one in native])
+    if plot is not None:
+        from rsltrace.cli.output.analysis_plot import draw
+
+        draw(found, plot)
+        tell(f"wrote {plot}")
+    sys.exit(0 if found.all_meet else 1)
+
+
+def _supply(reservation: str | None) -> Supply:
+    from rsltrace.timing.curves import PROCESSOR, Supply
+
+    if reservation is None:
+        return PROCESSOR
+    try:
+        budget, period = (parse_time(word) for word in reservation.split("/"))
+        if not 0 < budget <= period:
+            raise ValueError
+    except ValueError:
+        raise click.BadParameter(
+            f"{reservation!r} is no reservation: give budget and period, as in 2ms/5ms",
+            param_hint="--reservation",
+        ) from None
+    return Supply(budget, period)
+
+
+def _deadline(text: str) -> tuple[str, int]:
+    end, _, time = text.rpartition("=")
+    try:
+        return end, parse_time(time)
+    except ValueError as error:
+        raise click.BadParameter(str(error), param_hint="--deadline") from None
+
+
+def _opened(traces: Sequence[Path], stack: ExitStack) -> tuple[list[Observed], list[Observed]]:
+    """Return what the simulated and the native ones of some traces show.
+
+    :raises TraceError: there are several simulated ones, or one is damaged.
+    """
+    from rsltrace.timing.observed import Observed
+    from rsltrace.trace.native import is_native
+    from rsltrace.trace.reader import Trace
+
+    simulated: list[Observed] = []
+    native: list[Observed] = []
+    for path in traces:
+        trace = stack.enter_context(Trace.open(path))
+        (native if is_native(trace) else simulated).append(Observed(trace))
+    if len(simulated) > 1:
+        raise TraceError(
+            f"{simulated[1].trace.name} is of a simulated run, as {simulated[0].trace.name} is: "
+            "give one at most, and any number of native ones"
+        )
+    return simulated, native
+
+
+def _simulated(job: Job, stack: ExitStack) -> Observed:
+    """Run a job, and return what that shows.
+
+    :raises RunError: the run fails.
+    """
+    from rsltrace.run import record
+    from rsltrace.timing.observed import Observed
+    from rsltrace.trace.reader import Trace
+
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rsltrace-"))
+    path = Path(folder) / "run.mcap"
+    record(job, path)
+    return Observed(stack.enter_context(Trace.open(path)))
+
+
+def _print(found: Analysis, times: str, native: Sequence[str]) -> None:
+    from rsltrace.cli.output.analysis_text import text
+
+    say("\n".join(map(printable, text(found, times, native))))
+    for note in found.notes:
+        tell(printable(f"rsltrace: note: {note}"))

@@ -1,0 +1,93 @@
+"""What ``rsltrace analyze`` prints: chains with bounds and the worst that was seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
+
+from rsltrace.model.stamp import format_duration
+from rsltrace.timing.analysis import Analysis, ChainResult, Seen
+from rsltrace.words.table import table
+
+_TIMES = {
+    "job": "as the job says, at most",
+    "max": "the longest measured",
+    "p99": "99 % quantile of those measured: bounds hold as often as that",
+}
+
+
+def text(found: Analysis, times: str, native: Sequence[str]) -> list[str]:
+    """Return a table of chains, of executors, and how many chains meet their deadlines."""
+    columns = ["native" if len(native) == 1 else f"native {n + 1}" for n in range(len(native))]
+    rows = [("chain", "period", "bound", "simulated", *columns, "deadline", "", "by")]
+    for one in found.chains:
+        rows.append(
+            (
+                one.name,
+                _time(one.period_ns),
+                "none" if one.bound_ns is None else _time(one.bound_ns),
+                _seen(one.simulated),
+                *map(_seen, one.native),
+                _time(one.deadline_ns),
+                one.verdict,
+                one.method,
+            )
+        )
+    right = frozenset(range(1, len(columns) + 5))
+    lines = [f"execution times: {_TIMES[times]}", "", *table(rows, right=right), ""]
+    loads = ", ".join(f"{name} {part:.1%}" for name, part in found.load.items())
+    lines.append(f"executors busy at most: {loads}")
+    late = [one for one in found.chains if one.verdict in ("misses", "may miss")]
+    if late:
+        lines += [_why(one) for one in late]
+    else:
+        lines.append("every chain meets its deadline")
+    return lines
+
+
+def _why(one: ChainResult) -> str:
+    deadline = format_duration(one.deadline_ns or 0)
+    if one.verdict == "misses":
+        seen = format_duration(one.seen_ns or 0)
+        return f"{one.name} misses its deadline of {deadline}: it took {seen}"
+    if one.bound_ns is None:
+        return f"{one.name} may miss its deadline of {deadline}: there is no bound"
+    bound = format_duration(one.bound_ns)
+    return f"{one.name} may miss its deadline of {deadline}: it takes up to {bound}"
+
+
+def as_json(found: Analysis, times: str) -> dict[str, Any]:
+    """Return the same for programs; times in nanoseconds."""
+    return {
+        "times": times,
+        "meets": found.all_meet,
+        "chains": [
+            {
+                "name": one.name,
+                "callbacks": [callback._asdict() for callback in one.chain],
+                "period_ns": one.period_ns,
+                "deadline_ns": one.deadline_ns,
+                "bound_ns": one.bound_ns,
+                "analysis": one.method,
+                "simulated": None if one.simulated is None else asdict(one.simulated),
+                "native": [None if seen is None else asdict(seen) for seen in one.native],
+                "verdict": one.verdict,
+            }
+            for one in found.chains
+        ],
+        "executors": dict(found.load),
+        "execution_ns": [
+            {**callback._asdict(), "longest_ns": longest_ns}
+            for callback, longest_ns in found.times.items()
+        ],
+        "notes": list(found.notes),
+    }
+
+
+def _time(time_ns: int | None) -> str:
+    return "-" if time_ns is None else format_duration(time_ns)
+
+
+def _seen(seen: Seen | None) -> str:
+    return "-" if seen is None else format_duration(seen.worst_ns)
