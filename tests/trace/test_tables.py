@@ -238,6 +238,16 @@ def test_times_and_kinds_of_another_world_are_refused(tmp_path: Path) -> None:
             trace.tables.events().to_arrow()
 
 
+def test_a_schema_that_is_none_is_told_with_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "odd.mcap"
+    with Opened(path) as feeder:
+        feeder.writer.add_channel("/odd", "x/msg/Odd", "no schema at all;")
+        feeder.event(EventKind.TIMER, 0, 1)
+        feeder.writer.close(result={})
+    with Trace.open(path) as trace, pytest.raises(TraceError, match=r"odd\.mcap: messages on /odd"):
+        trace.tables.messages("/odd")
+
+
 def test_a_schema_that_unfolds_without_end_is_refused(tmp_path: Path) -> None:
     levels = 30
     parts = [f"x/A{n + 1} one\nx/A{n + 1} two\n" for n in range(levels)] + ["uint8 end\n"]

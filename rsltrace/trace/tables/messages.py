@@ -45,7 +45,10 @@ def message_table(
 ) -> Table:
     """Return the messages of a topic as a table. Raises TraceError for what is not there."""
     channel = _channel(trace, topic, type_name)
-    decoder = decoder_of(channel)
+    try:
+        decoder = decoder_of(channel)
+    except TraceError as error:
+        raise TraceError(f"{trace.name}: {error}") from error
     chosen = _chosen(trace, decoder, topic, fields)
 
     def make(arrow: Any) -> tuple[Any, Iterator[Any]]:
