@@ -15,7 +15,7 @@ import ctypes
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
-from types import BuiltinFunctionType, MethodType
+from types import BuiltinFunctionType, FunctionType, MethodType
 from typing import Any
 
 from rsltrace.errors import SetupError
@@ -23,7 +23,9 @@ from rsltrace.errors import SetupError
 _FASTCALL_KEYWORDS = 0x82
 _NO_ARGUMENTS = 0x4
 _api = ctypes.pythonapi
-_CALL = ctypes.cast(_api.PyObject_Vectorcall, ctypes.c_void_p).value
+_EXPORTED = hasattr(_api, "PyObject_Vectorcall")  # not by Python 3.10
+_VECTORCALL_OF = _api.PyObject_Vectorcall if _EXPORTED else _api._PyFunction_Vectorcall
+_CALL = ctypes.cast(_VECTORCALL_OF, ctypes.c_void_p).value
 _new_function = ctypes.PYFUNCTYPE(
     ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p
 )(("PyCFunction_NewEx", _api))
@@ -79,7 +81,7 @@ class Redirected:
 
     def __init__(self, function: BuiltinFunctionType, target: Callable[..., Any]) -> None:
         self._function = function
-        self._target = target
+        self._target = target = _callable(target)
         self.real = copy_of(function)
         place = _Function.from_address(id(function))
         self._saved = (place.definition, place.owner, place.vectorcall)
@@ -95,6 +97,17 @@ class Redirected:
         place = _Function.from_address(id(self._function))
         place.definition, place.owner, place.vectorcall = self._saved
         _count_down(id(self._target))
+
+
+def _callable(target: Callable[..., Any]) -> Callable[..., Any]:
+    """Return what can be called through ``_CALL``: on Python 3.10 only functions can."""
+    if _EXPORTED or isinstance(target, FunctionType):
+        return target
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        return target(*arguments, **options)
+
+    return call
 
 
 class RedirectedMethod:

@@ -82,7 +82,7 @@ def test_tbb_that_was_in_use_before_is_reported(library: Path) -> None:
     (told,) = _findings(library.parent, _node(library, "pass"))
     assert told.startswith("the threads of TBB in computes.so: it was in use before the run and")
     assert f"as for {count} threads; 'taskset --cpu-list 0'" in told
-    assert "m.py:10 in N.__init__" in told
+    assert "m.py:10 in " in told
 
 
 def _module_with_traces_of_tbb(folder: Path, name: str) -> None:
@@ -112,4 +112,4 @@ def test_a_hidden_tbb_is_reported_unless_allowed(tmp_path: Path, mode: str) -> N
         assert not told
     else:
         assert "its functions are hidden, so its threads stay many" in told[0]
-        assert "m.py:11 in N.__init__" in told[0]
+        assert "m.py:11 in " in told[0]
