@@ -63,10 +63,15 @@ def pin() -> None:
     _before = os.environ.pop(_MARK, _before)  # programs that a node starts are none of ours
     if _before or not sys.orig_argv[1:]:
         return
-    changes = {**PINNED, **_libraries()}
+    changes = pinned_variables()
     before = {name: os.environ.get(name) for name in changes}
     fixed = fix_addresses(True)
     _start_again({**changes, _MARK: json.dumps({**before, "addresses": fixed})})
+
+
+def pinned_variables() -> dict[str, str]:
+    """Return the environment variables of a pinned process, and of those that a run starts."""
+    return {**PINNED, **_libraries()}
 
 
 def _libraries() -> dict[str, str]:

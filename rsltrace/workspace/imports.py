@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any
 from rsltrace.guard.guard import engage
 
 if TYPE_CHECKING:
+    from importlib.metadata import Distribution, DistributionFinder
+
     from rsltrace.source_packages import SourcePackage
 
 _KINDS = ("msg", "srv", "action")
@@ -147,6 +149,17 @@ class _Packages:
             return found
         folder = self._workspace.interfaces(name)
         return None if folder is None else _spec(name, folder / "__init__.py")
+
+    def find_distributions(
+        self, context: DistributionFinder.Context | None = None
+    ) -> Iterator[Distribution]:
+        """Give what ``importlib.metadata`` is to know of the packages: what is installed comes
+        before it."""
+        from importlib.metadata import DistributionFinder
+
+        from rsltrace.workspace.distributions import distributions
+
+        return distributions(self._workspace.packages, context or DistributionFinder.Context())
 
 
 def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:

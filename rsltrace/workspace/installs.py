@@ -1,24 +1,17 @@
 """What the build files of a package would install: files and folders, modules, executables.
 
-``setup.py`` is asked without setuptools, in a process of its own; ``setup.cfg``, ``pyproject.toml``
-and the plain words of ``CMakeLists.txt`` are read.
+Of ``CMakeLists.txt`` the plain words are read.
 """
 
 from __future__ import annotations
 
-import configparser
-import importlib
-import json
 import os
 import re
-import subprocess
-import sys
-from collections.abc import Iterable, Iterator, Mapping
-from functools import cache
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 from rsltrace.source_packages import SourcePackage, source_packages
+from rsltrace.workspace.build_files import entry_points, setup_cfg, setup_py, text_mapping
 
 _COMMENT = re.compile(r"#[^\n]*")
 _INSTALL = re.compile(r"\binstall\s*\(\s*(DIRECTORY|FILES|PROGRAMS)\b([^)]*)\)", re.IGNORECASE)
@@ -35,33 +28,11 @@ _END = re.compile(
     re.DOTALL,
 )
 _NO_MODULES = frozenset("test tests launch setup conftest scripts doc docs config resource".split())
-_ASK = """
-import json, sys, types
-sys.stdout = sys.stderr
-said = {}
-class Setuptools(types.ModuleType):
-    def __getattr__(self, name):
-        if name.startswith("__"):
-            raise AttributeError(name)
-        return lambda *words, **named: []
-for name in ("setuptools", "distutils", "distutils.core", "setuptools.command"):
-    sys.modules[name] = Setuptools(name)
-    sys.modules[name].setup = lambda *words, **named: said.update(named)
-code = compile(open("setup.py", "rb").read(), "setup.py", "exec")
-sys.path.insert(0, "")
-sys.argv[:] = ["setup.py"]
-exec(code, {"__name__": "__main__", "__file__": "setup.py"})
-wanted = ("data_files", "entry_points", "scripts", "packages", "package_dir", "py_modules")
-sys.stdout.flush()
-json.dump({name: said[name] for name in wanted if said.get(name)}, sys.__stdout__, default=str)
-"""
-"""Finds out what a ``setup.py`` tells setuptools, without setuptools."""
-_ASK_SECONDS = 60
 
 
 def installed_files(package: SourcePackage) -> Iterator[tuple[str, Path]]:
     """Give where each file or folder would be installed below the prefix, and where it is now."""
-    setup = _setup(package.folder)
+    setup = setup_py(package.folder)
     for folder, files in setup.get("data_files", ()):
         for file in files:
             yield f"{folder}/{os.path.basename(file)}", package.folder / file
@@ -98,8 +69,8 @@ def compiled_executables(package: SourcePackage) -> set[str]:
 
 def modules(package: SourcePackage) -> dict[str, Path]:
     """Return the modules that a package would install, by name: files, or folders with modules."""
-    setup = _setup(package.folder)
-    given = _text_mapping(setup.get("package_dir"))
+    setup = setup_py(package.folder)
+    given = text_mapping(setup.get("package_dir"))
     root = package.folder / (given.get("") or _source_root(package.folder))
     found: dict[str, Path] = {}
     for name in setup.get("py_modules", ()):
@@ -129,7 +100,7 @@ def module_folders(folders: Iterable[Path], *, ask: bool = True) -> list[Path]:
 
 def _source_root(folder: Path) -> str:
     """Return the folder of the modules as ``setup.cfg`` has it, or as people have it."""
-    options = _setup_cfg(folder)
+    options = setup_cfg(folder)
     given = options.get("options", "package_dir", fallback="").strip()
     if given.startswith("="):
         return given[1:].strip()
@@ -137,72 +108,8 @@ def _source_root(folder: Path) -> str:
 
 
 def _console_scripts(folder: Path) -> dict[str, str]:
-    given = _setup(folder).get("entry_points", {})
-    if isinstance(given, str):
-        parser = configparser.ConfigParser(delimiters=("=",), interpolation=None)
-        try:
-            parser.read_string(given)
-        except configparser.Error:
-            return {}
-        given = {name: [f"{k}={v}" for k, v in parser[name].items()] for name in parser.sections()}
-    lines = list(given.get("console_scripts", ())) if isinstance(given, Mapping) else []
-    listed = _setup_cfg(folder).get("options.entry_points", "console_scripts", fallback="")
-    found = {}
-    for line in (*lines, *listed.splitlines()):
-        name, equals, target = str(line).partition("=")
-        if equals:
-            found[name.strip()] = target.partition("[")[0].strip()
-    return {**found, **_pyproject_scripts(folder)}
-
-
-@cache
-def _setup(folder: Path) -> dict[str, Any]:
-    """Return what a ``setup.py`` gives setuptools; nothing if it cannot be run without it."""
-    if not (folder / "setup.py").is_file():
-        return {}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", _ASK],
-            cwd=folder,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_ASK_SECONDS,
-            check=False,
-        )
-        said = json.loads(done.stdout or "{}")
-    except (OSError, ValueError, subprocess.TimeoutExpired):
-        return {}  # what lies in its folder is there all the same
-    return said if isinstance(said, dict) else {}
-
-
-def _setup_cfg(folder: Path) -> configparser.ConfigParser:
-    parser = configparser.ConfigParser(delimiters=("=",), interpolation=None, strict=False)
-    try:
-        parser.read(folder / "setup.cfg", encoding="utf-8")
-    except (configparser.Error, UnicodeDecodeError):
-        return configparser.ConfigParser()
-    return parser
-
-
-def _pyproject_scripts(folder: Path) -> dict[str, str]:
-    """Return the scripts of ``pyproject.toml``: the standard's, or those of an older Poetry."""
-    toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
-    try:
-        table = toml.loads((folder / "pyproject.toml").read_text("utf-8"))
-    except (OSError, ValueError):
-        return {}
-    found: dict[str, str] = {}
-    for above in (("tool", "poetry", "scripts"), ("project", "scripts")):
-        scripts: object = table
-        for name in above:
-            scripts = scripts.get(name) if isinstance(scripts, dict) else None
-        found.update(_text_mapping(scripts))
-    return found
-
-
-def _text_mapping(value: object) -> dict[str, str]:
-    return {str(k): str(v) for k, v in value.items()} if isinstance(value, Mapping) else {}
+    found = entry_points(folder).get("console_scripts", {})
+    return {name: target.partition("[")[0].strip() for name, target in found.items()}
 
 
 def _cmake(package: SourcePackage) -> str:

@@ -98,14 +98,19 @@ rclpy.init()
 node = rclpy.create_node('sees')
 mine = [os.open('/dev/null', os.O_RDONLY) for _ in range(3)]
 given = os.stat('/proc/self/environ').st_size or len(open('/proc/self/environ', 'rb').read())
-node.get_logger().info(f'{mine} {given}')
+node.get_logger().info(f'{mine} {given} {hash("seen")} {os.environ["OMP_NUM_THREADS"]}')
 rclpy.spin(node)
 """
 
 
 @pytest.mark.ros
 @pytest.mark.long
-def test_what_rsltrace_has_open_changes_nothing(compiled: object, tmp_path: Path) -> None:
+def test_what_rsltrace_has_open_changes_nothing_nor_that_it_is_not_pinned(
+    compiled: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Hash seed and threads of libraries are those of the command, in a run from Python, too."""
+    monkeypatch.delenv("PYTHONHASHSEED", raising=False)
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     (tmp_path / "node.py").write_text(SEES)
     (tmp_path / "job.yaml").write_text(JOB)
     digests = []

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from collections.abc import Callable, Iterator
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from rsltrace.run import run
 from rsltrace.source_packages import SourcePackage, source_packages
 from rsltrace.trace.reader import Trace
 from rsltrace.workspace import cache
+from rsltrace.workspace.build_files import entry_points, name_and_version
 from rsltrace.workspace.imports import unbuilt_packages
 from rsltrace.workspace.interfaces import interface_prefix
 from rsltrace.workspace.share import share_prefix
@@ -28,6 +29,7 @@ pytest.importorskip("rosidl_adapter", reason="needs ROS's rosidl")
 
 _NODE = """
 import os
+from importlib.metadata import entry_points, version
 from ament_index_python.packages import get_package_share_directory, get_packages_with_prefixes
 from arm.msg import Joint
 from arm_interfaces.action import Move
@@ -49,6 +51,9 @@ class Arm(Node):
             self.get_logger().info("limits " + file.read().strip())
         assert os.path.isdir(get_package_share_directory("std_msgs"))
         assert "arm_interfaces" in get_packages_with_prefixes()
+        (tool,) = entry_points(group="arm.tools")
+        assert tool.load() is Arm
+        self.get_logger().info(f"{tool.name} of {version('arm')}, {version('arm_interfaces')}")
         self.create_timer(1.0, self.start)
 
     def start(self):
@@ -80,14 +85,18 @@ class Arm(Node):
 _SETUP = """
 from glob import glob
 from setuptools import find_packages, setup
-setup(name="arm", packages=find_packages(), data_files=[
+setup(name="arm", version="1.2.3", entry_points={
+    "console_scripts": ["arm = arm.node:main"], "arm.tools": ["gripper = arm.node:Arm"],
+}, packages=find_packages(), data_files=[
     ("share/ament_index/resource_index/packages", ["resource/arm"]),
     ("share/arm", glob("config/*.yaml")),
 ])
 """
 
 _FILES = {
-    "src/arm_interfaces/package.xml": "<package><name>arm_interfaces</name></package>",
+    "src/arm_interfaces/package.xml": (
+        "<package><name>arm_interfaces</name><version>0.4.0</version></package>"
+    ),
     "src/arm_interfaces/srv/Grip.srv": "float32 force\n---\narm/Joint joint\n",
     "src/arm_interfaces/action/Move.action": "int8 to\n---\n---\nint8 at\n",
     "src/arm/package.xml": "<package><name>arm</name></package>",
@@ -138,7 +147,13 @@ def test_interfaces_of_source_folders_are_used_as_if_built(
     folder, (first, _) = runs
     assert first.error is None, first.error
     shown = command("cat", folder / "a.mcap", "--json").stdout
-    for text in ("limits 1 to 2", "left 7 [1.0, 2.0]", "place 2", "at 3"):
+    for text in (
+        "limits 1 to 2",
+        "gripper of 1.2.3, 0.4.0",
+        "left 7 [1.0, 2.0]",
+        "place 2",
+        "at 3",
+    ):
         assert text in shown
     with Trace.open(folder / "a.mcap") as trace:
         schemas = {channel.topic: channel.schema_text for channel in trace.channels.values()}
@@ -262,3 +277,45 @@ def test_modules_that_are_blocked_stop_nothing(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setitem(sys.modules, "somebody_blocks_this", None)  # its import is an ImportError
     with unbuilt_packages([]) as workspace:
         assert not workspace.made
+
+
+def test_entry_points_are_read_from_all_that_says_them(tmp_path: Path) -> None:
+    _write(
+        tmp_path,
+        {
+            "setup.py": """from setuptools import setup
+setup(entry_points='''
+[a]
+One = m:one [extra]
+''')""",
+            "setup.cfg": "[options.entry_points]\na =\n    two = m:two\nb = three=m:three\n",
+            "pyproject.toml": """
+[project]
+name = "tool-box"
+version = "2.0"
+[project.scripts]
+four = "m:four"
+[project.entry-points.c]
+five = "m"
+[tool.poetry.scripts]
+six = "m:six"
+""",
+        },
+    )
+    assert entry_points(tmp_path) == {
+        "a": {"One": "m:one [extra]", "two": "m:two"},
+        "b": {"three": "m:three"},
+        "console_scripts": {"six": "m:six", "four": "m:four"},
+        "c": {"five": "m"},
+    }
+    assert name_and_version(tmp_path) == ("tool-box", "2.0")
+
+
+def test_what_is_installed_counts_and_what_is_nowhere_is_not_found(tmp_path: Path) -> None:
+    _write(
+        tmp_path, {"p/package.xml": "<package><name>pytest</name><version>0</version></package>"}
+    )
+    with unbuilt_packages([tmp_path]):
+        assert metadata.version("pytest") == pytest.__version__
+        with pytest.raises(metadata.PackageNotFoundError):
+            metadata.version("nowhere_to_be_found")

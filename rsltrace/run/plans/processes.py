@@ -30,6 +30,7 @@ from rsltrace.doors.rclpy.wire.interfaces import (
 )
 from rsltrace.doors.rclpy.world import World
 from rsltrace.errors import JobError, SetupError
+from rsltrace.guard.pin import pinned_variables
 from rsltrace.job import Job, NodeSpec
 from rsltrace.middleware.interface import MessageType, ServiceType
 from rsltrace.model.printable import printable
@@ -46,7 +47,8 @@ class Processes:
         self._job = job
         self._told = told
         self._library: Library | None = None
-        self._surroundings = dict(os.environ)
+        pinned = pinned_variables() if job.guard.pins else {}  # this process need not be
+        self._surroundings = {**os.environ, **pinned}
         """As they are before modules of nodes are imported, which may set variables."""
 
     def find(

@@ -18,7 +18,8 @@ from rsltrace.errors import SetupError
 SOURCES = Path(__file__).parent
 OURS = (
     "real scheduler pthread_lives pthread_locks pthread_waits futex clocks entropy processors "
-    "stacks outside calls files polling timer_files writing fortified"
+    "stacks outside calls files polling timer_files writing fortified temporary_names c11_threads "
+    "system_calls"
 ).split()
 _WARNINGS = ("-Wall", "-Wextra", "-Werror")
 
@@ -76,7 +77,7 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
         pytest.skip(str(error))
     folder = tmp_path_factory.mktemp("native")
     parts = [*(LIBRARY / f"{name}.cpp" for name in OURS), SOURCES / "lone_loop.cpp"]
-    options = ["-std=c++17", "-O2", "-fPIC", "-fvisibility=hidden", f"-I{LIBRARY}", "-c"]
+    options = ["-std=c++17", "-O2", "-fPIC", "-fvisibility=hidden", f"-iquote{LIBRARY}", "-c"]
 
     def compile_part(part: Path) -> str:
         target = str(folder / f"{part.stem}.o")
@@ -94,7 +95,8 @@ def programs(tmp_path_factory: pytest.TempPathFactory) -> Programs:
         objects = list(pool.map(compile_part, parts))
         early = ["-shared", "-fPIC", "-DLIBRARY", str(SOURCES / "early.cpp")]
         _compile(compiler, [*early, "-o", str(folder / "libearly.so")])
-        list(pool.map(compile_program, ["random_threads", "corner_cases", "early", "layout"]))
+        names = ("random_threads", "corner_cases", "early", "layout", "machine")
+        list(pool.map(compile_program, names))
     _compile(compiler, ["-shared", *objects, "-o", str(folder / "libtry.so"), "-ldl"])
     return Programs(folder)
 

@@ -16,6 +16,7 @@
 #include <sys/sysinfo.h>
 #include <sys/time.h>
 #include <sys/times.h>
+#include <sys/uio.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -33,6 +34,7 @@
 #include <random>
 #include <string>
 #include <thread>
+#include <utility>
 #include <vector>
 
 using namespace std::chrono_literals;
@@ -397,23 +399,50 @@ void fortified() {  // lengths that the compiler does not know
   std::puts("");
 }
 
-void full() {  // a pipe and a socket that have no room for all of it
-  int ends[2], pair[2];
-  if (pipe(ends) != 0 || socketpair(AF_UNIX, SOCK_STREAM, 0, pair) != 0) std::abort();
-  const std::vector<char> sent(1'000'000, 'x');
-  for (const int *both : {ends, pair}) {
-    std::thread reader([from = both[0], wanted = sent.size()] {
-      std::vector<char> bytes(wanted / 3);
-      for (std::size_t got = 0; got < wanted;) {
+using Write = ssize_t (*)(int, char *, std::size_t);
+
+ssize_t in_two_parts(int to, char *from, std::size_t size, bool message) {
+  iovec parts[2] = {{from, size / 3}, {from + size / 3, size - size / 3}};
+  msghdr head{};
+  head.msg_iov = parts;
+  head.msg_iovlen = 2;
+  return message ? sendmsg(to, &head, 0) : writev(to, parts, 2);
+}
+
+void full() {  // a pipe and sockets that have no room for all of it
+  int ends[2], pair[2], datagrams[2];
+  if (pipe(ends) != 0 || socketpair(AF_UNIX, SOCK_STREAM, 0, pair) != 0 ||
+      socketpair(AF_UNIX, SOCK_DGRAM, 0, datagrams) != 0)
+    std::abort();
+  const std::pair<int *, Write> ways[] = {
+      {ends, [](int to, char *from, std::size_t size) { return write(to, from, size); }},
+      {pair, [](int to, char *from, std::size_t size) { return send(to, from, size, 0); }},
+      {pair, [](int to, char *from, std::size_t size) { return sendto(to, from, size, 0, nullptr, 0); }},
+      {ends, [](int to, char *from, std::size_t size) { return in_two_parts(to, from, size, false); }},
+      {pair, [](int to, char *from, std::size_t size) { return in_two_parts(to, from, size, true); }},
+      {datagrams,
+       [](int to, char *from, std::size_t size) {
+         std::size_t sent = 0;
+         while (sent < size) sent += static_cast<std::size_t>(in_two_parts(to, from, 10'000, true));
+         return static_cast<ssize_t>(sent);
+       }},
+  };
+  std::vector<char> sent(1'000'000);
+  for (std::size_t i = 0; i < sent.size(); ++i) sent[i] = static_cast<char>(i % 10'000 % 251);
+  for (const auto &[both, way] : ways) {
+    std::thread reader([from = both[0], &sent] {
+      std::vector<char> bytes;
+      while (bytes.size() < sent.size()) {
         std::this_thread::sleep_for(1ms);
-        const ssize_t part = read(from, bytes.data(), bytes.size());
+        const std::size_t before = bytes.size();
+        bytes.resize(before + sent.size() / 3);
+        const ssize_t part = read(from, &bytes[before], sent.size() / 3);
         if (part <= 0) std::abort();
-        got += static_cast<std::size_t>(part);
+        bytes.resize(before + static_cast<std::size_t>(part));
       }
-      say("read");
+      say(bytes == sent ? "read" : "read something else");
     });
-    const ssize_t wrote = both == ends ? write(both[1], sent.data(), sent.size())
-                                       : send(both[1], sent.data(), sent.size(), 0);
+    const ssize_t wrote = way(both[1], sent.data(), sent.size());
     say(wrote == static_cast<ssize_t>(sent.size()) ? "wrote all" : "?");
     reader.join();
   }

@@ -1,6 +1,7 @@
 // Chance comes from the job's seed.
 #include <fcntl.h>
 #include <stdio.h>
+#include <sys/auxv.h>
 #include <sys/mman.h>
 #include <sys/random.h>
 #include <unistd.h>
@@ -10,6 +11,7 @@
 #include <cstring>
 #include <random>
 
+#include "entropy.h"
 #include "real.h"
 #include "scheduler.h"
 
@@ -19,13 +21,11 @@ namespace {
 // How much one who opens /dev/urandom finds there.
 constexpr std::size_t DEVICE_BYTES = std::size_t{1} << 20;
 
-// SplitMix64 (Steele, Lea, Flood 2014): any seed will do.
+constexpr std::uint64_t OF_START = 0x7374617274;
+
 std::uint64_t draw() {
   static std::uint64_t state = seed();
-  std::uint64_t z = state += 0x9e3779b97f4a7c15;
-  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9;
-  z = (z ^ (z >> 27)) * 0x94d049bb133111eb;
-  return z ^ (z >> 31);
+  return split_mix(state);
 }
 
 void fill(void *out, std::size_t length) {
@@ -59,6 +59,23 @@ int open_device(const char *path) {
 }
 
 }  // namespace
+
+std::uint64_t split_mix(std::uint64_t &state) {
+  std::uint64_t z = state += 0x9e3779b97f4a7c15;
+  z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9;
+  z = (z ^ (z >> 27)) * 0x94d049bb133111eb;
+  return z ^ (z >> 31);
+}
+
+void exchange_start_bytes() {
+  auto *bytes = reinterpret_cast<char *>(getauxval(AT_RANDOM));  // 16; libc has taken what it needs
+  std::uint64_t state = seed() ^ OF_START;
+  for (std::size_t i = 0; bytes != nullptr && i < 2; ++i) {
+    const std::uint64_t word = split_mix(state);
+    std::memcpy(bytes + i * sizeof word, &word, sizeof word);
+  }
+}
+
 }  // namespace rsltrace
 
 using namespace rsltrace;

@@ -1,11 +1,8 @@
 // Futexes that a program waits on itself: std::atomic::wait, std::latch, std::future, static locals.
 #include <linux/futex.h>
-#include <sys/random.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
-
-#include <cstdarg>
 
 #include "real.h"
 #include "scheduler.h"
@@ -65,6 +62,8 @@ long requeue(Thread &thread, const std::uint32_t *word, std::uint32_t count, std
   return moved;
 }
 
+}  // namespace
+
 long do_futex(Thread &thread, const long *a) {
   auto *word = reinterpret_cast<std::uint32_t *>(a[0]);
   const auto value = static_cast<std::uint32_t>(a[2]);
@@ -88,42 +87,4 @@ long do_futex(Thread &thread, const long *a) {
   }
 }
 
-}  // namespace
 }  // namespace rsltrace
-
-using namespace rsltrace;
-
-RSLTRACE_EXPORT long syscall(long number, ...) noexcept {
-  va_list rest;
-  va_start(rest, number);
-  long a[6];
-  for (long &argument : a) argument = va_arg(rest, long);
-  va_end(rest);
-  Thread *thread = nullptr;
-  switch (number) {
-    case SYS_futex:
-    case SYS_getrandom:
-    case SYS_clock_gettime:
-    case SYS_clock_nanosleep:
-    case SYS_nanosleep:
-    case SYS_sched_yield: thread = me(); break;
-    default: break;
-  }
-  if (thread != nullptr) switch (number) {
-      case SYS_futex: return do_futex(*thread, a);
-      case SYS_getrandom:
-        return getrandom(reinterpret_cast<void *>(a[0]), static_cast<std::size_t>(a[1]), static_cast<unsigned>(a[2]));
-      case SYS_clock_gettime: return clock_gettime(static_cast<clockid_t>(a[0]), reinterpret_cast<timespec *>(a[1]));
-      case SYS_clock_nanosleep: {
-        const int failure =
-            clock_nanosleep(static_cast<clockid_t>(a[0]), static_cast<int>(a[1]),
-                            reinterpret_cast<const timespec *>(a[2]), reinterpret_cast<timespec *>(a[3]));
-        return failure == 0 ? 0 : fail(failure);
-      }
-      case SYS_nanosleep:
-        return nanosleep(reinterpret_cast<const timespec *>(a[0]), reinterpret_cast<timespec *>(a[1]));
-      case SYS_sched_yield: yield(*thread); return 0;
-      default: break;
-    }
-  return REAL(syscall)(number, a[0], a[1], a[2], a[3], a[4], a[5]);
-}

@@ -33,6 +33,13 @@ RSLTRACE_EXPORT int get_nprocs() noexcept { return linked() ? PROCESSORS : REAL(
 RSLTRACE_EXPORT int get_nprocs_conf() noexcept { return linked() ? PROCESSORS : REAL(get_nprocs_conf)(); }
 RSLTRACE_EXPORT int sched_getcpu() noexcept { return linked() ? 0 : REAL(sched_getcpu)(); }
 
+RSLTRACE_EXPORT int getcpu(unsigned *cpu, unsigned *node) noexcept {
+  if (!linked()) return REAL(getcpu)(cpu, node);
+  if (cpu != nullptr) *cpu = 0;
+  if (node != nullptr) *node = 0;
+  return 0;
+}
+
 RSLTRACE_EXPORT int sched_getaffinity(pid_t pid, size_t size, cpu_set_t *set) noexcept {
   if (!linked()) return REAL(sched_getaffinity)(pid, size, set);
   errno = affinity(size, set);

@@ -13,6 +13,7 @@
 #include <cstring>
 #include <deque>
 
+#include "entropy.h"
 #include "real.h"
 #include "threads.h"
 
@@ -195,6 +196,7 @@ void adopt_main(Thread &thread) {
   self = &thread;
   holding.store(&thread);
   prepare_threads(thread);
+  exchange_start_bytes();
   thread.open.store(true);
 }
 

@@ -143,6 +143,8 @@ void yield(Thread &thread);
 // A look that did not wait. Too many of them at one instant, and a millisecond passes.
 void look(Thread &thread, unsigned weight);
 
+long do_futex(Thread &thread, const long *arguments);  // futex.cpp: by who has the baton, not inside
+
 // From anywhere, signal handlers included: have the process look at its flags, files, semaphores.
 void ring(bool semaphores = false);
 

@@ -1,0 +1,13 @@
+// Chance from the job's seed.
+#pragma once
+
+#include <cstdint>
+
+namespace rsltrace {
+
+// SplitMix64 (Steele, Lea, Flood 2014): any seed will do.
+std::uint64_t split_mix(std::uint64_t &state);
+// In place of the random bytes that the kernel gives each program when it starts.
+void exchange_start_bytes();
+
+}  // namespace rsltrace

@@ -1,0 +1,159 @@
+"""What the build files of a package say.
+
+``setup.py`` is asked without setuptools, in a process of its own; ``setup.cfg`` and
+``pyproject.toml`` are read.
+"""
+
+from __future__ import annotations
+
+import configparser
+import importlib
+import json
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+_ASK = """
+import json, sys, types
+sys.stdout = sys.stderr
+said = {}
+class Setuptools(types.ModuleType):
+    def __getattr__(self, name):
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return lambda *words, **named: []
+for name in ("setuptools", "distutils", "distutils.core", "setuptools.command"):
+    sys.modules[name] = Setuptools(name)
+    sys.modules[name].setup = lambda *words, **named: said.update(named)
+code = compile(open("setup.py", "rb").read(), "setup.py", "exec")
+sys.path.insert(0, "")
+sys.argv[:] = ["setup.py"]
+exec(code, {"__name__": "__main__", "__file__": "setup.py"})
+wanted = "name version data_files entry_points scripts packages package_dir py_modules".split()
+sys.stdout.flush()
+json.dump({name: said[name] for name in wanted if said.get(name)}, sys.__stdout__, default=str)
+"""
+"""Finds out what a ``setup.py`` tells setuptools, without setuptools."""
+_ASK_SECONDS = 60
+
+Groups = dict[str, dict[str, str]]
+"""Entry points: what each name stands for, by group."""
+
+
+@cache
+def setup_py(folder: Path) -> dict[str, Any]:
+    """Return what a ``setup.py`` gives setuptools; nothing if it cannot be run without it."""
+    if not (folder / "setup.py").is_file():
+        return {}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _ASK],
+            cwd=folder,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            timeout=_ASK_SECONDS,
+            check=False,
+        )
+        said = json.loads(done.stdout or "{}")
+    except (OSError, ValueError, subprocess.TimeoutExpired):
+        return {}  # what lies in its folder is there all the same
+    return said if isinstance(said, dict) else {}
+
+
+def setup_cfg(folder: Path) -> configparser.ConfigParser:
+    """Return ``setup.cfg``; empty if there is none, or nothing that can be read."""
+    parser = configparser.ConfigParser(delimiters=("=",), interpolation=None, strict=False)
+    try:
+        parser.read(folder / "setup.cfg", encoding="utf-8")
+    except (configparser.Error, UnicodeDecodeError):
+        return configparser.ConfigParser()
+    return parser
+
+
+def _pyproject(folder: Path, *tables: str) -> Mapping[str, Any]:
+    """Return a table of ``pyproject.toml``; an empty one if it is not there."""
+    toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
+    try:
+        found: object = toml.loads((folder / "pyproject.toml").read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
+    for name in tables:
+        found = found.get(name) if isinstance(found, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def name_and_version(folder: Path) -> tuple[str | None, str | None]:
+    """Return what a package calls itself, and its version, as far as its build files say so."""
+    setup, listed = setup_py(folder), setup_cfg(folder)
+    project = {**_pyproject(folder, "tool", "poetry"), **_pyproject(folder, "project")}
+
+    def said(key: str) -> str | None:
+        given = listed.get("metadata", key, fallback=None)
+        if given is not None and given.startswith(("file:", "attr:")):
+            given = None
+        found = setup.get(key) or given or project.get(key)
+        return found.strip() if isinstance(found, str) else None
+
+    return said("name"), said("version")
+
+
+def entry_points(folder: Path) -> Groups:
+    """Return the entry points that a package would have, were it installed."""
+    found: Groups = {}
+    given = setup_py(folder).get("entry_points", {})
+    for group, lines in _of_setup_py(given):
+        found.setdefault(group, {}).update(_targets(lines))
+    listed = setup_cfg(folder)
+    if listed.has_section("options.entry_points"):
+        for group, text in listed["options.entry_points"].items():
+            found.setdefault(group, {}).update(_targets(text.splitlines()))
+    for group, targets in _of_pyproject(folder):
+        if targets:
+            found.setdefault(group, {}).update(targets)
+    return {group: targets for group, targets in found.items() if targets}
+
+
+def _of_setup_py(given: object) -> Iterator[tuple[str, Iterable[object]]]:
+    if isinstance(given, str):
+        parser = configparser.ConfigParser(delimiters=("=",), interpolation=None)
+        parser.optionxform = str  # type: ignore[assignment,method-assign]
+        try:
+            parser.read_string(given)
+        except configparser.Error:
+            return
+        for name in parser.sections():
+            yield name, [f"{key}={value}" for key, value in parser[name].items()]
+    elif isinstance(given, Mapping):
+        for name, lines in given.items():
+            yield str(name), lines.splitlines() if isinstance(lines, str) else lines
+
+
+def _of_pyproject(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """Give the entry points of the standard's tables, and of those of an older Poetry."""
+    yield "console_scripts", text_mapping(_pyproject(folder, "tool", "poetry", "scripts"))
+    yield "console_scripts", text_mapping(_pyproject(folder, "project", "scripts"))
+    yield "gui_scripts", text_mapping(_pyproject(folder, "project", "gui-scripts"))
+    for above in (("tool", "poetry", "plugins"), ("project", "entry-points")):
+        for group, targets in _pyproject(folder, *above).items():
+            yield group, text_mapping(targets)
+
+
+def _targets(lines: Iterable[object]) -> dict[str, str]:
+    found = {}
+    for line in lines:
+        name, equals, target = str(line).partition("=")
+        if equals:
+            found[name.strip()] = target.strip()
+    return found
+
+
+def text_mapping(value: object) -> dict[str, str]:
+    """Return a mapping with texts for keys and values; an empty one of anything else."""
+    return {str(k): str(v) for k, v in value.items()} if isinstance(value, Mapping) else {}
+
+
+__all__ = ["Groups", "entry_points", "name_and_version", "setup_cfg", "setup_py", "text_mapping"]
