@@ -15,7 +15,7 @@ import re
 import struct
 from copy import copy
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -28,8 +28,10 @@ from rsltrace.errors import TraceError
 from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
 from rsltrace.trace.index import ChannelInfo
-from rsltrace.trace.leaves import Leaf, leaves_of
 from rsltrace.trace.wide_texts import STAND_IN_TYPE, with_wide_texts, without_wide_texts
+
+if TYPE_CHECKING:
+    from rsltrace.trace.leaves import Leaf
 
 _TYPE_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*(/[A-Za-z][A-Za-z0-9_]*){1,3}", re.ASCII)
 _CONSTANT_NAME = re.compile(r"[A-Z][A-Z0-9_]*", re.ASCII)
@@ -116,6 +118,8 @@ class Decoder:
 
     def leaves(self) -> list[Leaf]:
         """Return the fields of the message that hold values."""
+        from rsltrace.trace.leaves import leaves_of
+
         return leaves_of(self.name, self.types)
 
     def of(self, channel: ChannelInfo) -> Decoder:
