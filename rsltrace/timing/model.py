@@ -214,7 +214,7 @@ class _Maker:
                         f"{where}: there is no analysis of executors with several workers"
                     )
                     return None
-                return str(index)
+                return f"executors[{index}]"
         return callback.node
 
     def _link_ns(self, sender: Callback, receiver: Callback) -> int | None:

@@ -77,7 +77,7 @@ def test_bounds_and_what_was_seen_of_each_chain(
     assert (fast["bound_ns"], fast["deadline_ns"]) == (8_000_000, 20_000_000)
     assert fast["simulated"]["runs"] >= 24
     assert slow["bound_ns"] == 8_000_000
-    assert found["executors"] == {"0": pytest.approx(0.16)}
+    assert found["executors"] == {"executors[0]": pytest.approx(0.16)}
     assert run(job, job.parent / "run.mcap", "--deadline", "/data=7ms") == 1
     said = capsys.readouterr().out
     assert "may miss its deadline of 7 ms: it takes up to 8 ms" in said

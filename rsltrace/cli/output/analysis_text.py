@@ -37,7 +37,8 @@ def text(found: Analysis, times: str, native: Sequence[str]) -> list[str]:
     right = frozenset(range(1, len(columns) + 5))
     lines = [f"execution times: {_TIMES[times]}", "", *table(rows, right=right), ""]
     loads = ", ".join(f"{name} {part:.1%}" for name, part in found.load.items())
-    lines.append(f"executors busy at most: {loads}")
+    if loads:
+        lines.append(f"busy at most: {loads}")
     late = [one for one in found.chains if one.verdict in ("misses", "may miss")]
     if late:
         lines += [_why(one) for one in late]
