@@ -300,6 +300,7 @@ class InProcesses(Recording):
     def _kill_all(self) -> None:
         """Leave no process behind, whatever has happened."""
         for child in self.children:
-            child.kill()
+            if not child.is_over:
+                child.kill()
         for child in self.children:
             child.join()
