@@ -32,5 +32,4 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*/job*.yaml"))
 def test_jobs_are_the_same_in_another_process(path: Path) -> None:
     job = load_job(path)
     other = pickle.loads(pickle.dumps(job))
-    assert other == job
     assert other.resolved() == job.resolved()
