@@ -48,9 +48,12 @@ Pairs = Sequence[tuple[int, int]]
 """Descriptors of the two ends of pipes and of pairs of sockets, both in this process."""
 
 
-def why_not(kept: Iterable[int], idle: frozenset[int], pairs: Pairs) -> str:
+def why_not(
+    kept: Iterable[int], idle: frozenset[int], pairs: Pairs, apart: Iterable[int] = ()
+) -> str:
     """Return why this process cannot be copied, "" if it can. ``kept`` are descriptors of ours,
-    ``idle`` the threads that do nothing in a simulation."""
+    ``idle`` the threads that do nothing in a simulation, ``apart`` the processes started by this
+    one that are not of it."""
     names = [name for thread, name in _threads() if thread not in idle]
     if names:
         return (
@@ -76,7 +79,8 @@ def why_not(kept: Iterable[int], idle: frozenset[int], pairs: Pairs) -> str:
                 f"a node has {target} open for reading and writing: what it writes there would not "
                 "be taken back"
             )
-    children = _children()
+    others = set(apart)
+    children = [child for child in own_children() if child not in others]
     if children:
         return f"a node has started a process ({', '.join(map(str, children[:4]))})"
     shared = _shared_memory()
@@ -197,7 +201,8 @@ def _threads() -> Iterator[tuple[int, str]]:
                 yield int(name), file.read().strip()
 
 
-def _children() -> list[int]:
+def own_children() -> list[int]:
+    """Return the processes that this one has started."""
     with suppress(OSError), open(f"/proc/self/task/{os.getpid()}/children") as file:
         return [int(word) for word in file.read().split()]
     return []

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rsltrace.errors import RunError
-from rsltrace.forking import other_threads, why_not
+from rsltrace.forking import other_threads, own_children, why_not
 from rsltrace.job import FaultSpec, Job
 from rsltrace.run.branching import why_never
 from rsltrace.run.branching import why_not as why_no_branch
@@ -40,6 +40,7 @@ class ForkedRun:
         self.session.may_become = True
         self._descriptors: list[int] = []
         self._threads: frozenset[int] = frozenset()
+        self._children: list[int] = []
 
     def begin(self) -> None:
         """Take note of what there is before the run.
@@ -51,6 +52,7 @@ class ForkedRun:
         names = os.listdir("/proc/self/fd")
         self._descriptors = [int(name) for name in names if os.path.exists(f"/proc/self/fd/{name}")]
         self._threads = other_threads()
+        self._children = own_children()
 
     def settle(self) -> None:
         """Write the trace of a run that is over, if it is to have one."""
@@ -76,7 +78,7 @@ class ForkedRun:
         :raises RunError: there can be none.
         """
         pairs = self.session.inner_pairs()
-        why = why_not(self._descriptors, self._threads, pairs)
+        why = why_not(self._descriptors, self._threads, pairs, self._children)
         if why:
             raise RunError(f"this simulation cannot fork: {why}")
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +104,8 @@ def test_faults_of_a_fork_are_those_of_a_job_that_has_them(tmp_path: Path) -> No
 def test_what_goes_wrong_in_a_fork_is_raised_and_the_original_goes_on(tmp_path: Path) -> None:
     there = tmp_path / "there.mcap"
     there.write_bytes(b"mine")
-    with Simulation(job(), forks=True) as sim:
+    before = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    with before, Simulation(job(), forks=True) as sim:
         sim.run_for(0.25)
         with pytest.raises(RunError, match="less than nothing"):
             sim.fork(adding(-100), tmp_path / "failed.mcap")
@@ -115,6 +118,8 @@ def test_what_goes_wrong_in_a_fork_is_raised_and_the_original_goes_on(tmp_path: 
         with pytest.raises(OutputError):
             sim.fork(lambda sim: sim.run(), there)
         sim.run()
+        assert before.stdin is not None
+        before.stdin.close()  # it is not of the simulation, and has been there all the time
     assert there.read_bytes() == b"mine"
     assert sim.result.events == record(job(), None).events
     with Trace.open(tmp_path / "failed.mcap") as trace:
