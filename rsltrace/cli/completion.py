@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
-from click.shell_completion import CompletionItem, get_completion_class
 
 from rsltrace.terminal import say
+
+if TYPE_CHECKING:
+    from click.shell_completion import CompletionItem
 
 _PROGRAM = "rsltrace"
 
@@ -14,6 +18,8 @@ def complete_files(
     context: click.Context, parameter: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Have the shell offer files, for arguments that may be something else, too (addresses)."""
+    from click.shell_completion import CompletionItem
+
     return [CompletionItem(incomplete, type="file")]
 
 
@@ -27,6 +33,8 @@ def completion(shell: str) -> None:
       zsh:  eval "$(rsltrace completion zsh)"                  in ~/.zshrc
       fish: rsltrace completion fish | source                  in ~/.config/fish/config.fish
     """
+    from click.shell_completion import get_completion_class
+
     from rsltrace.cli.main import cli
 
     made = get_completion_class(shell)

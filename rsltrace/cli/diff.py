@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -279,6 +278,8 @@ def print_diffs(
 
 def _screen() -> tuple[int, int]:
     """Return width and height for a report on a terminal, with room for the prompts around it."""
+    import shutil
+
     from rsltrace.diff.report.line import HEIGHT
 
     size = shutil.get_terminal_size((_WIDTH, HEIGHT + _PROMPTS))
