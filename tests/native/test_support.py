@@ -25,11 +25,15 @@ def test_every_key_of_a_job_is_followed_refused_or_named_as_without_effect() -> 
     assert everything - keys == FOLLOWED | REFUSED
 
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*/job*.yaml"))
+ROOT = Path(__file__).resolve().parents[2]
+EXAMPLES = sorted((ROOT / "examples").glob("*/job*.yaml"))
+HUSKY = ROOT.parent / "shared" / "data" / "husky_outdoor"
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_jobs_are_the_same_in_another_process(path: Path) -> None:
+    if "husky" in path.name and not HUSKY.exists():
+        pytest.skip("the Husky recording is not here")
     job = load_job(path)
     other = pickle.loads(pickle.dumps(job))
     assert other.resolved() == job.resolved()
