@@ -115,7 +115,7 @@ def _run(
         if error is None and not (verification.diverged or verification.interrupted):
             error = editing.failure()
         if error is None:
-            return session.finish()
+            return session.finish(cut_short=verification.has_cut_short)
         place = session.place
     if place is not None:  # no half of a branch
         place.unlink(missing_ok=True)
@@ -126,8 +126,7 @@ def _diverged(trace: Trace, verification: Verification) -> bool:
     """Say whether a run that is over did something else, or ended where the trace goes on."""
     if verification.diverged:
         return True
-    ended_by_us = verification.stop is not None or verification.interrupted
-    return not ended_by_us and verification.verified < trace.event_count
+    return not verification.has_cut_short and verification.verified < trace.event_count
 
 
 def _difference(trace: Trace, place: Path, *, kept: bool) -> Diff:

@@ -126,6 +126,13 @@ class Verification:
             return 0
         return stopped.exit_code if _INTERRUPTIONS.get(stopped.exit_code) == stopped.reason else 0
 
+    @property
+    def has_cut_short(self) -> bool:
+        """Whether the replay was ended before its job ended it: by itself, or by somebody."""
+        stopped = self._session.loop.stopped
+        is_branch_end = stopped is not None and stopped.reason == BRANCH_END
+        return self.stop is not None or is_branch_end or self.interrupted != 0
+
     def _end(self, stop: Stop, *, go_on: bool = False) -> None:
         """End the run. How its nodes then end is compared only if the trace has it: ``go_on``."""
         if self.stop is None:

@@ -487,15 +487,16 @@ class Session:
             rules += unmet_departures(self.job, self.loop.policy)
         return (*rules, *parameter_notes, *starts, *faults)
 
-    def finish(self) -> RunResult:
-        """Destroy the nodes, close the trace, and say how it went.
+    def finish(self, *, cut_short: bool = False) -> RunResult:
+        """Destroy the nodes, close the trace, and say how it went. Of a run that somebody has
+        ``cut_short`` nobody knows what in its job would have had nothing to do.
 
         :raises OutputError: if the rest of the trace cannot be written.
         """
         loop, outcome = self.loop, self.world.domain.outcome
         stop = self.stop or loop.stopped
         assert stop is not None, "a run ends with a reason"
-        unused = self.unused(lasted=True) if self.world.error is None else ()
+        unused = () if cut_short or self.world.error else self.unused(lasted=True)
         if self._recorded is not None and self.world.error is None:
             unused = (*self._recorded.notes(), *unused)
         with self._engaged():

@@ -111,6 +111,28 @@ def test_a_recorded_order_is_in_the_trace_itself(tmp_path: Path) -> None:
     assert result.is_whole
 
 
+@pytest.mark.parametrize("until", ["5", "20", None])
+def test_what_a_replay_has_not_come_to_is_no_note(
+    recorded: Callable[..., Path], until: str | None
+) -> None:
+    """It ends where it was asked to; in the job's own run there is that choice, and that fault."""
+    path = recorded(
+        """\
+nodes:
+  - node: nodes_of_replay:Source
+  - node: nodes_of_replay:Filter
+  - {node: nodes_of_replay:Filter, name: other}
+policy: {departures: [{choice: 5, run: 1}]}
+faults: [{crash: /other, at: 2.5s}]
+stop: {duration: 3s}
+"""
+    )
+    result = rsltrace.replay(path, until=until, trust=True)
+    assert not result.diverged
+    assert result.is_whole == (until is None)
+    assert result.notes == ()
+
+
 @pytest.mark.skipif(importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs")
 def test_actions_and_lifecycles(tmp_path: Path) -> None:
     programs = ("fibonacci_server", "fibonacci_client", "camera", "camera_manager")
