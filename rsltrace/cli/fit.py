@@ -8,10 +8,10 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -112,11 +112,10 @@ def fit(
         found = fitted_to(measured(first), how)
         path = _job_file(first, job_file)
         job = _load(path)
-        said = list(notes(found, job))
-        if job_file is None and path.read_bytes().decode("utf-8-sig", "replace") != first.job_text:
-            said.append(f"{path} has changed since the run, or was run with other options")
+        settings, more = _settings(first, path)
+        said = [*notes(found, job), *more]
         if output is not None:
-            _write(output, found, job, path, trace, first)
+            _write(output, found, job, path, first, settings)
         if plot is not None:
             from rsltrace.fit.picture import draw
 
@@ -164,7 +163,35 @@ def _load(path: Path) -> Job:
     return load_job(path)
 
 
-def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, first: Trace) -> None:
+def _settings(trace: Trace, job_file: Path) -> tuple[dict[str, Any], list[str]]:
+    """Return what the command line said of the run, as a job file says it, and notes on that. What
+    might run code is not taken over: a trace may come from anybody."""
+    from rsltrace.diff.causes.record_command import is_harmless, options_of
+    from rsltrace.job import load_job
+    from rsltrace.job.reading.override import as_overlay
+
+    options = list(options_of(trace))
+    harmless = [option for option in options if is_harmless(option[1])]
+    settings, left = as_overlay(harmless)
+    left += [" ".join(option) for option in options if option not in harmless]
+    if left:
+        left = [
+            f"the run was recorded with {', '.join(left)}, which the fitted job does not have: "
+            "record it with the same"
+        ]
+    elif load_job(job_file, overrides=harmless).source_text != trace.job_text:
+        left = [f"{job_file} is another job than that of the run, or has changed since"]
+    return settings, left
+
+
+def _write(
+    output: Path,
+    found: Fit,
+    job: Job,
+    job_file: Path,
+    first: Trace,
+    settings: Mapping[str, Any],
+) -> None:
     """Write the fitted job, and see that it can be read."""
     from rsltrace.fit.parts import fitted_job, with_files
 
@@ -172,7 +199,7 @@ def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, firs
         raise OutputError(f"{output} is the job itself, which the fitted one extends: name another")
     base = os.path.relpath(job_file.absolute(), output.absolute().parent).replace(os.sep, "/")
     head = (
-        f"The job {job_file.name} with the times of {trace.name}, a native run of "
+        f"The job {job_file.name} with the times of {Path(first.name).name}, a native run of "
         f"{first.event_count} events:\n"
         "delay: from publishing to reception; execution: how long executors were busy with a "
         "callback.\nMeasured by rsltrace fit."
@@ -186,7 +213,7 @@ def _write(output: Path, found: Fit, job: Job, job_file: Path, trace: Path, firs
     for name, written in files.items():
         write_text(output.parent / name, written)
     before = output.read_bytes() if output.is_file() else None
-    write_text(output, fitted_job(found, job, base, head))
+    write_text(output, fitted_job(found, job, base, head, settings))
     try:
         _load(output)
     except BaseException:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import StringIO
 from typing import Any
@@ -69,12 +69,14 @@ def with_files(fit: Fit, folder: str) -> tuple[Fit, dict[str, str]]:
     return Fit(links, executions, fit.measured), texts
 
 
-def fitted_job(fit: Fit, job: Job, base: str, head: str) -> str:
+def fitted_job(fit: Fit, job: Job, base: str, head: str, settings: Mapping[str, Any]) -> str:
     """Return the text of a job that is ``base`` (a path) with the measured times.
 
-    ``job`` is the one that ``base`` names; ``head`` are the lines of a comment.
+    ``job`` is the one that ``base`` names; ``head`` are the lines of a comment. ``settings`` are
+    what else was said of the run, as a job file says it.
     """
-    values: dict[str, Any] = {"base": base, "delay": _delay(fit, job)}
+    own = {key: value for key, value in settings.items() if key not in _replaced(fit)}
+    values: dict[str, Any] = {"base": base, **own, "delay": _delay(fit, job)}
     execution = {
         "entities": [
             {"node": one.node, "entity": one.entity, **as_job_has_it(model, time_text)}
@@ -184,13 +186,15 @@ def notes(fit: Fit, job: Job) -> Iterator[str]:
         yield f"{node}: the callback of {entity} never ran: it takes no time in the simulation"
     if found.tasks:
         yield f"{found.tasks} tasks: a job cannot say how long they take, in the simulation nothing"
-    replaced = [
-        key
-        for key in ("delay", "execution", "executors", "policy")
-        if getattr(job, key) is not None and not (key == "policy" and found.policy == OWN_POLICY)
-    ]
+    replaced = [key for key in _replaced(fit) if getattr(job, key) is not None]
     if replaced:
         yield f"in place of the job's own {', '.join(replaced)}, which have no effect natively"
+
+
+def _replaced(fit: Fit) -> tuple[str, ...]:
+    """Return what of a job had no effect natively: in its place comes what was measured."""
+    parts = ("delay", "execution", "executors")
+    return parts if fit.measured.policy == OWN_POLICY else (*parts, "policy")
 
 
 def _of_link(link: Link) -> Iterator[str]:

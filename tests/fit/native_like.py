@@ -8,7 +8,7 @@ from types import MappingProxyType
 
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import NO_EVENT, OutputKind
-from rsltrace.trace.format import METADATA_NATIVE, TIMING
+from rsltrace.trace.format import ATTACHMENT_JOB, METADATA_NATIVE, TIMING
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.recorder import Recorder
 from rsltrace.trace.writer import TraceWriter
@@ -37,6 +37,7 @@ def as_native(
     """
     with Trace.open(simulated) as trace, TraceWriter(path, force=False) as writer:
         writer.add_metadata("rsltrace:job", dict(trace.job))
+        writer.add_attachment(ATTACHMENT_JOB, "application/yaml", trace.job_text.encode())
         writer.add_metadata(METADATA_NATIVE, {"mode": "native", "executor": executor})
         recorder = Recorder(writer, keep_payload=lambda topic: False)
         threads: dict[str, int] = {}

@@ -336,6 +336,47 @@ def test_the_jobs_own_times_are_replaced(known: Known) -> None:
     assert "/asker: the callback of /never never ran" in done.stderr
 
 
+def test_what_the_run_was_recorded_with_is_in_the_fitted_job(known: Known, tmp_path: Path) -> None:
+    """``--set`` and ``--until`` are in no job file; what a job file cannot say is a note."""
+    shutil.copytree(known.folder, tmp_path, dirs_exist_ok=True)
+    overrides = [
+        "stop.duration=3s",
+        "record.payloads=false",
+        "execution.default=1ms",
+        "nodes.0.parameters.gain=2",
+        "guard=false",
+        ("--until", 'stop.time="2s"'),
+    ]
+    record(load_job(tmp_path / "truth.yaml", overrides=overrides), tmp_path / "short.mcap")
+    native = as_native(tmp_path / "short.mcap", tmp_path / "short_native.mcap")
+    output = tmp_path / "fitted.yaml"
+    done = known.fit(str(native), "-o", str(output), "--as", "series")
+    assert done.exit_code == 0, done.output
+    job = load_job(output)
+    assert (job.stop.duration_ns, job.stop.time_ns) == (3000 * MS, 2000 * MS)
+    assert not job.record.payloads
+    assert job.execution is not None
+    assert job.execution.default is None
+    assert (
+        "recorded with --set nodes.0.parameters.gain=2, --set guard=false, which the "
+        "fitted job does not have" in done.stderr
+    )
+
+
+@pytest.mark.parametrize("text", ["vars: {n: 10}\nseed: $(var n)\n", ""])
+def test_a_job_that_is_put_together_has_not_changed(
+    known: Known, tmp_path: Path, text: str
+) -> None:
+    shutil.copytree(known.folder, tmp_path, dirs_exist_ok=True)
+    job = tmp_path / "again.yaml"
+    job.write_text(f"base: job.yaml\n{text}")
+    record(load_job(job, overrides=["stop.duration=1s"]), tmp_path / "short.mcap")
+    native = as_native(tmp_path / "short.mcap", tmp_path / "short_native.mcap")
+    assert "another job" not in known.fit(str(native), "-o", str(tmp_path / "f.yaml")).stderr
+    job.write_text(f"base: job.yaml\n{text}min_time_step: 1us\n")
+    assert "another job" in known.fit(str(native), "-o", str(tmp_path / "g.yaml")).stderr
+
+
 def test_nodes_that_shared_an_executor_share_one(known: Known, tmp_path: Path) -> None:
     path = as_native(
         known.simulated,

@@ -12,6 +12,7 @@ import json
 import os
 import re
 import shlex
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -106,6 +107,23 @@ def is_of_file(trace: Trace) -> bool:
     return trace.job.get("name", "") not in ("", "<python>")
 
 
+def options_of(trace: Trace) -> Iterator[tuple[str, str]]:
+    """Yield what the command line said of a trace's job: ``--set`` and ``key=value``."""
+    for line in trace.job_text.splitlines()[1:] if is_effective(trace) else ():
+        if not line.startswith("#"):
+            return
+        if line.startswith(_WITH):
+            option, _, change = line.removeprefix(_WITH).partition(" ")
+            yield f"--{option}", change
+
+
+def is_harmless(change: str) -> bool:
+    """Whether ``key=value`` of a trace names neither code nor a file."""
+    key, _, value = change.partition("=")
+    fits = (k.fullmatch(key) and v.fullmatch(value) for k, v in _SETTINGS)
+    return len(change) <= _CHANGE_MAX and any(fits)
+
+
 def record_again(trace: Trace) -> RecordAgain:
     """Return ``rsltrace record …`` for the job of ``trace``; nothing if it came from no file."""
     if not is_of_file(trace):
@@ -113,12 +131,8 @@ def record_again(trace: Trace) -> RecordAgain:
     name = trace.job["name"]
     path, is_same = job_file(trace, name)
     words = _Words([path])
-    if is_effective(trace):
-        for line in trace.job_text.splitlines()[1:]:
-            if not line.startswith("#"):
-                break
-            if line.startswith(_WITH):
-                _take(words, line[len(_WITH) :], name)
+    for option, change in options_of(trace):
+        _take(words, option, change, name)
     if words.foreign:
         more = f" and {len(words.foreign) - 3} more" if len(words.foreign) > 3 else ""
         told = ", ".join(_told(text) for text in words.foreign[:3])
@@ -172,20 +186,18 @@ def _reads(path: Path, text: str) -> bool:
         return False
 
 
-def _take(words: _Words, override: str, name: str) -> None:
-    """Add what the job was put together with: ``set key=value``, as the trace says it."""
-    option, _, change = override.partition(" ")
-    if option == "until":  # the report has a time of its own
+def _take(words: _Words, option: str, change: str, name: str) -> None:
+    """Add what the job was put together with: ``--set`` and ``key=value``, as the trace says it."""
+    if option == "--until":  # the report has a time of its own
         return
-    key, equals, value = change.partition("=")
     too_much = len(change) > _CHANGE_MAX or len(words.settings) > _OPTIONS_MAX
-    if too_much or option not in ("set", "seed") or not equals:
-        words.foreign.append(f"--{override}")
+    if too_much or option not in ("--set", "--seed") or "=" not in change:
+        words.foreign.append(f"{option} {change}")
     elif change.startswith(_LAUNCH):
         _take_launch_file(words, change[len(_LAUNCH) :], name)
     elif change.startswith(_ROS):
         _take_ros_argument(words, change[len(_ROS) :])
-    elif any(k.fullmatch(key) and v.fullmatch(value) for k, v in _SETTINGS):
+    elif is_harmless(change):
         words.settings += ["--set", change]
     else:
         words.foreign.append(f"--set {change}")

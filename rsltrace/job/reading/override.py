@@ -6,6 +6,7 @@ An override is YAML with its path written in front, so its mistakes are shown in
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -49,6 +50,26 @@ def apply_override(root: Item, label: str, override: str, *, folder: str) -> Ite
     if value.value is None:
         value = Item(None, steps[-1].place)
     return _set(root, steps, value, ())
+
+
+def as_overlay(overrides: Iterable[tuple[str, str]]) -> tuple[dict[str, Any], list[str]]:
+    """Return overrides as what a job file says that extends the job, and those (``--set k=v``) that
+    it cannot say: they change an entry of a list, or put a mapping in place of another one."""
+    said: dict[str, Any] = {}
+    left = []
+    for label, override in overrides:
+        steps, at = _steps(YamlSource(label, override, is_option=True))
+        *outer, last = (step.text for step in steps)
+        value = parse_yaml(override[at:], label, option=override).value
+        in_list = any(is_list_at(Job, tuple(outer[:count])) for count in range(1, len(outer) + 1))
+        inner: Any = said
+        for key in () if in_list or isinstance(value, dict) else outer:
+            inner = inner.setdefault(key, {}) if isinstance(inner, dict) else None
+        if in_list or isinstance(value, dict) or not isinstance(inner, dict):
+            left.append(f"{label} {override}")
+        else:
+            inner[last] = value
+    return said, left
 
 
 def _steps(source: YamlSource) -> tuple[list[_Step], int]:
