@@ -589,3 +589,71 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
 
     simulate(NodeSpec(main=main))
     assert kept == [_FAILURES_MAX]
+
+
+def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any) -> None:
+    from rclpy.action import ActionClient
+    from rclpy.impl.implementation_singleton import rclpy_implementation
+    from test_msgs.action import Fibonacci
+
+    refused: list[str] = []
+    heard: list[int] = []
+
+    def program() -> None:
+        rclpy.init()
+        node = Counter()
+        client = node.create_client(Trigger, "~/ask")
+        action = ActionClient(node, Fibonacci, "fibonacci")
+        context = rclpy.utilities.get_default_context()
+        try:
+            rclpy.spin(node)
+        except KeyboardInterrupt:
+            pass
+        assert not rclpy.ok()
+        for attempt in (
+            lambda: node.publisher.publish(UInt64(data=99)),
+            node.publisher.get_subscription_count,
+            lambda: node.declare_parameter("gain", 1.0),  # is told on /parameter_events
+            lambda: node.create_publisher(UInt64, "more", 1),
+            lambda: node.create_subscription(UInt64, "more", print, 1),
+            lambda: node.create_client(Trigger, "more"),
+            lambda: node.create_service(Trigger, "more", print),
+            lambda: node.create_timer(1.0, print),
+            lambda: node.create_guard_condition(print),
+            client.service_is_ready,
+            action.server_is_ready,
+            node.get_node_names,
+            node.get_topic_names_and_types,
+            lambda: node.count_publishers("numbers"),
+            context.handle.shutdown,
+        ):
+            with pytest.raises(rclpy_implementation.RCLError) as error:
+                attempt()
+            refused.append(str(error.value))
+        node.get_logger().info("still heard")
+        node.destroy_node()
+
+    simulate(
+        main_spec(program),
+        lambda: listener(heard),
+        duration=1.2,  # type: ignore[arg-type]
+    )
+    assert refused[0] == "Failed to publish: publisher's context is invalid"
+    assert refused[-1].startswith("failed to shutdown: rcl_shutdown already called")
+    assert len(refused) == 15
+    assert [number for number, _ in heard] == [1, 2]  # type: ignore[misc]
+
+
+def test_after_a_shutdown_a_program_begins_anew(simulate: Any) -> None:
+    heard: list[Any] = []
+
+    def program() -> None:
+        for _ in range(2):
+            rclpy.init()
+            node = Counter()
+            rclpy.spin_once(node, timeout_sec=1.0)
+            rclpy.shutdown()
+            time.sleep(1.0)
+
+    simulate(main_spec(program), lambda: listener(heard), duration=5)
+    assert heard == [(1, 0.5), (1, 2.0)]

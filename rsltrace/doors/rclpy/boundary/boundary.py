@@ -37,7 +37,7 @@ from rsltrace.doors.rclpy.node_clocks import NodeClocks
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.errors import UnsupportedError
-from rsltrace.middleware.graph import Graph, names_and_types
+from rsltrace.middleware.graph import names_and_types
 from rsltrace.middleware.publisher import Publisher
 from rsltrace.middleware.qos.status import (
     CountStatus,
@@ -126,10 +126,6 @@ class Boundary:
         return self.world.stacks
 
     @property
-    def _graph(self) -> Graph:
-        return self.world.stacks.domain.graph
-
-    @property
     def is_free(self) -> bool:
         """Whether no simulation is under way in this process."""
         return self._world is None
@@ -186,7 +182,7 @@ class Boundary:
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
         try:
-            context = ContextHandle(self.stacks, arguments, domain_id)
+            context = ContextHandle(self.real, self.stacks, arguments, domain_id)
         except UnknownArgumentsError as error:
             raise self.real.UnknownROSArgsError(str(error)) from error
         except InvalidArgumentsError as error:
@@ -222,15 +218,19 @@ class Boundary:
         )
 
     def Publisher(self, node: NodeHandle, *arguments: Any) -> PublisherHandle:  # noqa: N802
+        node.require_up("failed to create publisher")
         return PublisherHandle(node, *arguments)
 
     def Subscription(self, node: NodeHandle, *arguments: Any) -> SubscriptionHandle:  # noqa: N802
+        node.require_up("failed to create subscription")
         return SubscriptionHandle(node, *arguments)
 
     def Client(self, node: NodeHandle, *arguments: Any) -> ClientHandle:  # noqa: N802
+        node.require_up("failed to create client")
         return ClientHandle(node, *arguments)
 
     def Service(self, node: NodeHandle, *arguments: Any) -> ServiceHandle:  # noqa: N802
+        node.require_up("failed to create service")
         return ServiceHandle(node, *arguments)
 
     def TypeDescriptionService(self, node: NodeHandle) -> TypeDescriptionServiceHandle:  # noqa: N802
@@ -239,23 +239,27 @@ class Boundary:
     def Timer(  # noqa: N802
         self, clock: Any, context: ContextHandle, period_ns: int, autostart: bool = True
     ) -> TimerHandle:
+        context.require("failed to create timer")
         if clock.follows:
             return RosTimerHandle(self.real, context.stacks, clock, period_ns, autostart)
         return TimerHandle(self.real, context.stacks, period_ns, autostart)
 
     def GuardCondition(self, context: ContextHandle) -> GuardConditionHandle:  # noqa: N802
+        context.require("failed to create guard_condition")
         return GuardConditionHandle(context.stacks)
 
     def EventHandle(self, parent: Any, event_type: Any) -> EventHandle:  # noqa: N802
         return EventHandle(parent, event_type)
 
     def ActionServer(self, node: NodeHandle, *arguments: Any) -> ActionServerHandle:  # noqa: N802
+        node.require_up("failed to create action server")
         return ActionServerHandle(node, *arguments)
 
     def ActionGoalHandle(self, server: ActionServerHandle, info: Any) -> GoalHandle:  # noqa: N802
         return GoalHandle(self.real, server.goals, info)
 
     def ActionClient(self, node: NodeHandle, *arguments: Any) -> ActionClientHandle:  # noqa: N802
+        node.require_up("failed to create action client")
         return ActionClientHandle(node, *arguments)
 
     def LifecycleStateMachine(  # noqa: N802
@@ -288,44 +292,44 @@ class Boundary:
     def rclpy_get_publisher_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self._graph.publishers_of(node.node_named(name, namespace))
+        found = node.asked_graph.publishers_of(node.node_named(name, namespace))
         return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_subscriber_names_and_types_by_node(
         self, node: NodeHandle, no_demangle: bool, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self._graph.subscriptions_of(node.node_named(name, namespace))
+        found = node.asked_graph.subscriptions_of(node.node_named(name, namespace))
         return names_and_types([(end.topic, end.type_name) for end in found])
 
     def rclpy_get_service_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self._graph.services_of(node.node_named(name, namespace))
+        found = node.asked_graph.services_of(node.node_named(name, namespace))
         return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_client_names_and_types_by_node(
         self, node: NodeHandle, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
-        found = self._graph.clients_of(node.node_named(name, namespace))
+        found = node.asked_graph.clients_of(node.node_named(name, namespace))
         return names_and_types([(end.service, end.type_name) for end in found])
 
     def rclpy_get_topic_names_and_types(
         self, node: NodeHandle, no_demangle: bool
     ) -> list[tuple[str, list[str]]]:
-        return self._graph.topic_names_and_types()
+        return node.asked_graph.topic_names_and_types()
 
     def rclpy_get_service_names_and_types(self, node: NodeHandle) -> list[tuple[str, list[str]]]:
-        return self._graph.service_names_and_types()
+        return node.asked_graph.service_names_and_types()
 
     def rclpy_get_publishers_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(p, _PUBLISHER) for p in self._graph.publishers(topic)]
+        return [_endpoint_info(p, _PUBLISHER) for p in node.asked_graph.publishers(topic)]
 
     def rclpy_get_subscriptions_info_by_topic(
         self, node: NodeHandle, topic: str, no_mangle: bool
     ) -> list[dict[str, Any]]:
-        return [_endpoint_info(s, _SUBSCRIPTION) for s in self._graph.subscriptions(topic)]
+        return [_endpoint_info(s, _SUBSCRIPTION) for s in node.asked_graph.subscriptions(topic)]
 
     # -- messages ----------------------------------------------------------------------------------
 

@@ -1,11 +1,13 @@
 """The handle of ``rclpy.Context``: init arguments, and a shutdown.
 
-That of a node which the job constructs ends the run; a main shuts down only itself.
+That of a node which the job constructs ends the run; a main shuts down only itself. As in rcl, what
+belongs to a context that is down can be destroyed, and hardly anything else.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.doors.rclpy.handles.destroyable import Handle
@@ -14,13 +16,17 @@ from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
 
 DEFAULT_DOMAIN = 2**64 - 1
+_DOWN = (
+    "the given context is not valid, either rcl_init() was not called or rcl_shutdown() was called."
+)
 
 
 class ContextHandle(Handle):
     """Stands in for ``_rclpy.Context``."""
 
-    def __init__(self, stacks: Stacks, arguments: Sequence[str], domain_id: int) -> None:
+    def __init__(self, real: Any, stacks: Stacks, arguments: Sequence[str], domain_id: int) -> None:
         super().__init__()
+        self._real = real
         self.stacks = stacks
         for argument in arguments:
             argument.encode()  # raises what rclpy raises for what is not text
@@ -41,8 +47,9 @@ class ContextHandle(Handle):
     def shutdown(self) -> None:
         """Shut down. Within an event this ends the run once the event is over."""
         if not self.is_up:
-            raise RuntimeError("context has already been shut down")
-        self.is_up = False
+            text = "failed to shutdown: rcl_shutdown already called on the given context"
+            raise self._real.RCLError(text)
+        self.end()
         stacks = self.stacks
         if self.program is not stacks.programs.host:
             stacks.dispatcher.note(OutputKind.SHUTDOWN, stacks.event.entity)
@@ -55,6 +62,20 @@ class ContextHandle(Handle):
     def end(self) -> None:
         """Shut down from outside, as a signal does."""
         self.is_up = False
+        graph = self.stacks.domain.graph
+        for node in graph.nodes:
+            if getattr(node, "context", None) is self:
+                for publisher in graph.publishers_of(node):
+                    publisher.publish = publisher.publish_raw = self._refuse  # type: ignore[attr-defined]
+
+    def _refuse(self, message: object) -> None:
+        """Stand in for the methods of publishers, so that no publication has to ask first."""
+        raise self._real.RCLError("Failed to publish: publisher's context is invalid")
+
+    def require(self, task: str) -> None:
+        """Raise RCLError if the context is down: rcl refuses the task then."""
+        if not self.is_up:
+            raise self._real.RCLError(f"{task}: {_DOWN}")
 
 
 def _only_ros(arguments: Sequence[str]) -> list[str]:

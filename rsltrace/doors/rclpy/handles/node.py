@@ -209,57 +209,64 @@ class NodeHandle(Destroyable, Participant):
 
     def get_count_publishers(self, topic: str) -> int:
         """Count the publishers of a fully qualified topic."""
-        return len(self._graph.publishers(topic))
+        return len(self.asked_graph.publishers(topic))
 
     def get_count_subscribers(self, topic: str) -> int:
         """Count the subscriptions of a fully qualified topic."""
-        return len(self._graph.subscriptions(topic))
+        return len(self.asked_graph.subscriptions(topic))
 
     def get_count_clients(self, service: str) -> int:
         """Count the clients of a fully qualified service."""
-        return len(self._graph.clients(service))
+        return len(self.asked_graph.clients(service))
 
     def get_count_services(self, service: str) -> int:
         """Count the servers of a fully qualified service."""
-        return len(self._graph.services(service))
+        return len(self.asked_graph.services(service))
 
     def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
         """Return every node of the graph, in creation order."""
-        return [(node.name, node.namespace) for node in self._graph.nodes]
+        return [(node.name, node.namespace) for node in self.asked_graph.nodes]
 
     def get_node_names_and_namespaces_with_enclaves(self) -> list[tuple[str, str, str]]:
         """Return every node of the graph with its enclave (always the root one)."""
-        return [(node.name, node.namespace, "/") for node in self._graph.nodes]
+        return [(node.name, node.namespace, "/") for node in self.asked_graph.nodes]
 
     def get_action_names_and_types(self) -> list[tuple[str, list[str]]]:
         """Return every action of the graph with its type."""
-        return action_names_and_types(self._graph.topic_names_and_types())
+        return action_names_and_types(self.asked_graph.topic_names_and_types())
 
     def get_action_client_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
         """Return the actions that a node is a client of."""
-        ends = self._graph.subscriptions_of(self.node_named(name, namespace))
+        ends = self.asked_graph.subscriptions_of(self.node_named(name, namespace))
         return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
 
     def get_action_server_names_and_types_by_node(
         self, name: str, namespace: str
     ) -> list[tuple[str, list[str]]]:
         """Return the actions that a node serves."""
-        ends = self._graph.publishers_of(self.node_named(name, namespace))
+        ends = self.asked_graph.publishers_of(self.node_named(name, namespace))
         return action_names_and_types(names_and_types([(e.topic, e.type_name) for e in ends]))
 
     def node_named(self, name: str, namespace: str) -> Participant:
         """Return a participant of the graph. Raises NodeNameNonExistentError if there is none."""
-        found = self._graph.node_named(full_name(namespace, name))
+        found = self.asked_graph.node_named(full_name(namespace, name))
         if found is None:
             missing = full_name(namespace, name)
             raise self.real.NodeNameNonExistentError(f"cannot find node {missing}")
         return found
 
     @property
-    def _graph(self) -> Graph:
+    def asked_graph(self) -> Graph:
+        """The graph, for user code that asks: it can as long as the context is up."""
+        self.require_up("failed to ask the graph")
         return self.stacks.domain.graph
+
+    def require_up(self, task: str) -> None:
+        """Raise RCLError if the node's context is shut down: rcl refuses the task then."""
+        if not self.context.is_up:
+            raise self.real.RCLError(f"{task}: rcl node's context is invalid")
 
     # -- the trace -----------------------------------------------------------------------------
 

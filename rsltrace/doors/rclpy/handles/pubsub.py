@@ -61,6 +61,7 @@ class PublisherHandle(EntityHandle, Publisher):
 
     def get_subscription_count(self) -> int:
         """Count the connected subscriptions."""
+        self.node.require_up("failed to get subscription count")
         return len(self.subscriptions)
 
     def wait_for_all_acked(self, timeout: Any) -> bool:

@@ -161,6 +161,7 @@ class ClientHandle(ServiceEndHandle, Client):
 
     def service_server_is_available(self) -> bool:
         """Return whether a server is there now."""
+        self.node.require_up("failed to check service availability")
         return bool(self.servers())
 
     def send_request(self, request: Any) -> int:
