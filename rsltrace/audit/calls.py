@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from rsltrace.audit import rules
 from rsltrace.audit.durations import is_difference_of_now
+from rsltrace.audit.exchanges import exchanged
 from rsltrace.audit.model import Rule
 from rsltrace.audit.names import Names
 from rsltrace.audit.rules import CONDITIONS, METHODS, SEEDED_BY, SHARED, rule_of
@@ -62,6 +63,8 @@ def find_calls(module: Module, names: Names, *, as_script: bool = False) -> Iter
 
 
 def _at(module: Module, node: ast.AST, names: Names) -> Iterator[Place]:
+    for place, name in exchanged(module, node, names):
+        yield Place(place, name, rules.EXCHANGED)
     if isinstance(node, ast.Call):
         yield from _call(module, node, names)
     elif isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Load):

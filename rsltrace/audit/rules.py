@@ -151,6 +151,12 @@ HASH = Rule(
     "zlib.crc32(text.encode()), or a key of your own",
     source=Source.ADDRESS,
 )
+EXCHANGED = Rule(
+    "replaced",
+    _D,
+    "a note of the run: it is never called, because rsltrace runs callbacks itself",
+    "exchange rclpy.executors.await_or_execute, or wrap the callbacks",
+)
 ENVIRON = _ENVIRONMENT
 LOCALE_FORMAT = _LOCALE
 DEL = _FINALIZER

@@ -130,9 +130,26 @@ FOUND = [
      "  return 3 // float(b - a)", "division by float(b - a)", "virtual"),
     ("next(iter(set(a)))", "order of the set set(a)", "virtual"),
     ("s = set(a)\ns = s - b\nlist(s)", "order of the set s", "virtual"),
+    ("from rclpy.executors import Executor\nExecutor._take_timer = f",
+     "rclpy.executors.Executor._take_timer", "detected"),
+    ("import rclpy.executors as e\nsetattr(e.Executor, '_make_handler', f)",
+     "rclpy.executors.Executor._make_handler", "detected"),
+    ("from unittest import mock\nmock.patch('rclpy.executors.Executor._take_service')",
+     "rclpy.executors.Executor._take_service", "detected"),
+    ("from unittest import mock\nfrom rclpy import callback_groups as g\n"
+     "mock.patch.object(g.ReentrantCallbackGroup, 'can_execute')",
+     "rclpy.callback_groups.ReentrantCallbackGroup.can_execute", "detected"),
+    ("from rclpy.executors import MultiThreadedExecutor\nclass A(MultiThreadedExecutor): pass\n"
+     "class B(A):\n  def can_execute(self, entity): pass",
+     "rclpy.executors.MultiThreadedExecutor.can_execute", "detected"),
 ]  # fmt: skip
 
 NOT_FOUND = [
+    "import rclpy.executors as e\ne.await_or_execute = f",
+    "from rclpy.executors import Executor\nreal = getattr(Executor, '_take_timer')",
+    "from rclpy.executors import Executor\nclass A(Executor):\n  def spin_once(self): pass",
+    "from rclpy.callback_groups import ReentrantCallbackGroup as R\n"
+    "class A(R):\n  def can_execute(self, entity): pass",
     # the time before this callback, another clock's, a difference that is guarded, a plain number
     "def f(self):\n  return 1 / (self.get_clock().now() - self.last).nanoseconds",
     "def f(self, a):\n  return 1 / (self.get_clock().now() - a).nanoseconds",

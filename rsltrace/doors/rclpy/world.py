@@ -17,6 +17,7 @@ from rsltrace.doors.rclpy.boundary.boundary import Boundary, Surroundings
 from rsltrace.doors.rclpy.boundary.installation import installed
 from rsltrace.doors.rclpy.callback_errors import RclpyDoor
 from rsltrace.doors.rclpy.entry import Entry
+from rsltrace.doors.rclpy.executors.exchanged import note_exchanged
 from rsltrace.doors.rclpy.executors.user_executors import own_executors
 from rsltrace.doors.rclpy.handles.logs import Logs
 from rsltrace.doors.rclpy.handles.node_state import NodeStates
@@ -282,6 +283,7 @@ class World:
         outcome.note_end(stacks.loop.events)
         if outcome.error is None and not ending.stuck:
             outcome.notes += held_back(stacks)
+        note_exchanged(stacks, hosted=bool(self.nodes))
         self.parameters = parameters_of(self.domain.graph)
         end_programs(stacks)
         end_blocked(stacks)

@@ -14,6 +14,7 @@ from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
 
+from rsltrace.doors.rclpy.executors.exchanged import exchanged_function_called, note_exchanged
 from rsltrace.doors.rclpy.executors.pump import pump_of
 from rsltrace.doors.rclpy.handles.waitables import sync_woken
 from rsltrace.doors.rclpy.stacks.blocking_calls import lose_patience
@@ -40,7 +41,8 @@ def own_executors(stacks: Stacks) -> Iterator[None]:
     )
     executors.time = SimpleNamespace(monotonic=lambda: stacks.loop.now_ns / 1_000_000_000)
     try:
-        yield
+        with exchanged_function_called(stacks):
+            yield
     finally:
         for name, method in real.items():
             setattr(Executor, name, method)
@@ -71,6 +73,7 @@ def _methods(
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:  # noqa: N807
         real["__init__"](self, *args, **kwargs)
         made.append(weakref.ref(self))
+        note_exchanged(stacks, type(self))
         for guard in (self._guard, getattr(self, "_sigint_gc", None)):
             pending = stacks.domain.entities.pending
             if getattr(guard, "handle", None) in pending:  # they are no entities
@@ -79,6 +82,7 @@ def _methods(
     def add_node(self: Any, node: Any) -> bool:
         if stacks.ending.closing:  # ``while True: rclpy.spin(node)`` does nothing else from then on
             lose_patience(stacks)
+        note_exchanged(stacks, type(self))
         added: bool = real["add_node"](self, node)
         if added:
             pump_of(stacks, self).add(node)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
-from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 
@@ -61,8 +61,8 @@ class GuardConditionHandle(EntityHandle):
             return
         self._triggered = False
         callback = wrapper.callback
-        if is_coroutine_function(callback):
-            start_coroutine(self.stacks, self, _GUARD, callback, (), *self._cause, 0)
+        if is_awaited(self.stacks, callback):
+            start_callback(self.stacks, self, _GUARD, callback, (), *self._cause, 0)
         else:
             self.dispatcher.execute(
                 self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0

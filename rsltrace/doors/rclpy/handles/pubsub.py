@@ -9,7 +9,7 @@ from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import qos_of
 from rsltrace.doors.rclpy.stacks.blocking_calls import wait
 from rsltrace.doors.rclpy.stacks.code_lines import CallSites
-from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import message_type
 from rsltrace.errors import UnsupportedError
@@ -123,9 +123,7 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
         message = deserialize(data)
         args = (message, _message_info(delivery)) if self._with_info else (message,)
         if self._coroutine:
-            start_coroutine(
-                self.stacks, self, SUBSCRIPTION, callback, args, event, position, digest
-            )
+            start_callback(self.stacks, self, SUBSCRIPTION, callback, args, event, position, digest)
             return
         self.dispatcher.execute(
             self, self.entity_id, self.node, SUBSCRIPTION, callback, args, event, position, digest
@@ -148,8 +146,12 @@ class SubscriptionHandle(ReceiverHandle, Subscription):
     def _learn(self, wrapper: Any) -> None:
         """Look at a callback once, when it is new; users may exchange it."""
         self._callback = wrapper._callback
-        self._coroutine = is_coroutine_function(wrapper._callback)
+        self._coroutine = is_awaited(self.stacks, wrapper._callback)
         self._with_info = wrapper._callback_type is not type(wrapper).CallbackType.MessageOnly
+
+    def forget_callback(self) -> None:
+        """Look at the callback once more: it may be run in another way from now on."""
+        self._callback = None
 
     def take_message(self, msg_type: Any, raw: bool) -> Any:
         """Take a message by hand, as a wait set would; None if there is none."""

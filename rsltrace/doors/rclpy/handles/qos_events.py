@@ -7,7 +7,7 @@ from typing import Any
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
-from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.middleware.entity import callback_name
 from rsltrace.middleware.qos.status import (
     DEADLINE_MISSED,
@@ -75,8 +75,8 @@ class EventHandle(QosEvent, EntityHandle):
         self.is_queued = False
         status = self.take_event()
         callback = wrapper.callback
-        if is_coroutine_function(callback):
-            start_coroutine(self.stacks, self, _QOS_EVENT, callback, (status,), *self.cause, 0)
+        if is_awaited(self.stacks, callback):
+            start_callback(self.stacks, self, _QOS_EVENT, callback, (status,), *self.cause, 0)
         else:
             self.dispatcher.execute(
                 self, self.entity_id, self.node, _QOS_EVENT, callback, (status,), *self.cause, 0

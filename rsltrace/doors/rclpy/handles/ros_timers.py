@@ -11,7 +11,7 @@ from rsltrace.doors.rclpy.handles.clock import ClockHandle
 from rsltrace.doors.rclpy.handles.timers import TimerHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import is_busy
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
-from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.middleware.timer import TIMER
 from rsltrace.model.event import NO_EVENT
 
@@ -84,8 +84,8 @@ class RosTimerHandle(TimerHandle):
             return
         callback, digest = wrapper.callback, self.deadline_hash()
         state.call(now_ns)
-        if is_coroutine_function(callback):
-            start_coroutine(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
+        if is_awaited(self.stacks, callback):
+            start_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             self.dispatcher.execute(
                 self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest

@@ -18,7 +18,12 @@ from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.handles.qos_profiles import profile_of, qos_of
 from rsltrace.doors.rclpy.stacks.code_lines import CallSites, Functions
-from rsltrace.doors.rclpy.stacks.tasks import executor_of, is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import (
+    executor_of,
+    is_awaited,
+    is_coroutine_function,
+    start_coroutine,
+)
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import service_type
 from rsltrace.doors.rclpy.wire.type_descriptions import answer
@@ -90,7 +95,7 @@ class ServiceHandle(ServiceEndHandle, Service):
         data, event, position, digest, header = self.queue.popleft()
         request = self._request.deserialize(data)
         wrapper = self.wrapper
-        if is_coroutine_function(wrapper.callback):
+        if is_awaited(self.stacks, wrapper.callback):
             start_coroutine(
                 self.stacks,
                 self,
@@ -122,9 +127,12 @@ class ServiceHandle(ServiceEndHandle, Service):
         wrapper.send_response(response, header)
 
     async def _serve_async(self, request: Any, header: ServiceInfo) -> None:
+        from rclpy import executors
+
         wrapper = self.wrapper
         self._tell(REQUEST_RECEIVED, header.request_id, request)
-        response = await wrapper.callback(request, self.srv_type.Response())
+        empty = self.srv_type.Response()
+        response = await executors.await_or_execute(wrapper.callback, request, empty)
         wrapper.send_response(response, header)
 
     def service_take_request(self, request_type: Any) -> tuple[Any, Any]:

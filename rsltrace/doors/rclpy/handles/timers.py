@@ -10,7 +10,7 @@ from typing import Any
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
 from rsltrace.doors.rclpy.stacks.callback_groups import is_busy
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
-from rsltrace.doors.rclpy.stacks.tasks import is_coroutine_function, start_coroutine
+from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.middleware.timer import TIMER, Timer
 from rsltrace.model.event import NO_EVENT
 
@@ -61,7 +61,7 @@ class TimerHandle(EntityHandle, Timer):
         callback = wrapper.callback
         if callback is not self._callback:
             self._callback = callback
-            self._coroutine = is_coroutine_function(callback)
+            self._coroutine = is_awaited(self.stacks, callback)
             self._info = _info_parameter(callback)
         digest = self.deadline_hash()
         if self._info is not None:
@@ -69,11 +69,15 @@ class TimerHandle(EntityHandle, Timer):
         state.call(loop.now_ns)
         loop.timers.ran(state)
         if self._coroutine:
-            start_coroutine(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
+            start_callback(self.stacks, self, TIMER, callback, (), NO_EVENT, 0, digest)
         else:
             dispatcher.execute(
                 self, self.entity_id, self.node, TIMER, callback, (), NO_EVENT, 0, digest
             )
+
+    def forget_callback(self) -> None:
+        """Look at the callback once more: it may be run in another way from now on."""
+        self._callback = None
 
     def _leave(self) -> None:
         self.dispatcher.loop.timers.remove(self.state)

@@ -86,6 +86,8 @@ class Stacks:
         self.coroutines = Coroutines(domain)
         self.runners = Runners(domain, self.programs, self.groups, self._take_over)
         self.executor: Any = None
+        self.runs_callbacks: Any = None
+        """What user code has put in place of rclpy's ``await_or_execute``, if it has."""
 
     def _take_over(self) -> None:
         """Run the loop on a stack of its own, because its runner's callback has blocked.

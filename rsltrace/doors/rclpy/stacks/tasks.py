@@ -32,12 +32,31 @@ def is_coroutine_function(callback: object) -> bool:
     return known
 
 
+def is_awaited(stacks: Stacks, callback: object) -> bool:
+    """Return whether a callback is run as a coroutine: it is one, or user code has its own way."""
+    return stacks.runs_callbacks is not None or is_coroutine_function(callback)
+
+
 def executor_of(stacks: Stacks, handle: Any) -> Any:
     """Return the executor that runs a handle's node: the user's own, or the run's."""
     mailbox: Mailbox | None = handle.node.mailbox if handle.node is not None else None
     if mailbox is not None and mailbox.pump is not None:
         return mailbox.pump.executor
     return stacks.executor
+
+
+def start_callback(
+    stacks: Stacks,
+    handle: Any,
+    kind: int,
+    callback: Callable[..., Any],
+    args: tuple[Any, ...],
+    *cause: int,
+) -> None:
+    """Run an entity's callback that ``is_awaited``, as rclpy's executors would."""
+    if stacks.runs_callbacks is not None:
+        callback, args = stacks.runs_callbacks, (callback, *args)
+    start_coroutine(stacks, handle, kind, callback, args, *cause)
 
 
 def start_coroutine(
