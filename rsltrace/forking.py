@@ -61,7 +61,7 @@ def why_not(
             f"({', '.join(sorted(set(names))[:4])}), which no copy would have"
         )
     ours, inner = set(kept), {number for pair in pairs for number in pair}
-    for number, target, mode in _open_descriptors():
+    for number, target, mode in open_descriptors():
         if number in ours or number < 3:
             continue
         if number in inner and not _waiting_bytes(number):
@@ -217,11 +217,11 @@ def _shared_memory() -> str:
     return ""
 
 
-def _open_descriptors() -> Iterator[tuple[int, str, int]]:
+def open_descriptors() -> Iterator[tuple[int, str, int]]:
     """Yield number, target and mode of what is open."""
     for name in os.listdir("/proc/self/fd"):
         number = int(name)
-        with suppress(OSError):
+        with suppress(OSError):  # that which has read the folder is gone again
             yield number, os.readlink(f"/proc/self/fd/{name}"), os.fstat(number).st_mode
 
 
@@ -238,7 +238,7 @@ def _is_read_and_written(number: int) -> bool:
 
 def _reopen_files() -> None:
     """Give this process descriptors of its own of all files, at the same positions."""
-    for number, _, mode in list(_open_descriptors()):
+    for number, _, mode in list(open_descriptors()):
         if number < 3 or not stat.S_ISREG(mode):
             continue
         with suppress(OSError):

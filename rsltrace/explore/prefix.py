@@ -23,7 +23,7 @@ from rsltrace.debug.lines import Lines
 from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.explore.copies import answer_and_end, source_of, take_ends
 from rsltrace.explore.trial import Trial
-from rsltrace.forking import die_with_parent, end_process, fork_beside, why_not
+from rsltrace.forking import die_with_parent, end_process, fork_beside, open_descriptors, why_not
 
 if TYPE_CHECKING:
     from rsltrace.explore.outcome import Wants
@@ -126,8 +126,7 @@ def _stand(task: dict[str, Any], overlay: Mapping[str, Any], lines: Lines, worke
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os.close(nowhere)
-    names = os.listdir("/proc/self/fd")  # and the descriptor that reads it, which is gone again
-    kept = [int(name) for name in names if os.path.exists(f"/proc/self/fd/{name}")]
+    kept = [number for number, _, _ in open_descriptors()]
     try:
         with ExitStack() as stack:
             try:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from rsltrace.errors import RunError
-from rsltrace.forking import other_threads, own_children, why_not
+from rsltrace.forking import open_descriptors, other_threads, own_children, why_not
 from rsltrace.job import FaultSpec, Job
 from rsltrace.run.branching import why_never
 from rsltrace.run.branching import why_not as why_no_branch
@@ -49,8 +49,7 @@ class ForkedRun:
         """
         if self._output is not None:
             check_output(self.session.job, self._output, None)
-        names = os.listdir("/proc/self/fd")
-        self._descriptors = [int(name) for name in names if os.path.exists(f"/proc/self/fd/{name}")]
+        self._descriptors = [number for number, _, _ in open_descriptors()]
         self._threads = other_threads()
         self._children = own_children()
 

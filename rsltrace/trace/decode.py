@@ -27,6 +27,7 @@ from rosbags.typesys.store import Typestore
 from rsltrace.errors import TraceError
 from rsltrace.mcap import limits
 from rsltrace.mcap.records import SCHEMA_ENCODING
+from rsltrace.model.placeholders import PLACEHOLDERS
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.wide_texts import STAND_IN_TYPE, with_wide_texts, without_wide_texts
 
@@ -41,7 +42,6 @@ _INTEGER_TYPES = {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 3
 _BASE_TYPES = _INTEGER_TYPES | {"bool", "byte", "char", "float32", "float64", "string"}
 _NESTING_MAX = 32
 _ARRAY_ITEMS_MAX = 1 << 32
-_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 
 
 _MISFITS = (SerdeError, struct.error, AssertionError, IndexError, ValueError, MemoryError)
@@ -113,7 +113,7 @@ class Decoder:
         return {
             name: str(detail) if kind == Nodetype.NAME and detail != STAND_IN_TYPE else ""
             for name, (kind, detail) in found[1]
-            if name not in _NOT_OF_THE_MESSAGE
+            if name not in PLACEHOLDERS
         }
 
     def leaves(self) -> list[Leaf]:
@@ -199,7 +199,7 @@ def field_names(kind: Any) -> tuple[str, ...] | None:
     if not dataclasses.is_dataclass(kind):
         return None
     names = (field.name for field in dataclasses.fields(kind))
-    return tuple(name for name in names if name not in _NOT_OF_THE_MESSAGE)
+    return tuple(name for name in names if name not in PLACEHOLDERS)
 
 
 class _UnsafeSchema(ValueError):

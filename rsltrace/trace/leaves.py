@@ -8,10 +8,10 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
+from rsltrace.model.placeholders import NO_FIELD
 from rsltrace.trace.wide_texts import STAND_IN_TYPE
 
 _DEPTH_MAX = 6
-_NO_FIELD = "structure_needs_at_least_one_member"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ def _leaves(of: str, types: dict[str, Any], prefix: str, depth: int) -> Iterator
                 yield Leaf(name, base, size or 1 << 20)
             name, kind, detail = f"{name}[]", inner, inner_detail
         if kind == Nodetype.BASE:
-            if field != _NO_FIELD:
+            if field != NO_FIELD:
                 yield Leaf(name, detail[0])
         elif detail == STAND_IN_TYPE:
             yield Leaf(name, "string")

@@ -26,13 +26,13 @@ from rsltrace.diff.values.numbers import (
     number_text,
     same_number,
 )
+from rsltrace.model.placeholders import PLACEHOLDERS
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import NS_PER_S, format_seconds
 
 WHOLE = "(whole)"
 """The path of a difference that belongs to no field: of the types, or of two plain values."""
 _TIMES = ("builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
-_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 _ABSENT = "absent"
 _NO_FIELD = "only one of the types has this field"
 _SECONDS_MAX = 2.0**33
@@ -101,7 +101,7 @@ def _fields_of_class(cls: Any) -> tuple[tuple[str, str, str], ...]:
     attributes = {
         field.name: field
         for field in dataclasses.fields(cls)
-        if field.name not in _NOT_OF_THE_MESSAGE and not str(field.type).startswith("ClassVar")
+        if field.name not in PLACEHOLDERS and not str(field.type).startswith("ClassVar")
     }
     if definition is None:
         return tuple((name, name, "float64") for name in attributes)

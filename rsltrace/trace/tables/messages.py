@@ -12,6 +12,7 @@ from rosbags.interfaces import Nodetype
 
 from rsltrace.errors import TraceError, did_you_mean
 from rsltrace.model.event import NO_SEQUENCE, Output, OutputKind
+from rsltrace.model.placeholders import NO_FIELD
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
 from rsltrace.trace.tables.rows import Labels, Source, node_names, whole_numbers
@@ -26,7 +27,6 @@ _SENT = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind
 _NAMES = {"float32": "float32", "float64": "float64", "bool": "bool_", "string": "string"}
 _BYTES = {"byte": "uint8", "char": "uint8"}
 _ARRAYS = (Nodetype.ARRAY, Nodetype.SEQUENCE)
-_MISSING = "structure_needs_at_least_one_member"
 
 
 class _Field(NamedTuple):
@@ -210,7 +210,7 @@ def _leaves(decoder: Decoder, prefix: str, interface: str) -> Iterator[_Field]:
     """Yield the fields of an interface, with those of messages in it in their place."""
     for name, description in decoder.types[interface][1]:
         kind, detail = description
-        if name == _MISSING:
+        if name == NO_FIELD:
             continue
         if kind == Nodetype.NAME and detail != STAND_IN_TYPE:
             yield from _leaves(decoder, f"{prefix}{name}.", str(detail))
@@ -230,7 +230,7 @@ def _arrow_type(arrow: Any, decoder: Decoder, description: Any) -> Any:
         inner = [
             arrow.field(name, _arrow_type(arrow, decoder, one))
             for name, one in decoder.types[str(detail)][1]
-            if name != _MISSING
+            if name != NO_FIELD
         ]
         return arrow.struct(inner)
     return arrow.list_(_arrow_type(arrow, decoder, detail[0]))
@@ -243,7 +243,7 @@ def _as_arrow(decoder: Decoder, description: Any) -> Callable[[Any], Any] | None
         inner = [
             (name, _as_arrow(decoder, one))
             for name, one in decoder.types[str(detail)][1]
-            if name != _MISSING
+            if name != NO_FIELD
         ]
         return lambda value: {
             name: getattr(value, name) if convert is None else convert(getattr(value, name))

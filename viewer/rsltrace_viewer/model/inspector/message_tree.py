@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from rsltrace.model.placeholders import PLACEHOLDERS
 from rsltrace.model.printable import printable, shortened
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 
-_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 _PREVIEW = 120
 _ITEMS_PER_LEVEL = 100
 _OPEN_BY_ITSELF = 1
@@ -69,7 +69,7 @@ def _children(value: object) -> Iterator[tuple[str, object]]:
         yield from _items(value, 0, len(value))
     elif _is_message(value):
         for field in dataclasses.fields(value):  # type: ignore[arg-type]  # an instance of one
-            if field.name not in _NOT_OF_THE_MESSAGE:
+            if field.name not in PLACEHOLDERS:
                 yield field.name.rstrip("_"), getattr(value, field.name)
 
 

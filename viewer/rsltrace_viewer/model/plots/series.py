@@ -14,6 +14,7 @@ from rsltrace.errors import TraceError
 from rsltrace.latency.measure import measuring
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import NO_EVENT, Output, OutputKind
+from rsltrace.model.placeholders import PLACEHOLDERS
 from rsltrace_viewer.model.chains import ARROW, VIA
 from rsltrace_viewer.model.run import Run
 
@@ -21,7 +22,6 @@ SAMPLES_MAX = 1500
 """Messages decoded for a plot; of more, every n-th is taken, and the plot says so."""
 
 _RATE_BINS = 240
-_NOT_OF_THE_MESSAGE = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 _NUMBERS_MAX = 16
 """Items of an array that are offered one by one."""
@@ -132,7 +132,7 @@ def numeric_paths(value: Any, path: str = "") -> Iterator[str]:
             yield from numeric_paths(value[place], f"{path}[{place}]")
     elif dataclasses.is_dataclass(value):
         for field in dataclasses.fields(value):
-            if field.name not in _NOT_OF_THE_MESSAGE:
+            if field.name not in PLACEHOLDERS:
                 inner = f"{path}.{field.name}" if path else field.name
                 yield from numeric_paths(getattr(value, field.name), inner)
 

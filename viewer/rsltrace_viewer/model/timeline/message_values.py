@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from rsltrace.model.placeholders import PLACEHOLDERS
 from rsltrace.model.printable import printable, shortened
 
-_NEVER = frozenset(("structure_needs_at_least_one_member", "__msgtype__"))
-_NOT_SHOWN = _NEVER | {"header", "stamp"}
+_NOT_SHOWN = PLACEHOLDERS | {"header", "stamp"}
 _VALUES_MAX = 5
 _LEAVES_MAX = 60
 _TEXT_MAX = 30
@@ -87,7 +87,7 @@ def _leaves(value: Any, path: str, in_full: bool = False) -> Iterator[tuple[str,
 
 
 def _fields(message: Any, path: str, in_full: bool) -> Iterator[tuple[str, str]]:
-    left_out = _NEVER if in_full else _NOT_SHOWN
+    left_out = PLACEHOLDERS if in_full else _NOT_SHOWN
     names = [f.name for f in dataclasses.fields(message) if f.name not in left_out]
     if names == ["x", "y", "z", "w"] and not in_full:  # a quaternion: its turn is what tells
         yield f"{path}.θ".lstrip("."), number(_yaw(*(float(getattr(message, n)) for n in names)))

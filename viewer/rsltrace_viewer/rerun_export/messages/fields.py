@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 
+from rsltrace.model.placeholders import NO_FIELD
 from rsltrace_viewer.rerun_export.columns import lists
 from rsltrace_viewer.rerun_export.messages.values import items, numbers
 
@@ -19,7 +20,6 @@ _ITEMS_MAX = 16
 _CURVES_MAX = 32
 """More curves than this are no plot that anybody reads; the data is there all the same."""
 _TIME_FIELDS = ({"sec", "nanosec"}, {"seconds", "nanoseconds"})
-_NO_FIELD = "structure_needs_at_least_one_member"
 """What ROS puts into a message that has no fields."""
 
 
@@ -42,7 +42,7 @@ def _curves(structs: pa.StructArray, path: str) -> Iterator[Curves]:
     inner: list[tuple[str, pa.Array]] = []
     for place in range(structs.type.num_fields):
         field = structs.type.field(place)
-        if field.name == _NO_FIELD:
+        if field.name == NO_FIELD:
             continue
         if _is_number(field.type):
             names.append(field.name)
