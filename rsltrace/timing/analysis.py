@@ -15,9 +15,6 @@ from rsltrace.timing.model import Wanted, longest_times, system_of
 from rsltrace.timing.observed import Key, Observed
 from rsltrace.timing.system import ONCE_NS, Callback
 
-TIMES = ("job", "max", "p99")
-"""Where execution times come from: ``execution:`` of the job, or what was measured."""
-
 
 @dataclass(frozen=True, slots=True)
 class Seen:
@@ -133,11 +130,7 @@ def analyze(
     for index, path in enumerate(simulated.paths):
         if path.children:
             continue
-        root = index
-        while (parent := system.tasks[root].parent) is not None:
-            root = parent
-        arrivals = system.tasks[root].arrivals
-        assert arrivals is not None, "what has no parent has arrivals"
+        arrivals = system.arrivals(system.tasks[index])
         period_ns = None if arrivals.period_ns == ONCE_NS else arrivals.period_ns
         results.append(
             ChainResult(

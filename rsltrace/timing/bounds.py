@@ -49,8 +49,8 @@ class _Solver:
         periods = [one.arrivals.period_ns for one in tasks if one.arrivals is not None]
         periods = [one for one in periods if one < ONCE_NS]
         self._limit_ns = _PERIODS_MAX * max(periods, default=1)
-        self._roots = [self._root(index) for index in range(len(tasks))]
-        self._counts = [self._count(index) for index in range(len(tasks))]
+        self._released = [self.system.arrivals(task) for task in tasks]
+        self._counts = [self.system.count(task) for task in tasks]
         self._of: dict[str, list[int]] = {}
         for index, task in enumerate(tasks):
             if task.executor is not None:
@@ -111,14 +111,6 @@ class _Solver:
 
     # -- what arrives, and when ------------------------------------------------------------------
 
-    def _root(self, index: int) -> int:
-        parent = self.system.tasks[index].parent
-        return index if parent is None else self._root(parent)
-
-    def _count(self, index: int) -> int:
-        task = self.system.tasks[index]
-        return task.count * (1 if task.parent is None else self._count(task.parent))
-
     def _head(self, index: int, goes_on: Callable[[Task], bool] = lambda task: True) -> int:
         """Return the first of the tasks up to this one that follow each other at once on one
         executor, as long as they are such that the analysis ``goes_on``."""
@@ -143,9 +135,9 @@ class _Solver:
         return end + task.link_ns
 
     def _arrivals(self, head: int) -> Arrivals:
-        root = self.system.tasks[self._roots[head]].arrivals
-        assert root is not None, "what has no parent has arrivals"
-        return root if head == self._roots[head] else root.delayed(self._late(head))
+        released = self._released[head]
+        is_root = self.system.tasks[head].parent is None
+        return released if is_root else released.delayed(self._late(head))
 
     def _work(self, indexes: Iterable[int], head_of: Callable[[int], int]) -> _Work:
         tasks = self.system.tasks
@@ -326,14 +318,8 @@ def _is_overloaded(system: System, executor: str) -> bool:
 
 def utilization(system: System, executor: str) -> float:
     """Return which part of its time an executor is busy, if all callbacks take their longest."""
-    counts: list[int] = []
-    total = 0.0
-    roots: list[Task] = []
-    for task in system.tasks:
-        parent = task.parent
-        counts.append(task.count * (1 if parent is None else counts[parent]))
-        roots.append(task if parent is None else roots[parent])
-        arrivals = roots[-1].arrivals
-        if task.executor == executor and arrivals is not None:
-            total += counts[-1] * task.wcet_ns / arrivals.period_ns
-    return total
+    return sum(
+        system.count(task) * task.wcet_ns / system.arrivals(task).period_ns
+        for task in system.tasks
+        if task.executor == executor
+    )

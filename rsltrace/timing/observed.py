@@ -17,13 +17,10 @@ from rsltrace.timing.system import Callback
 from rsltrace.trace.native import timings
 from rsltrace.trace.reader import Trace
 
-OUTSIDE = "outside"
-_CALLBACKS = {
-    int(EventKind.TIMER): "timer",
-    int(EventKind.SUBSCRIPTION): "subscription",
-    int(EventKind.SERVICE): "service",
-    int(EventKind.CLIENT): "client",
-}
+_CALLBACKS = frozenset(
+    map(int, (EventKind.TIMER, EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT))
+)
+_RECEIVERS = (EntityKind.TIMER, EntityKind.SUBSCRIPTION, EntityKind.SERVICE, EntityKind.CLIENT)
 _TIMER, _DRAW = int(EventKind.TIMER), int(OutputKind.DRAW)
 _TIMER_CHANGED = int(OutputKind.TIMER)
 _SUSPENDED = int(EventFlag.SUSPENDED)
@@ -172,20 +169,13 @@ class Observed:
 
 def _callbacks(trace: Trace) -> dict[int, Callback]:
     """Return what runs callbacks, by the ids of entities."""
-    kinds = {
-        EntityKind.TIMER: "timer",
-        EntityKind.SUBSCRIPTION: "subscription",
-        EntityKind.SERVICE: "service",
-        EntityKind.CLIENT: "client",
-    }
     seen: Counter[tuple[str, str, str]] = Counter()
     found = {}
     for number in sorted(trace.entities):
         entity: Entity = trace.entities[number]
-        kind = kinds.get(entity.kind)
-        if kind is None:
+        if entity.kind not in _RECEIVERS:
             continue
-        words = (trace.node_of(entity).name, kind, entity.name)
+        words = (trace.node_of(entity).name, entity.kind.label, entity.name)
         found[number] = Callback(*words, seen[words])
         seen[words] += 1
     return found

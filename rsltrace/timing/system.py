@@ -87,3 +87,14 @@ class System:
     def executor_of(self, task: Task) -> Executor | None:
         """Return the executor of a task, None if it is not analyzed."""
         return None if task.executor is None else self.executors.get(task.executor, Executor())
+
+    def arrivals(self, task: Task) -> Arrivals:
+        """Return how often the chain of a task is released."""
+        if task.parent is not None:
+            return self.arrivals(self.tasks[task.parent])
+        assert task.arrivals is not None, "what has no parent has arrivals"
+        return task.arrivals
+
+    def count(self, task: Task) -> int:
+        """Return how many of a task come of one release of its chain, at most."""
+        return task.count * (1 if task.parent is None else self.count(self.tasks[task.parent]))
