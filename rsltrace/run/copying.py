@@ -22,7 +22,7 @@ def in_copy(function: Callable[[int], Any], pairs: Pairs) -> Any:
     :raises Exception: what it raises, as it is if that can be pickled.
     :raises RunError: there can be no copy, or it dies, or the value cannot be pickled.
     """
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # who has closed one has None there
         stream.flush()  # or both would write what waits there
     told, tell = os.pipe()
     pid = fork_below(pairs)
