@@ -13,11 +13,9 @@ from rsltrace.bag.playback import Playback
 from rsltrace.doors.rclpy.entry import Entry
 from rsltrace.doors.rclpy.wire.interfaces import get_message_class
 from rsltrace.job import Job
-from rsltrace.native.apart.plans import PLAYER
+from rsltrace.native.apart.plans import THE_BAGS
 from rsltrace.run.plans.bags import (
-    PLAYER as NODE,
-)
-from rsltrace.run.plans.bags import (
+    PLAYER,
     BagInput,
     check_bag_types,
     check_type,
@@ -42,7 +40,7 @@ def player(job: Job, stack: ExitStack) -> Entry:
     """
     bags = [stack.enter_context(open_bag_of(job, index)) for index in range(len(job.bags))]
     check_bag_types(job, bags)
-    return Entry(PLAYER, partial(_play, job, bags), [], argv=[NODE])
+    return Entry(THE_BAGS, partial(_play, job, bags), [], argv=[PLAYER])
 
 
 def _play(job: Job, bags: list[BagInput]) -> None:
@@ -50,7 +48,7 @@ def _play(job: Job, bags: list[BagInput]) -> None:
     from rclpy.node import Node
 
     rclpy.init(args=[])
-    node = Node(NODE, start_parameter_services=False, enable_rosout=False)
+    node = Node(PLAYER, start_parameter_services=False, enable_rosout=False)
     publishers: dict[tuple[str, str], Any] = {}
     streams: list[_Played] = []
     for entry in bags:

@@ -15,7 +15,7 @@ from rsltrace.native.apart.order import Order
 from rsltrace.run.plans.entries import arguments_for_all, entry_keys, start_rule
 from rsltrace.run.plans.processes import Processes
 
-PLAYER = "the bags"
+THE_BAGS = "the bags"
 """The name of the process that plays them."""
 
 
@@ -47,7 +47,7 @@ def starts_of(job: Job, like: Order) -> list[Start]:
         )
     if job.bags:
         order = replace(like, plays_bags=True)
-        starts.append(Start(PLAYER, PLAYER, order, dict(os.environ), None, True))
+        starts.append(Start(THE_BAGS, THE_BAGS, order, dict(os.environ), None, True))
     return starts
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from rsltrace.doors.rclpy.entry import StartRule
 from rsltrace.model.entity import Entity, EntityKind
+from rsltrace.model.event import OutputKind
 from rsltrace.native.ledger import Sent, Span, now_ns
 
 if TYPE_CHECKING:
@@ -17,7 +18,6 @@ Fact = tuple[str, str]
 """What has come true: ``topic``, ``service``, ``node``, ``started`` or ``ended``, and its name."""
 
 _MADE = {EntityKind.NODE: "node", EntityKind.SERVICE: "service"}
-_MESSAGE = 1
 
 
 class Starts:
@@ -48,7 +48,7 @@ class Starts:
         found: set[Fact] = set()
         for span in spans:
             for output in span.outputs:
-                if isinstance(output, Sent) and output.kind == _MESSAGE:
+                if isinstance(output, Sent) and output.kind == OutputKind.MESSAGE:
                     found.add(("topic", output.thing.name))
                 elif isinstance(output, Entity) and output.kind in _MADE:
                     found.add((_MADE[output.kind], output.name))
