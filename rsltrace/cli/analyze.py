@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from rsltrace.cli.job_source import set_option
+from rsltrace.cli.output.picture import check_picture, save_picture
 from rsltrace.errors import TraceError
 from rsltrace.job.values.times import parse_time
 from rsltrace.model.printable import printable
@@ -51,13 +53,7 @@ if TYPE_CHECKING:
     is_flag=True,
     help="All executors share one processor: those with faster timers interrupt the others.",
 )
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set any key of the job: policy=rate_monotonic.",
-)
+@set_option
 @click.option(
     "--plot",
     type=click.Path(path_type=Path),
@@ -103,9 +99,7 @@ def analyze(
     supply = _supply(reservation)
     by_end = dict(_deadline(text) for text in deadlines)
     if plot is not None:
-        from rsltrace.cli.output.analysis_plot import check_plot
-
-        check_plot(plot)
+        check_picture(plot)
     loaded = without_launch_files(load_job(job, overrides=list(overrides))).job
     check_job(loaded)
     with ExitStack() as stack:
@@ -139,9 +133,9 @@ def analyze(
     else:
         _print(found, measured, [one.trace.name for one in native])
     if plot is not None:
-        from rsltrace.cli.output.analysis_plot import draw
+        from rsltrace.cli.output.analysis_plot import picture_of
 
-        draw(found, plot)
+        save_picture(picture_of(found), plot)
         tell(f"wrote {plot}")
     sys.exit(0 if found.all_meet else 1)
 

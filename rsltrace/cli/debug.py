@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from rsltrace.cli.job_source import set_option
 from rsltrace.cli.replay import agree, code_lines
 from rsltrace.model.printable import printable
 from rsltrace.terminal import tell
@@ -31,13 +32,7 @@ from rsltrace.terminal import tell
     help="The folder of the job file (default: that of the trace, or the present one).",
 )
 @click.option("--trust", is_flag=True, help="Run the code that TRACE names without being asked.")
-@click.option(
-    "--set",
-    "overrides",
-    multiple=True,
-    metavar="KEY=VALUE",
-    help="Set any key of a JOB: stop.duration=10s.",
-)
+@set_option
 @click.option(
     "--checkpoints",
     type=click.IntRange(min=0),

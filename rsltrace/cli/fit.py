@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from rsltrace.cli.output.fit_text import as_json, checked_text, text
+from rsltrace.cli.output.picture import check_picture, save_picture
 from rsltrace.cli.output.text_file import write_text
 from rsltrace.errors import OutputError, RunError, TraceError
 from rsltrace.model.printable import printable
@@ -106,6 +107,8 @@ def fit(
     for path in (output, plot, simulated):
         if path is not None and path.exists() and not force:
             raise OutputError(f"{path} exists; --force replaces it")
+    if plot is not None:
+        check_picture(plot)
     with ExitStack() as stack:
         first = stack.enter_context(Trace.open(trace))
         wanted = None if second is None else _chains(stack.enter_context(Trace.open(second)))
@@ -117,9 +120,9 @@ def fit(
         if output is not None:
             _write(output, found, job, path, first, settings)
         if plot is not None:
-            from rsltrace.fit.picture import draw
+            from rsltrace.fit.picture import picture_of
 
-            draw(found, plot, first.name)
+            save_picture(picture_of(found, first.name), plot)
         checked = None
         if wanted is not None:
             assert output is not None

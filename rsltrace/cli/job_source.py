@@ -34,6 +34,15 @@ class RosArgsCommand(click.Command):
         return left
 
 
+set_option = click.option(
+    "--set",
+    "overrides",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.0.",
+)
+
+
 def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Add what ``job_of`` needs to a command: ``words``, ``launch``, ``skip``, ``overrides``."""
     for decorate in reversed(
@@ -56,13 +65,7 @@ def job_options(function: Callable[..., Any]) -> Callable[..., Any]:
                 is_flag=True,
                 help="Leave out what of the launch file cannot be simulated.",
             ),
-            click.option(
-                "--set",
-                "overrides",
-                multiple=True,
-                metavar="KEY=VALUE",
-                help="Set any key of the job: stop.duration=10s, nodes.ekf.parameters.rate=20.0.",
-            ),
+            set_option,
             click.option(
                 "--ros-args",
                 is_flag=True,

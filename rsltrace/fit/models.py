@@ -24,8 +24,7 @@ from rsltrace.chance.distribution import (
 )
 from rsltrace.chance.stream import Stream
 from rsltrace.errors import SetupError
-
-Durations = npt.NDArray[np.int64]
+from rsltrace.latency.figures import Durations
 
 FEW = 30
 """Fewer durations than this say little of the tail."""

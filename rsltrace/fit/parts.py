@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 from io import StringIO
 from typing import Any
 
-from rsltrace.fit.measured import Durations, Execution, Link, Measured
+from rsltrace.fit.measurement import Execution, Link, Measured
 from rsltrace.fit.models import FEW, Model, as_job_has_it, model_of, series_of
 from rsltrace.job import Job
+from rsltrace.latency.figures import Durations
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.errors import OutputError, SetupError
-from rsltrace.fit.models import Durations, Model
+from rsltrace.fit.models import Model
 from rsltrace.fit.parts import Fit
+from rsltrace.latency.figures import Durations
 from rsltrace.model.printable import printable
 
 Numbers = npt.NDArray[np.float64]
-FORMATS = (".png", ".svg", ".pdf")
 _COLUMNS = 3
 _INCHES = (4.2, 2.8)
 _PANELS_MAX = 60
@@ -26,16 +24,9 @@ _WIDE = 5
 """From so many medians to the longest on, the axis is logarithmic."""
 
 
-def draw(fit: Fit, path: Path, title: str) -> None:
-    """Draw a panel for each link and each callback, up to 60, those with the most values first.
-
-    :raises SetupError: if matplotlib is missing.
-    :raises OutputError: if the file cannot be written.
-    """
-    if path.suffix.lower() not in FORMATS:
-        raise OutputError(f"{path}: a picture is one of {', '.join(FORMATS)}")
-    if importlib.util.find_spec("matplotlib") is None:
-        raise SetupError("a picture of the fit needs matplotlib: pip install 'rsltrace[fit]'")
+def picture_of(fit: Fit, title: str) -> Any:
+    """Return a panel for each link and each callback, up to 60, those with the most values first,
+    as a figure of matplotlib's."""
     from matplotlib.figure import Figure
 
     panels = sorted(_panels(fit), key=lambda panel: -len(panel[1]))[:_PANELS_MAX]
@@ -60,13 +51,7 @@ def draw(fit: Fit, path: Path, title: str) -> None:
         axes.set_ylim(0, 100)
         axes.set_ylabel("% below", fontsize=8)
         axes.legend(fontsize=7, loc="lower right")
-    work = path.with_name(f".{path.name}.part-{os.getpid()}")
-    try:
-        figure.savefig(work, format=path.suffix[1:].lower(), dpi=110)
-        os.replace(work, path)
-    except OSError as error:
-        work.unlink(missing_ok=True)
-        raise OutputError(f"{path} cannot be written: {error.strerror or error}") from error
+    return figure
 
 
 def _panels(fit: Fit) -> Iterator[tuple[str, Durations, Model]]:

@@ -16,7 +16,8 @@ pytest.importorskip("rclpy")
 from rsltrace import Trace, record
 from rsltrace.chance.stream import Stream
 from rsltrace.cli.main import cli
-from rsltrace.fit.measured import Measured, measured
+from rsltrace.fit.measured import measured
+from rsltrace.fit.measurement import Measured
 from rsltrace.fit.models import ks_distance
 from rsltrace.job import load_job
 from rsltrace.latency.measure import measure_latencies

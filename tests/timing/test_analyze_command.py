@@ -104,7 +104,7 @@ def test_without_a_trace_the_job_is_run_and_may_be_drawn(
         (["--reservation", "5ms/2ms"], "", UsageError, "is no reservation"),
         (["--times", "max", "--set", "seed=1"], "", UsageError, "nothing says how long"),
         ([], "min_time_step: 1ms\n", JobError, "time moves on in steps"),
-        (["--plot", "picture.txt"], "", RsltraceError, "a name that ends in"),
+        (["--plot", "picture.txt"], "", RsltraceError, "a picture is one of .png, .svg, .pdf"),
     ],
 )
 def test_what_cannot_be_analyzed_is_said(

@@ -2,36 +2,16 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
-from pathlib import Path
 from textwrap import fill
+from typing import Any
 
-from rsltrace.errors import OutputError, SetupError
 from rsltrace.timing.analysis import Analysis
 
-_SUFFIXES = (".png", ".svg", ".pdf")
 _NS_PER_MS = 1e6
 
 
-def check_plot(path: Path) -> None:
-    """Raise what would be wrong with drawing to ``path``.
-
-    :raises SetupError: matplotlib is not installed.
-    :raises OutputError: nothing can be drawn to such a file.
-    """
-    if find_spec("matplotlib") is None:
-        raise SetupError("--plot needs matplotlib: pip install matplotlib")
-    if path.suffix not in _SUFFIXES:
-        raise OutputError(f"{path}: give a name that ends in {', '.join(_SUFFIXES)}")
-    if not path.absolute().parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {path.parent}")
-
-
-def draw(found: Analysis, path: Path) -> None:
-    """Draw the chains of an analysis, the first at the top.
-
-    :raises OutputError: the file cannot be written.
-    """
+def picture_of(found: Analysis) -> Any:
+    """Return the chains of an analysis, the first at the top, as a figure of matplotlib's."""
     from matplotlib.figure import Figure
 
     chains = list(reversed(found.chains))
@@ -56,7 +36,4 @@ def draw(found: Analysis, path: Path) -> None:
     handles, labels = axes.get_legend_handles_labels()
     shown = dict(zip(labels, handles, strict=True))
     figure.legend(shown.values(), shown.keys(), loc="outside upper center", ncols=len(shown))
-    try:
-        figure.savefig(path, dpi=150)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+    return figure

@@ -10,9 +10,9 @@ import numpy as np
 
 from rsltrace.fit.checked import NEAR, Checked, CheckedChain, far
 from rsltrace.fit.comparison import Compared
-from rsltrace.fit.measured import Durations
 from rsltrace.fit.models import Model, as_job_has_it
 from rsltrace.fit.parts import Fit, time_text
+from rsltrace.latency.figures import Durations
 from rsltrace.model.stamp import format_duration
 from rsltrace.words.table import table
 
