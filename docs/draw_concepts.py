@@ -148,22 +148,22 @@ def chain() -> str:
 
 def cause() -> str:
     """Draw what came of one event."""
+    rows = (
+        (40, "484  /wheels", "timer Wheels.roll", "/position", "485  /scanner"),
+        (120, "486  /scanner", "timer Scanner.scan", "/obstacle", "487  /driver"),
+        (200, "488  /driver", "timer Driver.drive", "/speed", "489  /wheels"),
+    )
     return card(
         760,
         280,
         "What event 484 led to: each event names the output of another event that it came from",
-        box(24, 40, 200, "484  /wheels", "timer Wheels.roll"),
-        box(290, 40, 200, "485  /scanner", "subscription /position"),
-        box(24, 120, 200, "486  /scanner", "timer Scanner.scan"),
-        box(290, 120, 200, "487  /driver", "subscription /obstacle"),
-        box(24, 200, 200, "488  /driver", "timer Driver.drive"),
-        box(290, 200, 200, "489  /wheels", "subscription /speed"),
-        arrow((224, 67), (288, 67), colour=ORANGE),
-        arrow((224, 147), (288, 147), colour=ORANGE),
-        arrow((224, 227), (288, 227), colour=ORANGE),
-        text(230, 58, "/position", ORANGE, 11),
-        text(230, 138, "/obstacle", ORANGE, 11),
-        text(230, 218, "/speed", ORANGE, 11),
+        *(
+            box(x, y, 200, title, what)
+            for y, timer, name, topic, other in rows
+            for x, title, what in ((24, timer, name), (290, other, f"subscription {topic}"))
+        ),
+        *(arrow((224, y + 27), (288, y + 27), colour=ORANGE) for y, *_ in rows),
+        *(text(230, y + 18, topic, ORANGE, 11) for y, _, _, topic, _ in rows),
         text(516, 66, "what was published", DIM, 13),
         text(516, 84, "caused what received it", DIM, 13),
         text(516, 146, "timers come from time alone:", DIM, 13),

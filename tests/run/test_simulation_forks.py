@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -83,7 +84,7 @@ def test_each_fork_is_the_run_from_the_beginning_and_the_original_stays(tmp_path
         with Simulation(job(), tmp_path / f"whole{number}.mcap") as whole:
             whole.run_for(0.5)
             adding(number)(whole)
-        assert fork.result == whole.result or fork.result.digest == whole.result.digest
+        assert replace(fork.result, path=None) == replace(whole.result, path=None)
         traces = [(tmp_path / f"{name}{number}.mcap").read_bytes() for name in ("forked", "whole")]
         assert traces[0] == traces[1]
     assert nested.value == [1, 2, 3, 4, 5, 6, 7, 18, 19, 20]
