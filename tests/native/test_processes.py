@@ -291,7 +291,9 @@ def test_no_process_outlives_a_run_that_is_killed(tmp_path: Path) -> None:
 
 
 def test_the_job_is_judged_before_anything_begins(tmp_path: Path) -> None:
+    (tmp_path / "bad.yaml").write_text("gain: 2\n")
     for text, said in (
+        ("nodes: [{program: /bin/true, parameter_files: [bad.yaml]}]", "bad.yaml is no ROS param"),
         ("nodes: [{node: robot:Talker}, {main: robot:nothing}]", "job.yaml:2:"),
         ("nodes: [{main: robot_mains:talk, stdin: [x]}]", "a native run types nothing"),
         ("nodes: [{node: robot:Talker}]\nbags: [{path: nowhere}]", "nowhere"),

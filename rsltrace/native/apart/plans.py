@@ -7,12 +7,12 @@ import sys
 from dataclasses import replace
 
 from rsltrace.doors.processes.programs import is_python
-from rsltrace.doors.rclpy.entry import StartRule, ros_arguments
+from rsltrace.doors.rclpy.entry import StartRule
 from rsltrace.errors import SetupError
 from rsltrace.job import Job, NodeSpec, locate
 from rsltrace.native.apart.children import Start
 from rsltrace.native.apart.order import Order
-from rsltrace.run.plans.entries import arguments_for_all, entry_keys, start_rule
+from rsltrace.run.plans.entries import arguments_for_all, arguments_of, entry_keys, start_rule
 from rsltrace.run.plans.processes import Processes
 
 THE_BAGS = "the bags"
@@ -31,7 +31,7 @@ def starts_of(job: Job, like: Order) -> list[Start]:
     starts = []
     for index, (spec, key) in enumerate(zip(job.nodes, entry_keys(job.nodes), strict=True)):
         where = spec.origin or locate(job, ("nodes", index, spec.kind))
-        command = _command(job, told.nodes[index], processes, where)
+        command = _command(told, index, processes, where)
         starts.append(
             Start(
                 spec.target,
@@ -62,20 +62,13 @@ def _observed(job: Job, spec: NodeSpec) -> NodeSpec:
     return spec.model_copy(update=changes)
 
 
-def _command(job: Job, spec: NodeSpec, processes: Processes, where: str) -> tuple[str, ...]:
+def _command(job: Job, index: int, processes: Processes, where: str) -> tuple[str, ...]:
     """Return the command line of an entry that is not Python, empty for others."""
+    spec = job.nodes[index]
     words = processes.command(spec, where)
     if words is None:
         return ()
-    arguments = ros_arguments(
-        name=spec.name,
-        namespace=spec.namespace,
-        parameters=spec.parameters,
-        parameter_files=[job.resolve(path) for path in spec.parameter_files],
-        remappings=spec.remappings,
-        where=where,
-        for_all=arguments_for_all(job),
-    )
+    arguments = arguments_of(job, index, arguments_for_all(job), where=where)
     return (*words, *spec.arguments, *(word for part in arguments for word in part.arguments))
 
 

@@ -51,16 +51,7 @@ def node_entries(
         argv = program = None
         make: Any
         with showing_line(job, loc):
-            _check_parameter_files(job, index)
-            arguments = ros_arguments(
-                name=spec.name,
-                namespace=spec.namespace,
-                parameters=spec.parameters,
-                parameter_files=[job.resolve(path) for path in spec.parameter_files],
-                remappings=spec.remappings,
-                where=where,
-                for_all=for_all,
-            )
+            arguments = arguments_of(job, index, for_all, where=where)
             if spec.node is None and spec.component is None:
                 program = processes.find(spec, arguments, where=where)
             if spec.component is not None:
@@ -155,6 +146,24 @@ def previous_component(nodes: Sequence[NodeSpec], index: int) -> int | None:
         if (other.container, other.start_after) == (spec.container, spec.start_after):
             return place
     return None
+
+
+def arguments_of(job: Job, index: int, for_all: list[str], *, where: str) -> list[RosArguments]:
+    """Return the ROS arguments of an entry; ``for_all`` are those of all nodes.
+
+    :raises JobError: if rcl refuses them, or cannot read a parameter file.
+    """
+    _check_parameter_files(job, index)
+    spec = job.nodes[index]
+    return ros_arguments(
+        name=spec.name,
+        namespace=spec.namespace,
+        parameters=spec.parameters,
+        parameter_files=[job.resolve(path) for path in spec.parameter_files],
+        remappings=spec.remappings,
+        where=where,
+        for_all=for_all,
+    )
 
 
 def _check_parameter_files(job: Job, index: int) -> None:
