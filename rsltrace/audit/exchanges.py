@@ -28,8 +28,8 @@ def exchanged(
         yield from _known(node, _called_with(module, node, names))
     elif isinstance(node, ast.ClassDef):
         own_module = EXECUTOR.rpartition(".")[0]
-        for method in node.body:
-            for base in node.bases if isinstance(method, ast.FunctionDef) else ():
+        for method in (one for one in node.body if isinstance(one, ast.FunctionDef)):
+            for base in node.bases:
                 name = names.of(ast.Attribute(base, method.name, ast.Load()), module.scope_of(base))
                 if name is not None and name.startswith(own_module):
                     yield from _known(method, name)
