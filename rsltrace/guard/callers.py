@@ -125,7 +125,7 @@ def user_frame(frame: FrameType | None, packages: frozenset[str]) -> FrameType |
             if file == _THREADS:
                 return installed or library or standard
             return installed or (library and (library if _calls_back(file) else None))
-        if packages and is_in(frame, packages):
+        if packages and (_tops.get(file) or _top_of(frame, file)) in packages:
             return installed or frame
         if kind == _LIBRARY:
             library = frame

@@ -16,29 +16,33 @@ from typing import Any
 from rsltrace.guard.redirect import method_of
 
 
-def _frames() -> Iterator[Any]:
+def _callers() -> Iterator[Any]:
     own = sys._getframe(0)
     while True:
-        yield own.f_back.f_back.f_back  # type: ignore[union-attr]
+        yield own.f_back.f_back  # type: ignore[union-attr]
 
 
-_next_frame = _frames().__next__
+next_caller = _callers().__next__
+"""Return the frame that called who calls this: half of what ``caller`` takes. To be called as an
+attribute of this module, and if it raises ``INTERRUPTED``, ``lost_caller`` instead."""
+
+INTERRUPTED = (ValueError, StopIteration)
+"""A signal came while another call was there, or its handler has raised."""
+
+
+def lost_caller() -> FrameType:
+    """Return what ``next_caller`` should have."""
+    global next_caller
+    next_caller = _callers().__next__
+    return sys._getframe(2)
 
 
 def caller() -> FrameType:
     """Return the frame that called who calls this, as ``sys._getframe(1)`` there would."""
     try:
-        return _next_frame()  # type: ignore[no-any-return]
-    except ValueError:  # a signal came while another call was here
-        return sys._getframe(2)
-    except StopIteration:  # and its handler has raised
-        _begin_again()
-        return sys._getframe(2)
-
-
-def _begin_again() -> None:
-    global _next_frame
-    _next_frame = _frames().__next__
+        return next_caller().f_back  # type: ignore[no-any-return]
+    except INTERRUPTED:
+        return lost_caller().f_back  # type: ignore[return-value]
 
 
 code_of: Callable[[FrameType], CodeType] = method_of(
@@ -46,4 +50,4 @@ code_of: Callable[[FrameType], CodeType] = method_of(
 )
 """Return a frame's code."""
 
-__all__ = ["caller", "code_of"]
+__all__ = ["INTERRUPTED", "caller", "code_of", "lost_caller", "next_caller"]

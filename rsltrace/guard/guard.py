@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import threading
-from collections import Counter
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from types import FrameType
-from typing import Any, Protocol
+from typing import Any
+from weakref import WeakSet
 
 from rsltrace.errors import GuardError
 from rsltrace.guard.callers import (
@@ -22,13 +22,16 @@ from rsltrace.guard.callers import (
     STANDARD,
     USER,
     in_import,
+    is_in,
     module_of,
     stack_of,
     user_frame,
 )
+from rsltrace.guard.context import Context
 from rsltrace.guard.descriptor_table import DescriptorTable
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.library_imports import present_import
+from rsltrace.guard.looks_and_draws import AHEAD_NS_MAX, LOOK_NS, Clock, Draw, Shown
 from rsltrace.guard.object_numbers import ObjectNumbers, ShownNumbers
 from rsltrace.guard.random_streams import RandomStreams
 from rsltrace.guard.real_time import RealTimePace
@@ -38,8 +41,7 @@ from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
 _thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
-_here = _process_id()
-"""This process; asking the system each time would cost more than all the rest."""
+_guards: WeakSet[Guard] = WeakSet()
 
 FINDINGS_PER_EVENT = 100
 """An event that looks at the address of a million objects is one problem, not a million."""
@@ -47,58 +49,23 @@ FINDINGS_PER_EVENT = 100
 # Python takes longer to find a member of an Enum than all else that is asked of it.
 _ALLOW, _ERROR, _RANDOM = Mode.ALLOW, Mode.ERROR, Source.RANDOM
 _EACH = (Mode.ERROR, Mode.RECORD)
-_AT_LEAST = {Mode.VIRTUAL: Mode.WARN, Mode.RECORD: Mode.WARN}
-"""What can be neither made virtual nor recorded is at least reported."""
+_ALWAYS = (Mode.WARN, Mode.ERROR, Mode.ALLOW)
 
 _READS_PER_EVENT = 50_000
 _BUSY_NS = 10_000
-_LOOK_NS = 1_000
-"""What looking at a clock again takes: ``time.time()`` of this century cannot show much less."""
-_AHEAD_NS_MAX = 1_000_000
-_NEVER = (0, -1 << 63)
 
 
 def _forked() -> None:
-    global _here
-    _here = _process_id()
+    for guard in _guards:
+        guard.thread = 0  # in charge of no thread of a child
 
 
 os.register_at_fork(after_in_child=_forked)
 
 
-class Context(Protocol):
-    """What a guard asks of the simulation."""
-
-    def now_ns(self) -> int:
-        """Return simulated time."""
-
-    def look(self) -> tuple[int, str, int]:
-        """Return the index of the event under way, the node and simulated time."""
-
-    def node(self) -> str:
-        """Return the node whose code runs, or an empty text."""
-
-    def process(self) -> int:
-        """Return which of the run's processes that is: 0 has the nodes that the job constructs,
-        the mains count from 1 in the order of the job."""
-
-    def policy(self) -> Policy | None:
-        """Return the policy of that node, or None for the job's."""
-
-    def place(self) -> tuple[int, int]:
-        """Return the index of the event under way and the entity that runs."""
-
-    def pass_time(self, for_ns: int) -> None:
-        """Let simulated time pass, if whoever runs can wait."""
-
-    def is_aside(self) -> bool:
-        """Return whether others can go on while whoever runs waits for what is outside."""
-
-    def can_step(self) -> bool:
-        """Return whether whoever runs can wait in simulated time at all."""
-
-    def step(self, for_ns: int) -> None:
-        """Let simulated time pass while whoever runs waits for what is outside."""
+def at_least(mode: Mode) -> Mode:
+    """Return what is done where the run can make no answer and record none: it is reported."""
+    return mode if mode in _ALWAYS else Mode.WARN
 
 
 class Guard:
@@ -107,6 +74,39 @@ class Guard:
     ``modes`` says what is done about each source if that is the same for all code (``one_policy``,
     and no module is exempt), which spares most calls a question.
     """
+
+    __slots__ = (
+        "__weakref__",
+        "_answered",
+        "_clocks",
+        "_draws",
+        "_event",
+        "_found",
+        "_in_event",
+        "_look",
+        "_loop",
+        "_passes",
+        "_policy",
+        "_reads",
+        "_reads_event",
+        "_running",
+        "_shown",
+        "answers",
+        "context",
+        "descriptors",
+        "kinds",
+        "makes_chance",
+        "makes_clocks",
+        "modes",
+        "numbers",
+        "on_finding",
+        "pace",
+        "packages",
+        "process",
+        "shown",
+        "streams",
+        "thread",
+    )
 
     def __init__(
         self,
@@ -120,12 +120,16 @@ class Guard:
     ) -> None:
         self.context = context
         self._look = context.look
+        self._loop: Any
+        self._running: Any
+        self._loop, self._running = context.direct or (None, None)
         self.packages = packages
+        self.kinds: dict[str, int] = {}
+        """Whose the modules are that read clocks and draw, by ``__file__`` (see ``whose``)."""
         self.on_finding = on_finding
-        self._found: Counter[tuple[Source, Mode, str, str]] = Counter()
+        self._found: dict[tuple[Source, Mode, str, str], int] = {}
         self._answered: dict[Source, dict[str, dict[str, int]]] = {source: {} for source in Source}
-        self._clock_looks = self._answered[Source.CLOCK]
-        self._draws = self._answered[Source.RANDOM]
+        self._draws: dict[str, dict[str, Draw]] = {}
         self.streams = RandomStreams(seed)
         self.answers = RecordedAnswers()
         self.descriptors = DescriptorTable()
@@ -138,23 +142,32 @@ class Guard:
         self.makes_chance = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
         self.thread = _thread_id()
         self.process = _process_id()
+        _guards.add(self)
         self._event = -1
         self._in_event = 0
         self._reads = 0
         self._reads_event = -1
         self._passes = 0
-        self._shown: dict[str, tuple[int, int]] = {}
+        self._clocks: dict[str, dict[str, Clock]] = {}
+        self._shown: dict[str, Shown] = {}
 
     def goes_on_in(self, process: int) -> None:
         """Take note that the present process is a copy, made by the kernel's own ``fork``, which
         is in charge from now on."""
-        global _here
-        _here = self.process = process
+        self.process = process
 
     @property
     def counts(self) -> dict[tuple[Source, Mode, str, str], int]:
         """How often each call was met: by source, mode, node and call."""
         counts: dict[tuple[Source, Mode, str, str], int] = dict(self._found)
+        for call, clocks in self._clocks.items():
+            for node, clock in clocks.items():
+                if clock.looks:
+                    counts[Source.CLOCK, Mode.VIRTUAL, node, call] = clock.looks
+        for call, draws in self._draws.items():
+            for node, draw in draws.items():
+                if draw.count:
+                    counts[_RANDOM, Mode.VIRTUAL, node, call] = draw.count
         for source, calls in self._answered.items():
             for call, nodes in calls.items():
                 for node, count in nodes.items():
@@ -190,20 +203,33 @@ class Guard:
             return node
         return f"module {module_of(user_frame(frame, self.packages) or frame)}"
 
-    def drawn(self, call: str, frame: FrameType) -> str:
-        """Count a draw that the run makes; return the name of its stream."""
+    def known_draw(self, call: str, kind: int) -> Callable[..., Any] | None:
+        """Count a draw of the user's or rclpy's code; return what draws for the node that runs, or
+        None if none runs or it is its first."""
+        try:
+            draw = self._draws[call][self._running.node.key]
+        except (KeyError, AttributeError):
+            return None
+        if kind == USER:
+            draw.count += 1
+        return draw.function
+
+    def draw(
+        self, call: str, virtual: Callable[[Guard, str], Callable[..., Any]], frame: FrameType
+    ) -> Callable[..., Any]:
+        """Count a draw that the run makes; return what draws from the stream of whoever runs."""
         node = self.context.node()
         kind = KINDS[code_of(frame).co_filename]
-        if kind == OURS and node:  # rclpy, for itself: what the two below would find out
-            return node
-        if kind != USER:
-            self.count(_RANDOM, call, frame)
-            return self.stream(frame)
-        try:
-            self._draws[call][node] += 1
-        except KeyError:
-            self._draws.setdefault(call, {})[node] = 1
-        return node or self.stream(frame)
+        if node and (kind <= OURS or user_frame(frame, self.packages) is not None):
+            try:
+                draw = self._draws[call][node]
+            except KeyError:
+                draw = self._draws.setdefault(call, {})[node] = Draw(virtual(self, node))
+            if kind != OURS:
+                draw.count += 1
+            return draw.function
+        self.count(_RANDOM, call, frame)
+        return virtual(self, self.stream(frame))
 
     def is_user(self, frame: FrameType) -> bool:
         """Return whether a frame is user code itself."""
@@ -214,6 +240,13 @@ class Guard:
         """Return whether user code has led to a frame."""
         kind = KINDS[code_of(frame).co_filename]
         return kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None)
+
+    def user_of(self, frame: FrameType) -> FrameType | None:
+        """Return the frame of user code that has led to a frame, if any has."""
+        kind = KINDS[code_of(frame).co_filename]
+        if kind <= OURS:
+            return frame if kind == USER else None
+        return user_frame(frame, self.packages)
 
     def count(self, source: Source, call: str, frame: FrameType) -> None:
         """Count a call of user code that the run answers itself."""
@@ -251,16 +284,19 @@ class Guard:
         value: object,
         frame: FrameType,
         told: Callable[[Any], str] | None = None,
+        user: FrameType | None = None,
     ) -> None:
         """Report a call; ``frame`` is where it was made, ``told`` makes a text of its answer.
+        ``user`` is the frame of user code that led to it, for those who know.
 
         :raises GuardError: if the job says that it is an error.
         """
         node = self.context.node()
-        self._found[source, mode, node, call] += 1
+        key = (source, mode, node, call)
+        self._found[key] = self._found.get(key, 0) + 1
         event, entity = self.context.place()
         if self._has_room(event) or mode in _EACH:
-            user = user_frame(frame, self.packages)
+            user = user or user_frame(frame, self.packages)
             stack = stack_of(user or frame, self.packages)
             if told is not None:
                 text = told(value)
@@ -307,24 +343,43 @@ class Guard:
         mode = self.mode(source, frame)
         if mode is _ALLOW:
             return
-        self.found(source, _AT_LEAST.get(mode, mode), call, value, frame, told)
+        self.found(source, at_least(mode), call, value, frame, told)
 
-    def clock_ns(self, call: str, frame: FrameType, kind: int) -> int:
+    def whose(self, names: dict[str, Any], frame: FrameType) -> int:
+        """Return whose the code of a frame is, be it in a package of the nodes; remember it of its
+        module, whose ``names`` these are."""
+        file = code_of(frame).co_filename
+        kind = KINDS[file]
+        if kind > STANDARD and self.packages and is_in(frame, self.packages):
+            kind = USER
+        # What a decorator has made of a text is of no file, and a program may be a module, too.
+        if names.get("__file__") == file and names.get("__name__") != "__main__":
+            self.kinds[file] = kind
+        return kind
+
+    def clock_ns(self, call: str, kind: int, names: dict[str, Any], frame: Any = None) -> int:
         """Return what a clock of the node (of the module, where no node runs) shows: now.
 
         Real clocks never show the same twice, and code that measures durations (to divide by them,
         say) relies on it. So whoever looks again at one instant sees a little more each time;
         not so Python's own modules, which wait by what they see. Whoever looks until time has
         passed makes it pass. A library that is being imported has a clock of its own.
-        ``kind`` says whose file the code of ``frame`` is of.
+        ``kind`` says whose the code is that asks, with ``names`` in its module; ``frame`` is its
+        frame, if it is neither the user's nor rclpy's.
         """
-        look = self._look
-        event, node, now_ns = look()
+        look, running = self._look, self._running
+        present = running.node if running is not None else None
+        if present is None:
+            event, node, now_ns = look()
+        else:
+            loop = self._loop
+            event, node, now_ns = loop.events, present.key, loop.now_ns
+        try:
+            clock = self._clocks[call][node]
+        except KeyError:
+            clock = self._new_clock(call, node)
         if kind == USER or (kind != OURS and user_frame(frame, self.packages) is not None):
-            try:
-                self._clock_looks[call][node] += 1
-            except KeyError:
-                self._clock_looks.setdefault(call, {})[node] = 1
+            clock.looks += 1
         library = present_import()
         if library is not None:
             return now_ns + library.look()
@@ -337,14 +392,21 @@ class Guard:
             self._reads_event, node, now_ns = look()
         if kind == STANDARD:
             return now_ns
-        who = node or module_of(frame)
-        before_ns, shown_ns = self._shown.get(who, _NEVER)
-        if now_ns > shown_ns or now_ns < before_ns:  # a node's clock may jump backwards
-            shown_ns = now_ns
-        elif shown_ns - now_ns < _AHEAD_NS_MAX:
-            shown_ns += _LOOK_NS
-        self._shown[who] = now_ns, shown_ns
-        return shown_ns
+        shown = clock.shown if node else self._shown_by(f"module {names.get('__name__', '')}")
+        if now_ns is not shown.now_ns:
+            shown.see(now_ns)
+        elif shown.ahead_ns < AHEAD_NS_MAX:
+            shown.ahead_ns += LOOK_NS
+        return now_ns + shown.ahead_ns
+
+    def _shown_by(self, who: str) -> Shown:
+        shown = self._shown[who] = self._shown.get(who) or Shown()
+        return shown
+
+    def _new_clock(self, call: str, node: str) -> Clock:
+        clock = Clock(self._shown_by(node))
+        self._clocks.setdefault(call, {})[node] = clock
+        return clock
 
 
 ADVICE = {
@@ -369,7 +431,7 @@ def engaged() -> Guard | None:
     """Return the guard in charge of the calling thread (and of no child process), or None."""
     if _engaged:
         guard = _engaged[-1]
-        if guard.thread == _thread_id() and guard.process == _here:
+        if guard.thread == _thread_id():
             return guard
     return None
 

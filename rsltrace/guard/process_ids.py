@@ -36,6 +36,8 @@ def meant_id(pid: Any) -> Any:
 
 def meant_path(path: Any) -> Any:
     """Return a path below ``/proc`` with the real process id in it."""
+    if type(path) is str and path[:6] != _PROC:
+        return path
     text = os.fspath(path) if isinstance(path, PurePath) else path
     if isinstance(text, str) and text.startswith(_PROC):
         match = _OF_PROCESS.match(text)

@@ -26,6 +26,7 @@ _api = ctypes.pythonapi
 _EXPORTED = hasattr(_api, "PyObject_Vectorcall")  # not by Python 3.10
 _VECTORCALL_OF = _api.PyObject_Vectorcall if _EXPORTED else _api._PyFunction_Vectorcall
 _CALL = ctypes.cast(_VECTORCALL_OF, ctypes.c_void_p).value
+_NEXT = ctypes.cast(_api.PyIter_Next, ctypes.c_void_p).value
 _new_function = ctypes.PYFUNCTYPE(
     ctypes.py_object, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_void_p
 )(("PyCFunction_NewEx", _api))
@@ -66,37 +67,64 @@ class _Method(ctypes.Structure):
     )
 
 
-def _vectorcall() -> int:
+def _vectorcall(address: int | None, flags: int) -> int:
     """Return how Python calls built-in functions with the flags of ours."""
-    definition = _MethodDef(b"", _CALL, _FASTCALL_KEYWORDS, None)
+    definition = _MethodDef(b"", address, flags, None)
     function = _new_function(ctypes.addressof(definition), id(None), None)
     return int(_Function.from_address(id(function)).vectorcall)
 
 
-_VECTORCALL = _vectorcall()
+_VECTORCALLS = {
+    _FASTCALL_KEYWORDS: _vectorcall(_CALL, _FASTCALL_KEYWORDS),
+    _NO_ARGUMENTS: _vectorcall(_NEXT, _NO_ARGUMENTS),
+}
 
 
 class Redirected:
     """A built-in function that calls something else until ``restore``. ``real`` is what it was."""
 
     def __init__(self, function: BuiltinFunctionType, target: Callable[..., Any]) -> None:
+        self._turn(function, _callable(target), _CALL, _FASTCALL_KEYWORDS)
+
+    def _turn(
+        self, function: BuiltinFunctionType, target: object, address: int | None, flags: int
+    ) -> None:
         self._function = function
-        self._target = target = _callable(target)
+        self._target = target
         self.real = copy_of(function)
         place = _Function.from_address(id(function))
         self._saved = (place.definition, place.owner, place.vectorcall)
-        name = function.__name__.encode()
-        self._definition = _MethodDef(name, _CALL, _FASTCALL_KEYWORDS, None)
+        self._definition = _MethodDef(function.__name__.encode(), address, flags, None)
         _count_up(id(target))
         place.definition = ctypes.addressof(self._definition)
         place.owner = id(target)
-        place.vectorcall = _VECTORCALL
+        place.vectorcall = _VECTORCALLS[flags]
 
     def restore(self) -> None:
         """Let the function be what it was."""
         place = _Function.from_address(id(self._function))
         place.definition, place.owner, place.vectorcall = self._saved
         _count_down(id(self._target))
+
+
+class RedirectedRead(Redirected):
+    """A built-in function without arguments; ``target`` is called with the names of the module
+    that calls it.
+
+    Those are to be had in C, for a fraction of what a frame costs: nothing of Python's runs before
+    ``target``.
+    """
+
+    def __init__(
+        self, function: BuiltinFunctionType, target: Callable[[dict[str, Any]], Any]
+    ) -> None:
+        self._turn(function, map(target, iter(globals, None)), _NEXT, _NO_ARGUMENTS)
+
+
+def takes_nothing(function: BuiltinFunctionType) -> bool:
+    """Return whether a built-in function has no arguments, and so may be a ``RedirectedRead``."""
+    definition = _Function.from_address(id(function)).definition
+    return bool(_MethodDef.from_address(definition).flags == _NO_ARGUMENTS)
 
 
 def _callable(target: Callable[..., Any]) -> Callable[..., Any]:
@@ -135,6 +163,13 @@ def redirect(stack: ExitStack, function: Any, make: Callable[[Any], Callable[...
     stack.callback(Redirected(function, make(copy_of(function))).restore)
 
 
+def redirect_read(
+    stack: ExitStack, function: Any, make: Callable[[Any], Callable[[dict[str, Any]], Any]]
+) -> None:
+    """Redirect in the same way one that takes no arguments; ``RedirectedRead`` says to what."""
+    stack.callback(RedirectedRead(function, make(copy_of(function))).restore)
+
+
 def replace_attribute(stack: ExitStack, owner: Any, name: str, value: object) -> None:
     """Set an attribute of a module or class until ``stack`` ends."""
     stack.callback(setattr, owner, name, getattr(owner, name))
@@ -148,9 +183,10 @@ def copy_of(function: BuiltinFunctionType) -> Callable[..., Any]:
     """
     place = _Function.from_address(id(function))
     definition = place.definition
-    if definition and _MethodDef.from_address(definition).function == _CALL:
-        target: Callable[..., Any] = function.__self__  # type: ignore[assignment]
-        return target
+    calls = _MethodDef.from_address(definition).function if definition else None
+    if calls in (_CALL, _NEXT):
+        target: Any = function.__self__
+        return target if calls == _CALL else target.__next__  # type: ignore[no-any-return]
     name = _MethodDef.from_address(definition).name if definition else None
     owner = function.__self__
     if name != function.__name__.encode() or place.owner not in (None, id(owner)):

@@ -12,7 +12,8 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
-from rsltrace.guard.guard import Context, Guard, engage, engaged
+from rsltrace.guard.context import Context
+from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.real_time import STEP_NS
 from rsltrace.guard.recorded_answers import decoded, encoded_answer, finding_value

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import errno
+import json
 import os
 import random
 import sys
@@ -20,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rsltrace.guard import frames
-from rsltrace.guard.callers import USER
+from rsltrace.guard.callers import STANDARD, USER
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard
 from rsltrace.model.finding import Policy
@@ -320,6 +321,8 @@ def test_two_simulations_in_one_process_do_not_disturb_each_other(tmp_path: Path
 class Standing:
     """A simulation whose time the test sets, and the node that runs."""
 
+    direct = None
+
     def __init__(self) -> None:
         self.time_ns = 0
         self.runs = "/a"
@@ -344,7 +347,7 @@ class Standing:
 
 
 def _look(guard: Guard, frame: FrameType) -> int:
-    return guard.clock_ns("a clock", frame, USER)
+    return guard.clock_ns("a clock", USER, frame.f_globals)
 
 
 @given(
@@ -425,7 +428,7 @@ def test_who_calls_is_known_after_a_handler_has_raised_while_it_was_asked() -> N
     here = sys._getframe()
     assert asked() is here
     with pytest.raises(KeyboardInterrupt):
-        frames._next_frame.__self__.throw(KeyboardInterrupt)  # type: ignore[attr-defined]
+        frames.next_caller.__self__.throw(KeyboardInterrupt)  # type: ignore[attr-defined]
     assert asked() is here
     assert asked() is here
 
@@ -458,3 +461,32 @@ def test_every_machine_has_as_many_processors(said: Said) -> None:
     real = node_code("self.say(os.cpu_count(), len(os.sched_getaffinity(0)))", imports="import os")
     job = "nodes: [{node: 'm:N'}]\nguard: {environment: allow}"
     assert said(real, job=job)[0] == [os.cpu_count(), len(before)]
+
+
+def test_a_clock_that_is_given_something_refuses_it_as_ever(said: Said) -> None:
+    code = node_code(
+        "for call in (time.time, time.monotonic_ns, random.random):\n"
+        "    try: call(1)\n"
+        "    except TypeError as error: self.say(str(error))\n",
+        imports="import random, time",
+    )
+    for (text,), name in zip(said(code), ("time", "monotonic_ns", "random"), strict=False):
+        assert text.endswith(f".{name}() takes no arguments (1 given)")
+
+
+def test_whose_code_reads_a_clock_is_told_from_its_file_and_not_from_its_modules() -> None:
+    """A decorator's text is of no file, and what a program has compiled is of the file it says."""
+    guard = Guard(Standing(), policy=Policy(), packages=frozenset(("pack",)))
+    places = {"here": sys._getframe().f_code.co_filename, "json": json.__file__}
+
+    def whose(name: str, file: str, **more: str) -> tuple[int, dict[str, int]]:
+        names = {"whose": guard.whose, "frame": sys._getframe, "__file__": name, **more}
+        exec(compile("kind = whose(globals(), frame())", file, "exec"), names)
+        return names["kind"], guard.kinds  # type: ignore[return-value]
+
+    assert whose(places["json"], "<text>") == (USER, {})
+    assert whose(places["json"], places["here"]) == (USER, {})
+    assert whose(places["json"], places["json"], __name__="__main__") == (STANDARD, {})
+    assert whose(places["json"], places["json"]) == (STANDARD, {places["json"]: STANDARD})
+    installed = "/x/site-packages/pack/node.py"
+    assert whose(installed, installed, __name__="pack.node")[0] == USER

@@ -16,17 +16,12 @@ class GuardContext:
 
     def __init__(self, stacks: Stacks, clocks: NodeClocks | None) -> None:
         self._stacks = stacks
-        self._loop, self._event = stacks.loop, stacks.event
         self._clocks = clocks
+        self.direct = (stacks.loop, stacks.event) if clocks is None else None
 
     def look(self) -> tuple[int, str, int]:
         """Return the index of the event under way, the node and simulated time."""
-        loop, node = self._loop, self._event.node
-        if node is None:
-            return loop.events, self.node(), loop.now_ns
-        if self._clocks is None:
-            return loop.events, node.key, loop.now_ns
-        return loop.events, node.key, self._clocks.shows(node.fully_qualified_name, loop.now_ns)
+        return self._stacks.loop.events, self.node(), self.now_ns()
 
     def now_ns(self) -> int:
         """Return simulated time."""

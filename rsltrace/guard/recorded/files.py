@@ -7,13 +7,14 @@ import os
 import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
+from functools import lru_cache, partial
 from sys import _getframe
 from typing import Any
 
-from rsltrace.guard.callers import is_nobodys
+from rsltrace.guard import frames
+from rsltrace.guard.asked_files import NOT_NEWS, asking_module, is_installed
 from rsltrace.guard.frames import caller
-from rsltrace.guard.guard import Guard
+from rsltrace.guard.guard import Guard, at_least, engaged
 from rsltrace.guard.process_ids import meant_path
 from rsltrace.guard.recorded.descriptors import (
     RawDescriptor,
@@ -24,9 +25,10 @@ from rsltrace.guard.recorded.descriptors import (
     tracked,
 )
 from rsltrace.guard.redirect import copy_of, redirect
-from rsltrace.model.finding import Source
+from rsltrace.model.finding import Mode, Source
 
 _FILE = Source.FILE
+_RECORD, _ALLOW = Mode.RECORD, Mode.ALLOW
 BYTES_MAX = 64 << 20
 
 
@@ -109,30 +111,55 @@ def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[...,
 
 
 _real_stat = copy_of(os.stat)  # type: ignore[arg-type]
-_REAL = {"stat": _real_stat, "lstat": copy_of(os.lstat)}  # type: ignore[arg-type]
 
 
-def _looking(name: str, plain: Callable[..., Any], real: Callable[..., Any]) -> Any:
+def _looking(name: str, real: Callable[..., Any]) -> Any:
     def stat(path: Any, **options: Any) -> Any:
-        frame = caller()
-        if is_nobodys(frame):  # nor does the watch below have to know
-            return plain(path, **options) if options else plain(path)
-        path = meant_path(path)
-        guard = None if isinstance(path, int) else recording(_FILE, frame)
+        guard = engaged()
         if guard is None:
             return real(path, **options) if options else real(path)
-        call = f"{name}({os.fsdecode(path)!r})"
-        return recorded_stat(guard, Source.FILE, call, lambda: real(path, **options), frame)
+        try:
+            frame = frames.next_caller()
+        except frames.INTERRUPTED:
+            frame = frames.lost_caller()
+        user = guard.user_of(frame)
+        if user is None:
+            return real(path, **options) if options else real(path)
+        path = meant_path(path)
+        mode = guard.mode(_FILE, frame)
+        if mode is _RECORD and not isinstance(path, int):
+            call = f"{name}({os.fsdecode(path)!r})"
+            return recorded_stat(guard, _FILE, call, lambda: real(path, **options), frame)
+        value = real(path, **options) if options else real(path)
+        if mode is not _ALLOW and asking_module(frame) not in NOT_NEWS:
+            is_plain = type(path) is str and path[:1] == "/"
+            call = _news_of_path(name, path) if is_plain else _news(name, path)
+            if call:
+                guard.found(_FILE, at_least(mode), call, value, frame, _told, user)
+        return value
 
     return stat
 
 
+def _news(name: str, path: Any) -> str:
+    """Return what a look at a file is called, an empty text if it is none worth telling."""
+    return "" if is_installed(path) else f"{name}({repr(path)[:100]})"
+
+
+_news_of_path = lru_cache(maxsize=4096)(_news)
+"""The same for an absolute path, which means the same whatever the working directory is."""
+
+
+def _told(found: os.stat_result) -> str:
+    return f"{found.st_size} bytes, changed {found.st_mtime_ns}"
+
+
 @contextmanager
 def recorded_files() -> Iterator[None]:
-    """Let files that are read, and their times, answer from the trace in a re-run."""
+    """Let files that are read, and their times, answer from the trace in a re-run; report looks
+    at files that are not recorded."""
     with ExitStack() as stack:
         redirect(stack, io.open, _opening)
-        for name, plain in _REAL.items():
-            # Outermost: what is recorded here is no finding of the watch below.
-            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}", plain))
+        for name in ("stat", "lstat"):
+            redirect(stack, getattr(os, name), partial(_looking, f"os.{name}"))
         yield

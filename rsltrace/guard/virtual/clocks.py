@@ -17,11 +17,12 @@ from functools import partial
 from types import BuiltinFunctionType, FrameType
 from typing import Any
 
+from rsltrace.guard import frames
 from rsltrace.guard.callers import KINDS, OURS
 from rsltrace.guard.extension_types import put_member
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.redirect import Redirected, copy_of, redirect
+from rsltrace.guard.redirect import Redirected, copy_of, redirect, redirect_read
 from rsltrace.model.finding import Mode, Source
 
 _NS = 1_000_000_000
@@ -71,7 +72,8 @@ def clock_call(
         )
     mode = guard.mode(_CLOCK, frame)
     if mode is _VIRTUAL:
-        return virtual(guard.clock_ns(call, frame, KINDS[code_of(frame).co_filename]))
+        kind = KINDS[code_of(frame).co_filename]
+        return virtual(guard.clock_ns(call, kind, frame.f_globals, frame))
     if mode is Mode.ALLOW:
         return real()
     if mode is Mode.RECORD:
@@ -83,27 +85,41 @@ def clock_call(
     return value
 
 
-def _readers() -> dict[str, Callable[[int], Any]]:
-    """Return what each clock function gives at a simulated time in nanoseconds."""
-    readers: dict[str, Callable[[int], Any]] = {}
-    for name in ("time", "monotonic", "perf_counter", "process_time", "thread_time"):
-        readers[name] = lambda now_ns: now_ns / _NS
-        readers[f"{name}_ns"] = lambda now_ns: now_ns
-    return readers
+_READERS = ("time", "monotonic", "perf_counter", "process_time", "thread_time")
 
 
-def _reading(name: str, virtual: Callable[[int], Any], real: Callable[..., Any]) -> Any:
-    call = f"time.{name}()"
+def _seconds(now_ns: int) -> float:
+    return now_ns / _NS
 
-    def read(*arguments: Any) -> Any:
-        guard = None if arguments else engaged()
+
+def _nanoseconds(now_ns: int) -> int:
+    return now_ns
+
+
+def _reading(name: str, real: Callable[[], Any]) -> Callable[[dict[str, Any]], Any]:
+    call, in_ns = f"time.{name}()", name.endswith("_ns")
+    virtual: Callable[[int], Any] = _nanoseconds if in_ns else _seconds
+
+    def read(names: dict[str, Any]) -> Any:
+        guard = engaged()
         if guard is None:
-            return real(*arguments)
-        frame = caller()
-        kind = KINDS[code_of(frame).co_filename]
-        if kind <= OURS and guard.makes_clocks:  # of users and of rclpy: most calls
-            return virtual(guard.clock_ns(call, frame, kind))
-        return clock_call(guard, frame, call, virtual, real)
+            return real()
+        frame = None
+        try:
+            kind = guard.kinds[names["__file__"]]
+        except (KeyError, TypeError):
+            frame = caller()
+            kind = guard.whose(names, frame)
+        if kind > OURS or not guard.makes_clocks:
+            if frame is None:
+                try:
+                    frame = frames.next_caller()
+                except frames.INTERRUPTED:
+                    frame = frames.lost_caller()
+            if not guard.makes_clocks or names.get("__name__") in REAL_TIME_MODULES:
+                return clock_call(guard, frame, call, virtual, real)
+        now_ns = guard.clock_ns(call, kind, names, frame)
+        return now_ns if in_ns else now_ns / _NS
 
     return read
 
@@ -233,13 +249,13 @@ def virtual_clocks() -> Iterator[None]:
     """Redirect every clock; which guard answers is asked at each call."""
     with ExitStack() as stack:
 
-        def redirect_time(name: str, make: Callable[[Any], Any]) -> None:
+        def redirect_time(name: str, make: Callable[[Any], Any], how: Any = redirect) -> None:
             function = getattr(time, name, None)
             if isinstance(function, BuiltinFunctionType):
-                redirect(stack, function, make)
+                how(stack, function, make)
 
-        for name, virtual in _readers().items():
-            redirect_time(name, partial(_reading, name, virtual))
+        for name in (*_READERS, *(f"{name}_ns" for name in _READERS)):
+            redirect_time(name, partial(_reading, name), redirect_read)
         localtime = copy_of(time.localtime)  # type: ignore[arg-type]
         redirect_time(
             "clock_gettime", lambda real: _clock_gettime("clock_gettime", lambda ns: ns / _NS, real)

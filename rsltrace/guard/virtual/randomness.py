@@ -16,17 +16,21 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from sys import _getframe
-from types import BuiltinFunctionType, FunctionType, MethodType
+from types import BuiltinFunctionType, FrameType, FunctionType, MethodType
 from typing import Any
 
-from rsltrace.guard.frames import caller
+from rsltrace.guard import frames
+from rsltrace.guard.callers import KINDS, OURS
+from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.redirect import (
     Redirected,
     RedirectedMethod,
+    RedirectedRead,
     copy_of,
     redirect,
     replace_attribute,
+    takes_nothing,
 )
 from rsltrace.model.finding import Mode, Source
 
@@ -38,12 +42,12 @@ _NODE_ID = 0x02_00_00_00_00_01
 _real_entropy = copy_of(os.urandom)  # type: ignore[arg-type]
 
 
+_Virtual = Callable[[Guard, str], Callable[..., Any]]
+"""Returns what draws from the stream of that name."""
+
+
 def _drawn(
-    call: str,
-    real: Callable[..., Any],
-    virtual: Callable[[Guard, str], Callable[..., Any]],
-    *,
-    is_method: bool = False,
+    call: str, real: Callable[..., Any], virtual: _Virtual, *, is_method: bool = False
 ) -> Any:
     """Return the stand-in for a function that answers by chance; a method's owner is dropped."""
 
@@ -53,23 +57,60 @@ def _drawn(
         guard = engaged()
         if guard is None:
             return real(*arguments, **options)
-        frame = caller()
-        if guard.makes_chance or (mode := guard.mode(_RANDOM, frame)) is Mode.VIRTUAL:
-            return virtual(guard, guard.drawn(call, frame))(*arguments, **options)
-        if mode is Mode.RECORD:
-            stream = guard.stream(frame)
-            guard.streams.begin(
-                stream,
-                lambda: guard.recorded(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
-            )
-            return virtual(guard, stream)(*arguments, **options)
-        if mode is Mode.ALLOW:
-            return real(*arguments, **options)
-        value = real(*arguments, **options)
-        guard.found(_RANDOM, mode, call, value, frame, _shown)
-        return value
+        try:
+            frame = frames.next_caller()
+        except frames.INTERRUPTED:
+            frame = frames.lost_caller()
+        if guard.makes_chance:
+            kind = KINDS[code_of(frame).co_filename]
+            drawing = guard.known_draw(call, kind) if kind <= OURS else None
+            return (drawing or guard.draw(call, virtual, frame))(*arguments, **options)
+        return _answer(guard, frame, call, virtual, partial(real, *arguments, **options))
 
     return draw
+
+
+def _drawn_plainly(
+    call: str, real: Callable[[], Any], virtual: _Virtual
+) -> Callable[[dict[str, Any]], Any]:
+    """Return the same for a function without arguments, for ``RedirectedRead``."""
+
+    def draw(names: dict[str, Any]) -> Any:
+        guard = engaged()
+        if guard is None:
+            return real()
+        frame = None
+        try:
+            kind = guard.kinds[names["__file__"]]
+        except (KeyError, TypeError):
+            frame = caller()
+            kind = guard.whose(names, frame)
+        if guard.makes_chance:
+            drawing = guard.known_draw(call, kind) if kind <= OURS else None
+            return (drawing or guard.draw(call, virtual, frame or caller()))()
+        return _answer(guard, frame or caller(), call, virtual, partial(real))
+
+    return draw
+
+
+def _answer(
+    guard: Guard, frame: FrameType, call: str, virtual: _Virtual, real: partial[Any]
+) -> Any:
+    """Draw as the job says."""
+    mode = guard.mode(_RANDOM, frame)
+    if mode is Mode.VIRTUAL:
+        return guard.draw(call, virtual, frame)(*real.args, **real.keywords)
+    if mode is Mode.RECORD:
+        stream = guard.stream(frame)
+        guard.streams.begin(
+            stream,
+            lambda: guard.recorded(_RANDOM, "entropy", lambda: _real_entropy(32).hex(), frame),
+        )
+        return virtual(guard, stream)(*real.args, **real.keywords)
+    value = real()
+    if mode is not Mode.ALLOW:
+        guard.found(_RANDOM, mode, call, value, frame, _shown)
+    return value
 
 
 def _shown(value: object) -> str:
@@ -127,15 +168,19 @@ def _module_functions(
     for name, function in sorted(vars(module).items()):
         if getattr(function, "__self__", None) is not owner or function.__name__ != name:
             continue
-        kind = RedirectedMethod if isinstance(function, MethodType) else Redirected
         real = getattr(owner, name)  # a new object: only the module's own is redirected
 
         def virtual(guard: Guard, stream: str, name: str = name) -> Any:
             return getattr(generator(guard, stream), name)
 
-        is_method = kind is RedirectedMethod
-        draw = _drawn(f"{prefix}.{name}()", real, virtual, is_method=is_method)
-        stack.callback(kind(function, draw).restore)
+        call = f"{prefix}.{name}()"
+        if isinstance(function, MethodType):
+            draw = _drawn(call, real, virtual, is_method=True)
+            stack.callback(RedirectedMethod(function, draw).restore)
+        elif takes_nothing(function):
+            stack.callback(RedirectedRead(function, _drawn_plainly(call, real, virtual)).restore)
+        else:
+            stack.callback(Redirected(function, _drawn(call, real, virtual)).restore)
 
 
 def _entropy(stack: ExitStack) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from types import FrameType
 from typing import Any
 
+from rsltrace.guard.asked_files import READERS_OF_CODE, asking_module, is_installed
 from rsltrace.guard.callers import user_frame
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engage, engaged
@@ -20,19 +21,6 @@ from rsltrace.model.finding import Mode, Source
 
 _HASHED_BYTES_MAX = 64 << 20
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
-_INSTALLED = (
-    os.path.join(sys.prefix, ""),
-    os.path.join(sys.base_prefix, ""),
-    "/usr/share/zoneinfo/",
-    "/usr/lib/",
-    "/etc/mime.types",
-    "/dev/null",
-    "/dev/tty",
-)
-READERS_OF_CODE = {"linecache", "tokenize", "inspect", "traceback", "zipimport", "pkgutil"}
-_BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
-"""By way of which others ask the file system."""
-
 _PROCESSES = {
     "subprocess.Popen": "subprocess.Popen",
     "os.system": "os.system",
@@ -119,15 +107,6 @@ def _opened(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     return Source.FILE, f"open({name!r})", _content(name)
 
 
-def asking_module(frame: FrameType) -> str | None:
-    """Return the name of the module that asks the file system, be it by way of ``os.path``."""
-    name = frame.f_globals.get("__name__")
-    while name in _BETWEEN and frame.f_back is not None:
-        frame = frame.f_back
-        name = frame.f_globals.get("__name__")
-    return name
-
-
 def _content(name: str) -> str:
     """Say what is in a file, in few characters."""
     try:
@@ -146,17 +125,6 @@ def _foreign_function(arguments: tuple[Any, ...], frame: FrameType) -> _Wanted:
     name = str(arguments[1])
     source = FOREIGN.get(name)
     return None if source is None else (source, f"C library: {name}()", "")
-
-
-def is_installed(path: object) -> bool:
-    """Return whether a file is part of what is installed, whose versions a trace knows."""
-    if not isinstance(path, (str, bytes, os.PathLike)):
-        return False
-    name = os.fsdecode(path)
-    if not name.startswith(os.sep) or "/." in name or "//" in name:
-        with engage(None):  # the working directory that is asked for is no finding
-            name = os.path.abspath(name)
-    return name.startswith(_INSTALLED)
 
 
 def _one(source: Source, name: str) -> Callable[[tuple[Any, ...], FrameType], _Wanted]:

@@ -19,20 +19,13 @@ from types import BuiltinFunctionType
 from typing import Any
 
 from rsltrace.guard.addresses import hashed_by_address, is_by_address
+from rsltrace.guard.asked_files import NOT_NEWS, asking_module, is_installed
 from rsltrace.guard.frames import caller, code_of
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
-from rsltrace.guard.watched.audit_hook import (
-    READERS_OF_CODE,
-    asking_module,
-    is_installed,
-    report_audit_events,
-)
+from rsltrace.guard.watched.audit_hook import report_audit_events
 from rsltrace.guard.watched.environment import environment_watched
 from rsltrace.model.finding import Mode, Source
-
-_NOT_NEWS = {"logging", "threading", *READERS_OF_CODE}
-"""Modules that look at such things for records of their own."""
 
 _SQL = re.compile(
     r"'now'|\bCURRENT_(?:TIME|DATE|TIMESTAMP)\b|\b(?:julianday|unixepoch|date|time|datetime)\(\s*\)"
@@ -71,7 +64,7 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
         frame = caller()
         if not guard.is_for_user(frame):
             return real(*arguments, **options)  # ROS and Python, for themselves
-        if not is_thread and asking_module(frame) in _NOT_NEWS:
+        if not is_thread and asking_module(frame) in NOT_NEWS:
             return real(*arguments, **options)
         shown = ""
         if is_file:
@@ -89,8 +82,6 @@ def _watching(source: Source, name: str, real: Callable[..., Any]) -> Any:
 
 
 def _told(value: Any) -> str:
-    if hasattr(value, "st_mtime_ns"):
-        return f"{value.st_size} bytes, changed {value.st_mtime_ns}"
     return f"{len(value)} elements" if isinstance(value, list) else repr(value)[:200]
 
 
@@ -150,7 +141,7 @@ def _watched_functions() -> Iterator[tuple[Source, str, Any]]:
         yield Source.ENVIRONMENT, name, function
     for name, function in builtin(sys, "getallocatedblocks"):
         yield Source.ENVIRONMENT, name, function
-    for name, function in builtin(os, "stat", "lstat", "statvfs", "fstatvfs"):
+    for name, function in builtin(os, "statvfs", "fstatvfs"):
         yield Source.FILE, name, function
     for name, function in builtin(_thread, "start_new_thread", "start_joinable_thread"):
         yield Source.THREAD, name, function
