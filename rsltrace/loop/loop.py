@@ -73,6 +73,9 @@ class EventLoop:
     on by ``min_step_ns`` at least; what is due in between runs late.
     """
 
+    polls = False
+    """Whether executors find out what is ready only at polling points: see ``wait_set.py``."""
+
     def __init__(
         self,
         *,

@@ -33,12 +33,14 @@ class Place:
     """What the loop has to know of something that may run.
 
     ``workers`` is None for what runs on no simulated executor. ``exclusive`` is the mutually
-    exclusive callback group, or None.
+    exclusive callback group, or None. To dispatch what is ``told`` only tells an executor of the
+    user's own of it.
     """
 
     candidate: Candidate
     workers: Workers | None
     exclusive: object | None
+    told: bool = False
 
 
 class Charge:
@@ -157,10 +159,17 @@ class OrderedLoop(EventLoop):
         if forced is not None:
             self._take_out(forced)
             return forced
+        polls = self.polls
+        if polls:
+            self.hand_over()
+        tasks: list[Place] = []
         for place in self._tasks.runnable():
+            if polls and place.candidate.kind == "task":
+                tasks.append(place)
+                continue
             self._tasks.places.remove(place)
             return place
-        places = self._waiting()
+        places = tasks + self._waiting()
         if not places:
             return None
         candidates = [place.candidate for place in places]
@@ -188,6 +197,28 @@ class OrderedLoop(EventLoop):
     def run_next(self, place: Place) -> None:
         """Run one of ``runnable`` before anything else, once the event under way gives way."""
         self._forced = place
+
+    @property
+    def polls(self) -> bool:  # type: ignore[override]
+        """Whether the policy is asked for what executors of the user's own run, and for tasks."""
+        from_ns: int | None = getattr(self.policy, "polls_from_ns", None)
+        return from_ns is not None and self.now_ns > from_ns
+
+    def hand_over(self) -> None:
+        """Tell executors of the user's own of all that is ready for them by now."""
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        for place in [*self._tasks.places, *self._ready.places, *timers]:
+            item: Dispatchable = place.candidate.item
+            if place.told and self.place(item).told:
+                self._take_out(place)
+                item.dispatch()
+
+    def forget(self, executor: str) -> None:
+        """Tell the policy that an executor begins anew, if it wants to know."""
+        forget = getattr(self.policy, "forget", None)
+        if forget is not None:
+            forget(executor)
 
     def choose(self, ready: list[Candidate]) -> int:
         """Have the policy choose; return the index of what it has chosen.

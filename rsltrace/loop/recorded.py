@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 from rsltrace.errors import RunError
 from rsltrace.loop.policy import Candidate, Moment
+from rsltrace.loop.search_policies import After
+from rsltrace.loop.wait_set import RclpyWaitSet
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import format_seconds
@@ -79,6 +81,14 @@ class Recorded:
         self.event = event
         self.name_of = name_of
         self._chosen = chosen
+        self.polls_from_ns: int | None = None
+        self.forget: Callable[[str], None] | None = None
+
+    def poll_as(self, policy: RclpyWaitSet | After) -> None:
+        """Have executors poll as in the recording: of that policy's choices, all follow from what
+        has happened."""
+        self._chosen = policy.choose
+        self.polls_from_ns, self.forget = policy.polls_from_ns, policy.forget
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         chosen = None if self._chosen is None else self._chosen(ready, moment)

@@ -81,6 +81,8 @@ class After:
         self._time_ns = time_ns
         self._policy = policy
         self.follows_chains = getattr(policy, "follows_chains", False)
+        self.polls_from_ns = time_ns if hasattr(policy, "polls_from_ns") else None
+        self.forget = getattr(policy, "forget", None)
 
     def choose(self, ready: Sequence[Candidate], moment: Moment) -> int:
         return 0 if moment.now_ns <= self._time_ns else self._policy.choose(ready, moment)

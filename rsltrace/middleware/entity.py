@@ -19,7 +19,8 @@ class Runnable:
     ``kind`` and ``name`` are what a policy sees, ``group`` is what keeps others from running at the
     same time (a mutually exclusive callback group) with the names of its members. What has no
     ``executor`` runs on none of the simulated ones. ``thread`` tells apart callbacks of one entity
-    that are under way at the same time, where threads are switched at lines.
+    that are under way at the same time, where threads are switched at lines, and numbers tasks.
+    What is ``told`` is left to an executor of the user's own.
     """
 
     kind: str
@@ -31,12 +32,13 @@ class Runnable:
     period_ns: int | None = None
     executor: bool = True
     thread: int = 0
+    told: bool = False
 
 
-def on_no_executor(node: Any, name: str) -> Runnable:
-    """Describe what runs on no executor: a thread, say."""
+def on_no_executor(node: Any, name: str, kind: str = "thread", *, told: bool = False) -> Runnable:
+    """Describe what runs on none of the simulated executors: a thread, say."""
     period_ns = None if node is None else node.shortest_period_ns()
-    return Runnable("thread", name, 0, node, period_ns=period_ns, executor=False)
+    return Runnable(kind, name, 0, node, period_ns=period_ns, executor=False, told=told)
 
 
 class Membership(Protocol):

@@ -114,7 +114,7 @@ class Scheduling:
             what.thread,
             "" if workers is None else workers.name,
         )
-        return Place(candidate, workers, what.group)
+        return Place(candidate, workers, what.group, what.told)
 
     def _workers_of(self, what: Runnable) -> Workers | None:
         """Return the simulated executor that something runs on, if it does on any."""

@@ -13,7 +13,7 @@ Made by `python tests/rclpy_suite --rclpy PATH --baseline LIST --document VERSIO
 checkout of rclpy (none of its code is kept here):
 
 - **here**: each test module is the `main:` of a job with `clocks: {{source: topic, advances:
-  true}}`, in rsltrace's process;
+  true}}` and [`policy: rclpy`](policies.md), in rsltrace's process;
 - **process**: pytest runs each as an `isolated: true` script with `clocks: {{source: topic}}`:
   rclpy and its compiled parts, unmodified, on [the library of processes](processes.md).
 

@@ -6,19 +6,9 @@ because something is missing or wrong does not belong here.
 
 from __future__ import annotations
 
-_NEWEST = (
-    "expects the newest task to run first, an accident of rclpy's list of tasks; here the oldest"
-)
-_WAIT_SET = (
-    "expects the order in which rclpy walks one wait set (subscriptions before clients); here what "
-    "came first runs first"
-)
 _NATIVE = "fails natively, too: it asks a node that does not exist"
 
 _HERE: dict[str, str] = {
-    "test/test_action_server.py::TestActionServer::test_different_feedback_type_raises": _WAIT_SET,
-    "test/test_action_server.py::TestActionServer::test_feedback": _WAIT_SET,
-    "test/test_executor.py::TestExecutor::test_create_task_dependent_coroutines": _NEWEST,
     "test/test_type_description_service.py::TestTypeDescriptionService::"
     "test_get_type_description": _NATIVE,
 }

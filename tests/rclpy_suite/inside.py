@@ -70,13 +70,15 @@ def simulate(request: dict[str, Any], reporter: Reporter) -> None:
 
     folder = Path(request["folder"])
     clocks: dict[str, object] = {"source": "topic"}
+    policy = None
     if request["where"] == "process":
         words = [json.dumps({**request, "where": "here"})]
         node = NodeSpec(script=Path(__file__), isolated=True, arguments=words)
     else:
         node = NodeSpec(main=partial(run_pytest, request, reporter))
         clocks["advances"] = True
-    job = Job(nodes=[node], base_dir=folder, start=1000.0, clocks=clocks)
+        policy = "rclpy"
+    job = Job(nodes=[node], base_dir=folder, start=1000.0, clocks=clocks, policy=policy)
     result = run(job, folder / f"{request['module']}.mcap", force=True)
     # Of interest if a test is under way: it waits for what never comes.
     reason = str(result.error) if result.error is not None else result.stop_reason

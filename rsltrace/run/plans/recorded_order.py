@@ -17,7 +17,8 @@ from rsltrace.loop.observed_order import CALLBACKS, Observed, ObservedOrder
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
 from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
-from rsltrace.loop.search_policies import Departure, Departures, Pct
+from rsltrace.loop.search_policies import After, Departure, Departures, Pct
+from rsltrace.loop.wait_set import RclpyWaitSet
 from rsltrace.model.event import EventKind
 from rsltrace.run.plans.scheduling import of_order, own_policy
 from rsltrace.trace.native import is_native
@@ -31,6 +32,8 @@ if TYPE_CHECKING:
 
 ATTACHMENT_CHOICES = "rsltrace/choices"
 """What the policy of the run has chosen; see ``rsltrace.loop.choices``."""
+ATTACHMENT_POLLS = "rsltrace/polls"
+"""From when on executors had polling points, see ``OrderedLoop.polls``."""
 
 
 def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | ObservedRun | None:
@@ -53,6 +56,9 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
         observed = [Observed(index, one) for index, one in events if one.kind in CALLBACKS]
         return ObservedRun(domain.dispatcher, ObservedOrder(file, observed, census.describe_all()))
     order = Recorded(file, _Events(trace).event, _chosen(trace), census.describe_all())
+    from_ns = _polls_from_ns(trace)
+    if from_ns is not None:
+        order.poll_as(RclpyWaitSet() if from_ns < 0 else After(from_ns, RclpyWaitSet()))
     return RecordedRun(domain.dispatcher, order, is_whole=trace.complete)
 
 
@@ -83,6 +89,20 @@ def keep_choices(writer: TraceWriter, loop: EventLoop) -> None:
     if isinstance(loop, OrderedLoop) and loop.choices:
         data = loop.choices.encoded()
         writer.add_attachment(ATTACHMENT_CHOICES, "application/octet-stream", data)
+    policy = loop.policy if isinstance(loop, OrderedLoop) else None
+    from_ns = getattr(policy, "polls_from_ns", None)
+    if from_ns is not None:
+        writer.add_attachment(ATTACHMENT_POLLS, "text/plain", str(from_ns).encode())
+
+
+def _polls_from_ns(trace: Trace) -> int | None:
+    """Return from when on the recording's executors polled, None if they did not."""
+    data = trace.attachment(ATTACHMENT_POLLS)
+    if data is not None:
+        return int(data)
+    policy = (json.loads(trace.job.get("resolved") or "null") or {}).get("policy") or {}
+    made = None if policy.get("after_ns") else of_order(str(policy.get("order")), 0)
+    return getattr(made, "polls_from_ns", None)  # it was cut off
 
 
 def _chosen(trace: Trace) -> Callable[[Sequence[Candidate], Moment], int | None] | None:

@@ -29,6 +29,7 @@ class Part(ReceiverHandle):
     """One of an action's endpoints: its arrivals are handed to the action's waitable."""
 
     owner: ActionHandle
+    in_waitable = True
     in_wait_sets: str
     """What it is to a wait set: ``service``, ``client`` or ``subscription``."""
     purpose: str

@@ -228,7 +228,8 @@ class _Expiry:
 
     def runnable(self) -> Runnable:
         """Describe it to a policy."""
-        return on_no_executor(self.node, self.describe())
+        told = self.node.mailbox is not None
+        return on_no_executor(self.node, self.describe(), "waitable", told=told)
 
     def describe(self) -> str:
         return f"{self.node.fully_qualified_name}: expiry of goals of {self._server.name}"

@@ -9,6 +9,7 @@ else (``spin``, ``spin_once``, worker threads, when exceptions come out where) i
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from rsltrace.doors.rclpy.executors.standby import Ran, Standby, standby_of
@@ -20,6 +21,7 @@ from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.wait_reasons import awaited
 from rsltrace.loop.loop import Dispatchable
+from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.middleware.graph import Graph
 
 _WORK = "work for its executor"
@@ -45,6 +47,8 @@ class Pump:
         self.woken = False
         """Whether there has been a reason to look again."""
         self._looked_ns = -1
+        self._name = f"executor {stacks.loop.next_place()}"
+        self._asked: tuple[Any, ...] = ()
 
     def add(self, node: Any) -> None:
         """Run a node's callbacks whenever the executor spins."""
@@ -95,6 +99,10 @@ class Pump:
         loop = self.stacks.loop
         until_ns = None if timeout_ns < 0 else loop.now_ns + timeout_ns
         looked = False
+        if isinstance(loop, OrderedLoop) and loop.polls:
+            asked, self._asked = self._asked, (timeout, nodes, condition)
+            if asked != self._asked:  # rclpy makes a new generator
+                loop.forget(self._name)
         while True:
             if self.executor._is_shutdown:
                 raise executors.ShutdownException
@@ -151,7 +159,10 @@ class Pump:
         self.waits = [blocked for blocked in self.waits if blocked in self.stacks.runners.blocked]
 
     def _take(self, nodes: list[Any] | None) -> tuple[Any, Mailbox, Dispatchable] | None:
-        """Take out what is next: tasks first, as in rclpy, then in the order of arrival."""
+        """Take out what is next: tasks first, as in rclpy, then in the order of arrival; or what
+        the policy chooses, if it is asked for that."""
+        if isinstance(self.stacks.loop, OrderedLoop) and self.stacks.loop.polls:
+            return self._choose(self.stacks.loop, nodes)
         if self.tasks.entries:
             return None, self.tasks, self.tasks.entries.popleft()[1]
         while True:
@@ -167,6 +178,31 @@ class Pump:
             place, item = mailbox.entries.popleft()
             if not _is_stale(item) and not self._parked(mailbox, place, item):
                 return node, mailbox, item
+
+    def _choose(
+        self, loop: OrderedLoop, nodes: list[Any] | None
+    ) -> tuple[Any, Mailbox, Dispatchable] | None:
+        """Take out what the policy chooses of all that is ready by now."""
+        loop.hand_over()
+        ready = [(None, self.tasks, entry) for entry in self.tasks.entries]
+        for node, mailbox in self.nodes.items():
+            if nodes is None or node in nodes:
+                ready += [(node, mailbox, entry) for entry in mailbox.entries]
+        ready.sort(key=lambda one: (one[1] is not self.tasks, one[2][0]))
+        free = []
+        for node, mailbox, (place, item) in ready:
+            gone = _is_stale(item) or not getattr(item, "is_due", True)
+            if gone or self._parked(mailbox, place, item):
+                mailbox.entries.remove((place, item))
+            else:
+                free.append((node, mailbox, (place, item)))
+        if not free:
+            return None
+        candidates = [loop.place(item).candidate for _, _, (_, item) in free]
+        chosen = loop.choose([replace(one, executor=self._name) for one in candidates])
+        node, mailbox, entry = free[chosen]
+        mailbox.entries.remove(entry)
+        return node, mailbox, entry[1]
 
     def _parked(self, mailbox: Mailbox, place: int, item: Any) -> bool:
         """Keep what its callback group does not let run now until the group is free."""

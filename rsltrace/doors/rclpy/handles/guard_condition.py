@@ -26,6 +26,7 @@ class GuardConditionHandle(EntityHandle):
         super().__init__(stacks.dispatcher, None)
         self._triggered = False
         self._cause = (0, 0)
+        self._found: tuple[int, int] | None = None
 
     def trigger_guard_condition(self) -> None:
         """Make the callback ready."""
@@ -36,6 +37,16 @@ class GuardConditionHandle(EntityHandle):
             loop, dispatcher = self.dispatcher.loop, self.dispatcher
             self._cause = (loop.events, dispatcher.note(OutputKind.GUARD, self.entity_id))
             loop.ready.append(self)
+
+    def found(self) -> None:
+        """A polling point has found it: another trigger from now on is for the next one."""
+        if self._triggered:
+            self._found, self._triggered = self._cause, False
+
+    @property
+    def is_due(self) -> bool:
+        """Whether its callback has to run."""
+        return self._triggered or self._found is not None
 
     def is_triggered(self) -> bool:
         """Return whether a trigger has not been handled yet."""
@@ -55,15 +66,18 @@ class GuardConditionHandle(EntityHandle):
         if self.mailbox_keeps():
             return
         wrapper = self.wrapper
-        if not self._triggered or wrapper is None or self.destroyed:
+        if not self.is_due or wrapper is None or self.destroyed:
             return
         if self.stacks.groups.must_wait(self, wrapper):
             return
-        self._triggered = False
+        cause = self._found
+        if cause is None:
+            cause, self._triggered = self._cause, False
+        self._found = None
         callback = wrapper.callback
         if is_awaited(self.stacks, callback):
-            start_callback(self.stacks, self, _GUARD, callback, (), *self._cause, 0)
+            start_callback(self.stacks, self, _GUARD, callback, (), *cause, 0)
         else:
             self.dispatcher.execute(
-                self, self.entity_id, self.node, _GUARD, callback, (), *self._cause, 0
+                self, self.entity_id, self.node, _GUARD, callback, (), *cause, 0
             )

@@ -210,7 +210,8 @@ class ClientHandle(ServiceEndHandle, Client):
         )
 
     def _complete(self, response: Any, request_id: RequestId) -> None:
-        """Set the result; plain done callbacks belong to this event, coroutines become tasks."""
+        """Set the result; plain done callbacks belong to this event, coroutines become tasks. Where
+        executors poll, all do, as rclpy has it."""
         if self._service_events is not None:
             self._tell(RESPONSE_RECEIVED, request_id, response)
         try:
@@ -219,6 +220,9 @@ class ClientHandle(ServiceEndHandle, Client):
             return  # cancelled, or another server was faster
         executor = executor_of(self.stacks, self)
         future._set_executor(executor)
+        if self.stacks.loop.polls:
+            future.set_result(response)  # done callbacks are tasks
+            return
         with future._lock:
             callbacks, future._callbacks = future._callbacks, []
         future.set_result(response)

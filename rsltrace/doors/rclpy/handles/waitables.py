@@ -106,7 +106,8 @@ class UserWaitable:
 
     def runnable(self) -> Runnable:
         """Describe it to a policy."""
-        return on_no_executor(self.node, self.describe())
+        told = self.node.mailbox is not None
+        return on_no_executor(self.node, self.describe(), "waitable", told=told)
 
     def close(self) -> None:
         """Run no more."""

@@ -6,7 +6,9 @@ Future is polled, once after everything else at that time has run.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any
 
 from rsltrace.doors.rclpy.stacks.code_lines import Functions
@@ -88,6 +90,8 @@ class TaskRun:
         self.node = node
         self.kind = kind
         self.label = label
+        self.number = self.domain.loop.next_place()
+        """Its place in the order in which tasks are made."""
         self.cause_event = self.domain.loop.events
         self.cause_output = 0
         self.input_hash = 0
@@ -118,6 +122,11 @@ class TaskRun:
             self.input_hash,
         )
 
+    @property
+    def oldest_first(self) -> bool:
+        """Whether rclpy's executors run the oldest task first, as those after Jazzy do."""
+        return _run_oldest_first()
+
     def describe(self) -> str:
         """Name the task and where it came from."""
         return self.label()
@@ -132,6 +141,8 @@ class TaskRun:
             node,
             period_ns=None if node is None else node.shortest_period_ns(),
             executor=node is None or getattr(node, "mailbox", None) is None,
+            thread=self.number,
+            told=self.mailbox is not None,
         )
 
     def execution_name(self) -> tuple[str, str]:
@@ -172,6 +183,14 @@ class TaskRun:
         if self._on_end is not None:
             on_end, self._on_end = self._on_end, None
             on_end()
+
+
+@lru_cache(maxsize=1)
+def _run_oldest_first() -> bool:
+    from rclpy.executors import Executor
+
+    looks = getattr(Executor, "_wait_for_ready_callbacks", None)
+    return looks is None or "reversed(tasks)" not in inspect.getsource(looks)
 
 
 class Resume:
