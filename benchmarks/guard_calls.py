@@ -25,6 +25,8 @@ CALLS = 300
 ROUNDS = 40
 
 MODULE = '''
+import os
+
 import numpy
 import rclpy
 from rclpy.node import Node
@@ -72,7 +74,7 @@ def dict_of_10(count):
 
 
 def of(file):
-    names = {"__file__": file, "__name__": "called"}
+    names = {"__file__": file, "__name__": os.path.basename(os.path.dirname(file))}
     exec(compile(CALLS, file, "exec"), names)
     return {name: names[name] for name in NAMES}
 

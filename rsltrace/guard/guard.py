@@ -250,8 +250,10 @@ class Guard:
 
     def count(self, source: Source, call: str, frame: FrameType) -> None:
         """Count a call of user code that the run answers itself."""
-        if self.is_for_user(frame):
-            node = self.context.node()
+        if self.user_of(frame) is not None:
+            running = self._running
+            present = running.node if running is not None else None
+            node = present.key if present is not None else self.context.node()
             try:
                 self._answered[source][call][node] += 1
             except KeyError:

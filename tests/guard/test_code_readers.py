@@ -131,7 +131,7 @@ def test_allowed_order_leaves_the_code_as_it_is(said: Callable[..., Any]) -> Non
     (plain,) = said(code, job=job + "guard: {order: allow}")[0]
     (ours,) = said(code, job=job)[0]
     assert not [name for name in plain if "rsltrace" in name]
-    assert [name for name in ours if "rsltrace" in name] == ["__rsltrace_ordered__"]
+    assert [name for name in ours if "rsltrace" in name] == ["__rsltrace_each__"]
 
 
 def test_variables_that_a_library_reads_are_told_as_one(

@@ -15,9 +15,10 @@ import sys
 import weakref
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import CodeType, ModuleType
+from types import CodeType, FrameType, ModuleType
 from typing import Any
 
+from rsltrace.guard import frames
 from rsltrace.guard.addresses import is_by_address
 from rsltrace.guard.callers import is_installed, is_own, is_user_file
 from rsltrace.guard.frames import caller
@@ -30,6 +31,7 @@ from rsltrace.model.finding import Mode, Source
 
 _ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
 _ORDERED = "__rsltrace_ordered__"
+_EACH = "__rsltrace_each__"
 _SHOWN = "__rsltrace_shown__"
 _POP = "__rsltrace_pop__"
 _NOW = "__rsltrace_now__"
@@ -45,7 +47,8 @@ _PLAIN = (str, bytes, int, float, bool, type(None))
 
 
 def ordered(thing: Any) -> Any:
-    """Return what a loop over ``thing`` should go through: a set in an order that stays."""
+    """Return what stands for ``thing`` where its elements are asked for: a set in an order that
+    stays."""
     kind = type(thing)
     if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
         return thing
@@ -54,21 +57,43 @@ def ordered(thing: Any) -> Any:
     guard = engaged()
     if guard is None:
         return thing
-    frame = caller()
+    in_order = _order(guard, thing, caller())
+    return thing if in_order is None else _Watched(thing, in_order)
+
+
+def each(thing: Any) -> Any:
+    """Return what a loop over ``thing`` should go through, once: ``ordered`` for less."""
+    kind = type(thing)
+    if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
+        return thing
+    if len(thing) < 2 or _NUMBERS.issuperset(map(type, thing)):
+        return thing
+    guard = engaged()
+    if guard is None:
+        return thing
+    try:
+        frame = frames.next_caller()
+    except frames.INTERRUPTED:
+        frame = frames.lost_caller()
+    in_order = _order(guard, thing, frame)
+    return thing if in_order is None else _through(thing, in_order)
+
+
+def _order(guard: Guard, thing: Any, frame: FrameType) -> list[Any] | None:
+    """Return the elements of a set in an order that stays, or None if they are left as they are."""
     mode = guard.mode(_ORDER, frame)
     are_texts = _TEXTS.issuperset(map(type, thing))
     if mode is _ALLOW or not (are_texts or any(map(_has_no_order, thing))):
-        return thing
+        return None
     if mode is _VIRTUAL:
         in_order = sorted(thing) if are_texts else _in_order(guard, thing)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
             guard.count(_ORDER, "order of a set", frame)
-            return _Watched(thing, in_order)
+            return in_order
     kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
-    guard.watched(
-        Source.ORDER, f"order of a {kind.__name__} of {kinds}", f"{len(thing)} elements", frame
-    )
-    return thing
+    call = f"order of a {type(thing).__name__} of {kinds}"
+    guard.watched(_ORDER, call, f"{len(thing)} elements", frame)
+    return None
 
 
 def _in_order(guard: Guard, thing: Any) -> list[Any] | None:
@@ -107,6 +132,14 @@ class _Text(str):
         return str(self)
 
 
+def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
+    size = len(thing)
+    for item in in_order:
+        if len(thing) != size:
+            raise RuntimeError("Set changed size during iteration")
+        yield item
+
+
 class _Watched:
     """The elements of a set in order; like a set, it notices when that changes on the way."""
 
@@ -115,11 +148,7 @@ class _Watched:
         self._of = of
 
     def __iter__(self) -> Iterator[Any]:
-        size = len(self._of)
-        for item in self.items:
-            if len(self._of) != size:
-                raise RuntimeError("Set changed size during iteration")
-            yield item
+        return _through(self._of, self.items)
 
     def __len__(self) -> int:
         return len(self.items)
@@ -151,13 +180,13 @@ class _Rewriter(ast.NodeTransformer):
     def visit_For(self, node: ast.For) -> ast.AST:
         self.generic_visit(node)
         if not _is_harmless(node.iter):
-            node.iter = self._call(_ORDERED, node.iter)
+            node.iter = self._call(_EACH, node.iter)
         return node
 
     def visit_comprehension(self, node: ast.comprehension) -> ast.AST:
         self.generic_visit(node)
         if not node.is_async and not _is_harmless(node.iter):
-            node.iter = self._call(_ORDERED, node.iter)
+            node.iter = self._call(_EACH, node.iter)
         return node
 
     def visit_Starred(self, node: ast.Starred) -> ast.AST:
@@ -323,6 +352,7 @@ def ordered_sets(
     """
     helpers: dict[str, Callable[..., Any]] = {
         _ORDERED: ordered,
+        _EACH: each,
         _SHOWN: shown,
         _POP: pop,
         _NOW: numpy_now,

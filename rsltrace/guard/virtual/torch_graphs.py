@@ -30,6 +30,7 @@ def _call(function: Any, text: str, *more: Any) -> Any:
 
 _MEANT = {
     set_order.ordered: _as_it_is,
+    set_order.each: _as_it_is,
     set_order.shown: _as_it_is,
     set_order.pop: _pop,
     numpy_now: _call,
