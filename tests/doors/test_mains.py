@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import sys
 import time
@@ -657,3 +658,34 @@ def test_after_a_shutdown_a_program_begins_anew(simulate: Any) -> None:
 
     simulate(main_spec(program), lambda: listener(heard), duration=5)
     assert heard == [(1, 0.5), (1, 2.0)]
+
+
+def test_every_main_has_its_own_event_loop(simulate: Any) -> None:
+    log: list[Any] = []
+
+    def program(name: str) -> Callable[[], None]:
+        async def count(node: Node) -> None:
+            for _ in range(2):
+                rclpy.spin_once(node, timeout_sec=0.1)
+                await asyncio.sleep(0.4)
+                log.append((name, seconds(node), asyncio.get_event_loop()))
+
+        def main() -> None:
+            rclpy.init()
+            loop = asyncio.new_event_loop()
+            asyncio.set_event_loop(loop)
+            node = Node(name)
+            asyncio.get_event_loop().run_until_complete(count(node))
+            assert asyncio.get_event_loop() is loop
+            loop.close()
+
+        return main
+
+    simulate(main_spec(program("a")), main_spec(program("b")))
+    assert [(name, round(at, 6)) for name, at, _ in log] == [
+        ("a", 0.5),
+        ("b", 0.5),
+        ("a", 1.0),
+        ("b", 1.0),
+    ]
+    assert log[0][2] is log[2][2] is not log[1][2]

@@ -124,7 +124,7 @@ class Program:
         kept = self._kept
         if kept is None:
             kept = self._first_values()
-        system, modules, rclpy, utilities, context = programs.places
+        system, modules, rclpy, utilities, context, loops = programs.places
         # Every callback of a main comes by here twice, so there is no loop.
         before._kept = (
             system["argv"],
@@ -134,6 +134,7 @@ class Program:
             rclpy["__executor"],
             utilities["g_default_context"],
             context["g_logging_ref_count"],
+            loops["_event_loop_policy"],
         )
         (
             system["argv"],
@@ -143,6 +144,7 @@ class Program:
             rclpy["__executor"],
             utilities["g_default_context"],
             context["g_logging_ref_count"],
+            loops["_event_loop_policy"],
         ) = kept
         if programs.on_enter is not None:
             programs.on_enter(self)
@@ -152,7 +154,7 @@ class Program:
         argv = None if self.entry is None else self.entry.argv
         main = ModuleType("__main__")
         vars(main).update(__builtins__=builtins, __annotations__={})
-        return argv, list(sys.path), self._programs.stdin_of(self), main, None, None, 0
+        return argv, list(sys.path), self._programs.stdin_of(self), main, None, None, 0, None
 
     # -- its life --------------------------------------------------------------------------------
 
@@ -180,10 +182,13 @@ class Program:
 
 @lru_cache(maxsize=1)
 def _places() -> tuple[dict[str, Any], ...]:
-    """Return where process-wide values are kept."""
+    """Return where process-wide values are kept; asyncio's policy has a thread's event loop."""
+    import asyncio.events
+
     import rclpy
     import rclpy.context
     import rclpy.utilities
 
     modules: dict[str, Any] = sys.modules
-    return vars(sys), modules, vars(rclpy), vars(rclpy.utilities), vars(rclpy.context)
+    ours = rclpy, rclpy.utilities, rclpy.context, asyncio.events
+    return vars(sys), modules, *map(vars, ours)
