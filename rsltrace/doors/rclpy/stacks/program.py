@@ -190,5 +190,5 @@ def _places() -> tuple[dict[str, Any], ...]:
     import rclpy.utilities
 
     modules: dict[str, Any] = sys.modules
-    ours = rclpy, rclpy.utilities, rclpy.context, asyncio.events
-    return vars(sys), modules, *map(vars, ours)
+    context, loops = vars(rclpy.context), vars(asyncio.events)
+    return vars(sys), modules, vars(rclpy), vars(rclpy.utilities), context, loops
