@@ -36,14 +36,14 @@ _KNOWN = frozenset(
     backports bleak bokeh boto3 botocore bs4 casadi certifi cffi chardet charset_normalizer
     click cloudpickle colorama colorlog contourpy coverage cryptography cv2 cvxopt cvxpy cycler
     dash dask dateutil debugpy decorator deepdiff dill distributed distro distutils django
-    docutils dotenv duckdb ecos evdev execnet fast_sugiyama fastapi ffmpeg filelock filterpy
-    flask flatbuffers fontTools freezegun frozenlist fsspec gevent git google greenlet grimp
-    grpc gtsam gym gymnasium h11 h5py httpcore httpx huggingface_hub humanize hypothesis idna
-    imageio importlib_metadata importlib_resources iniconfig ipykernel IPython isympy jax jaxlib
-    jedi jinja2 joblib jsonpickle jsonschema jsonschema_specifications keras keyboard kiwisolver
-    lark librosa librt lightning linkify_it llvmlite loguru lxml lz4 markdown markdown_it
-    markupsafe matplotlib mcap mcap_ros2 mdit_py_plugins mdurl meshcat meshio mock
-    more_itertools mpl_toolkits mpmath msgpack mujoco multidict multiprocess mypy
+    docutils dotenv duckdb ecos evdev exceptiongroup execnet fast_sugiyama fastapi ffmpeg
+    filelock filterpy flask flatbuffers fontTools freezegun frozenlist fsspec gevent git google
+    greenlet grimp grpc gtsam gym gymnasium h11 h5py httpcore httpx huggingface_hub humanize
+    hypothesis idna imageio importlib_metadata importlib_resources iniconfig ipykernel IPython
+    isympy jax jaxlib jedi jinja2 joblib jsonpickle jsonschema jsonschema_specifications keras
+    keyboard kiwisolver lark librosa librt lightning linkify_it llvmlite loguru lxml lz4
+    markdown markdown_it markupsafe matplotlib mcap mcap_ros2 mdit_py_plugins mdurl meshcat
+    meshio mock more_itertools mpl_toolkits mpmath msgpack mujoco multidict multiprocess mypy
     mypy_extensions mypyc netifaces networkx nltk nose notebook numba numexpr numpy onnx
     onnxruntime open3d openai OpenGL OpenSSL opentelemetry orjson osqp outcome packaging paho
     pandas paramiko parso patsy pexpect pickleshare PIL pinocchio pip pkg_resources platformdirs
