@@ -71,7 +71,7 @@ def run_natively(
     run = kind(expanded.job, observer or Observer(), executor, domain_id, policy, rules)
     run.notes += expanded.notes
     with kept_process(), ExitStack() as stack:
-        stack.enter_context(search_path(run.job))
+        stack.enter_context(search_path(run.job, native=True))
         run.open(stack, output, force=force, echo=echo)
         run.go_on()
         return run.finish()

@@ -177,13 +177,16 @@ def _kept_streams() -> Iterator[None]:
 
 
 @contextmanager
-def search_path(job: Job) -> Iterator[None]:
-    """Let user modules be imported from the job's search path, and forget them afterwards."""
+def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
+    """Let user modules be imported from the job's search path, and forget them afterwards.
+
+    In a ``native`` run, interfaces that nobody has built cannot be sent.
+    """
     folders = [str(job.resolve(folder)) for folder in job.search_path]
     old_path, old_modules = list(sys.path), set(sys.modules)
     sys.path[:0] = folders
     try:
-        with unbuilt_packages([Path(folder) for folder in folders]) as workspace:
+        with unbuilt_packages(list(map(Path, folders)), native=native) as workspace:
             try:
                 yield
             finally:

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from rsltrace.errors import SetupError
 from rsltrace.guard.guard import engage
 
 if TYPE_CHECKING:
@@ -30,8 +31,10 @@ _SUPPORT = "_s__rosidl_typesupport_c"
 class Workspace:
     """The packages in and below some folders, as far as they have not been built."""
 
-    def __init__(self, folders: Sequence[Path]) -> None:
+    def __init__(self, folders: Sequence[Path], *, native: bool = False) -> None:
+        """``native``: their interfaces go to ROS's middleware, which needs them compiled."""
         self._folders = folders
+        self._native = native
         self._packages: dict[str, SourcePackage] | None = None
         self._prefixes: dict[str, Path] = {}
         self._modules: dict[str, Path] | None = None
@@ -63,6 +66,16 @@ class Workspace:
                 self._prefixes[name] = interface_prefix(package, self.packages)
             self.made.add(name)
         return self._prefixes[name] / "site-packages" / name
+
+    def require_type_support(self, name: str) -> None:
+        """Raise SetupError if the interfaces of a package have to be compiled, which is not one
+        that was built."""
+        if self._native and name in self.made:
+            raise SetupError(
+                f"{name} in {self.packages[name].folder} has not been built, and its interfaces "
+                "cannot go over DDS as they are: build the package and source its workspace, or "
+                "record without --native"
+            )
 
     def shadows(self, name: str) -> bool:
         """Whether a folder of that name could be taken for a package, though it is none."""
@@ -122,6 +135,8 @@ class _Kinds:
             return None
         if rest not in _KINDS and rest != package + _SUPPORT:
             return None
+        if rest not in _KINDS:
+            self._workspace.require_type_support(package)
         built = PathFinder.find_spec(name, path)
         if built is not None and built.origin is not None:
             return None
@@ -206,9 +221,13 @@ def unbuilt_names() -> set[str]:
 
 
 @contextmanager
-def unbuilt_packages(folders: Sequence[Path]) -> Iterator[Workspace]:
-    """Let the packages in ``folders`` be used as if they were built, and forget them afterwards."""
-    workspace = Workspace(folders)
+def unbuilt_packages(folders: Sequence[Path], *, native: bool = False) -> Iterator[Workspace]:
+    """Let the packages in ``folders`` be used as if they were built, and forget them afterwards.
+
+    Their interfaces are classes without compiled type support: ``native``, creating what needs that
+    raises SetupError.
+    """
+    workspace = Workspace(folders, native=native)
     before, after = _Kinds(workspace), _Packages(workspace)
     sys.meta_path.insert(0, before)
     sys.meta_path.append(after)

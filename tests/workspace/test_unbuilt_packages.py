@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from rsltrace.errors import JobError
+from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
 from rsltrace.run import run
 from rsltrace.source_packages import SourcePackage, source_packages
@@ -169,6 +169,23 @@ def test_the_run_that_makes_the_classes_is_like_the_next(runs: tuple[Path, list[
 def test_nothing_of_it_is_left_behind(runs: tuple[Path, list[Any]]) -> None:
     assert not [name for name in sys.modules if name.partition(".")[0] in ("arm", "arm_interfaces")]
     assert not [f for f in sys.meta_path if type(f).__module__.startswith("rsltrace.workspace")]
+
+
+def test_natively_they_are_refused_by_name(runs: tuple[Path, list[Any]]) -> None:
+    from rclpy.type_support import check_for_type_support
+
+    folder = runs[0] / "src"
+    for native in (False, True):
+        with unbuilt_packages([folder], native=native) as workspace:
+            joint = import_module("arm.msg").Joint
+            joint.__class__._TYPE_SUPPORT = None
+            assert joint(name="left").name == "left"
+            assert workspace.made >= {"arm"}
+            if not native:
+                check_for_type_support(joint)
+                continue
+            with pytest.raises(SetupError, match=r"arm in .*/src/arm has not been built.*--native"):
+                check_for_type_support(joint)
 
 
 def test_classes_and_hashes_are_those_that_a_build_makes(

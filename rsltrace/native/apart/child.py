@@ -91,7 +91,7 @@ class _Child:
         """Run the entry; return the exit status of the process."""
         order = self._order
         try:
-            stack.enter_context(search_path(order.job))
+            stack.enter_context(search_path(order.job, native=True))
             entry = self._find(stack)
             if entry.argv is None:
                 stack.enter_context(rclpy_running(echo=order.echo))
