@@ -201,6 +201,12 @@ def test_a_main_that_exits_is_reported_and_the_others_go_on(
     assert result.notes == ("my_demo/quitter exited with 1 at 0.000000000 s: no hardware",)
 
 
+def test_entries_of_one_program_are_told_apart_in_notes(record_yaml: Callable[[str], Any]) -> None:
+    result = record_yaml("nodes: [{executable: my_demo/quitter}, {executable: my_demo/quitter}]\n")
+    said = "exited with 1 at 0.000000000 s: no hardware"
+    assert result.notes == (f"my_demo/quitter {said}", f"my_demo/quitter #2 {said}")
+
+
 @pytest.mark.parametrize(
     ("target", "message"),
     [

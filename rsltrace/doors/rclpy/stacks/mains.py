@@ -88,9 +88,9 @@ def end_program(stacks: Stacks, program: Program, error: BaseException | None) -
     if not (ending.unwinding or ending.closing or failed or program.exit_code):
         if not program.spun:
             never = f": no callback of {', '.join(idle)} has run" if idle else ""
-            notes.append(f"{program.name} ended at {at} s without ever spinning{never}")
+            notes.append(f"{program.label} ended at {at} s without ever spinning{never}")
         else:
-            notes.append(f"{program.name} ended at {at} s")
+            notes.append(f"{program.label} ended at {at} s")
     _vanish(stacks, program)
     if failed:
         assert error is not None
@@ -117,7 +117,7 @@ def crash_program(stacks: Stacks, program: Program) -> None:
         context.end()
     program.ended = True
     at = format_seconds(stacks.loop.now_ns)
-    stacks.domain.outcome.notes.append(f"{program.name} crashed at {at} s, as the job says")
+    stacks.domain.outcome.notes.append(f"{program.label} crashed at {at} s, as the job says")
     _has_ended(stacks, program)
 
 
@@ -167,12 +167,12 @@ def _judge(stacks: Stacks, program: Program, error: BaseException | None) -> boo
             said = text_of(error) if not isinstance(getattr(error, "code", 0), int) else ""
             said = f": {said}" if said else ""
             at = format_seconds(stacks.loop.now_ns)
-            notes.append(f"{program.name} exited with {program.exit_code} at {at} s{said}")
+            notes.append(f"{program.label} exited with {program.exit_code} at {at} s{said}")
         return False
     if over:
         if not isinstance(error, KeyboardInterrupt) and not _is_external_shutdown(error):
             kind = type(error).__qualname__
-            notes.append(f"{program.name}, told to end, raised {kind}: {text_of(error)}")
+            notes.append(f"{program.label}, told to end, raised {kind}: {text_of(error)}")
         return False
     return True
 

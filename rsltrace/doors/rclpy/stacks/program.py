@@ -93,6 +93,8 @@ class Program:
         self._programs = programs
         self.entry = entry
         self.name = "the run" if entry is None else entry.name
+        self.label = self.name if entry is None else entry.key or entry.name
+        """What notes call it: entries of one target have numbers."""
         arguments = [] if entry is None else entry.arguments
         self.ros_words = [word for part in arguments[:1] for word in part.arguments]
         """What the job adds to the ROS arguments of every ``rclpy.init`` of this program."""

@@ -68,7 +68,7 @@ def _fail(stacks: Stacks, call: str) -> NoReturn:
             "spins it (main:), and give that entry what is typed: stdin: [...]"
         )
     raise UnsupportedError(
-        f"{call}: {program.name} reads from its terminal, and the job does not say what is typed "
+        f"{call}: {program.label} reads from its terminal, and the job does not say what is typed "
         "there: give its entry a file or a list, such as stdin: [yes, {at: 2s, keys: q}]"
     )
 
