@@ -69,7 +69,7 @@ def _tell(outcome: Outcome) -> None:
 
 
 def _one(options: argparse.Namespace) -> int:
-    folder = options.out / "case"
+    folder = options.out.resolve() / "case"
     outcome = keep_case(options.only, options.seed, folder)
     found = diff(folder / "a.mcap", folder / "b.mcap")
     print(render(found, "text", options=DiffOptions(everything=True), width=100))

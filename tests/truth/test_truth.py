@@ -94,3 +94,9 @@ def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_what_is_known_names_classes() -> None:
     for key in KNOWN:
         assert fnmatch.filter(NAMES, key.rpartition(": ")[0]), key
+
+
+def test_what_is_refused_after_a_shutdown_is_told_with_the_shutdown() -> None:
+    """The exception alone would not say who made the context invalid."""
+    outcomes = list(try_cases([("shutdown, hidden", SEED + 1)]))
+    assert not wrong(outcomes), wrong(outcomes)

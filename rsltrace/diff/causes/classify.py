@@ -309,6 +309,8 @@ def _exception(case: Case, a: EventView, b: EventView) -> Judgement:
         f"{phrase(a)} {at_time(a.stamp_ns)} raised{what} in {where} and not in {not_where}, "
         "from the same input"
     )
+    if any(m.kind is OutputKind.SHUTDOWN and m.presence == f"only {where}" for m in case.messages):
+        sentence += ", after it had shut its context down"
     return Judgement(
         Verdict.EXCEPTION,
         Root.EXCEPTION,

@@ -179,7 +179,8 @@ def exits(rng: random.Random, world: World) -> Change:
 @behaviour("shutdown")
 def shutdown(rng: random.Random, world: World) -> Change:
     node = one_of(rng, world, "source", "relay")
-    truth = truth_of(node, verdicts=("ended-early", *OUTPUT), first=(r"shut\s?down",))
+    # what the callback publishes after it is refused, as rcl refuses it
+    truth = truth_of(node, verdicts=("exception",), first=(r"raised .*shut \S+ context down",))
     return Change(node, ["rclpy.shutdown()"], truth, at=rng.randint(2, 6))
 
 
