@@ -27,6 +27,11 @@ class Workers:
     count: int = 1
     running: int = 0
 
+    @property
+    def are_busy(self) -> bool:
+        """Whether each of them runs a callback."""
+        return self.running >= self.count
+
 
 @dataclass(frozen=True, slots=True)
 class Place:
@@ -194,6 +199,13 @@ class OrderedLoop(EventLoop):
         that are due."""
         return [*self._tasks.runnable(), *self._waiting()]
 
+    def starved(self) -> list[Place]:
+        """Return what is ready and has no worker, since all of its executor's are busy."""
+        due, _ = self.timers.due(self.now_ns)
+        timers = [self.place(timer.owner) for timer in due]  # type: ignore[arg-type]
+        every = [*self._tasks.places, *self._ready.places, *timers]
+        return [place for place in every if place.workers is not None and place.workers.are_busy]
+
     def run_next(self, place: Place) -> None:
         """Run one of ``runnable`` before anything else, once the event under way gives way."""
         self._forced = place
@@ -264,7 +276,7 @@ class OrderedLoop(EventLoop):
 
     def _runs(self, place: Place) -> bool:
         workers = place.workers
-        if workers is not None and workers.running >= workers.count:
+        if workers is not None and workers.are_busy:
             return False
         return place.exclusive is None or place.exclusive not in self._held
 

@@ -6,6 +6,7 @@ outside say how far to go.
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -23,6 +24,7 @@ from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.events.census import Census
+from rsltrace.middleware.events.outcome import EndlessWait
 from rsltrace.middleware.faults import FaultsOfAll
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
@@ -87,6 +89,8 @@ if TYPE_CHECKING:
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
+_WAITS_KEPT = 10
+_HELD_KEPT = 1000
 """Characters of who waits for what in a deadlock that a trace keeps."""
 
 
@@ -516,7 +520,7 @@ class Session:
                     "exit_code": str(exit_code),
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
-                    **_waits(error),
+                    **_waits(error, outcome.waits),
                     **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,
@@ -558,9 +562,18 @@ class Session:
         return {"numerics": late} if late else {}
 
 
-def _waits(error: RunError | None) -> dict[str, str]:
-    """Return what a trace keeps of a deadlock: nothing else in it tells who waits for what."""
-    if not isinstance(error, DeadlockError):
-        return {}
-    text = _FOLDER.sub("", str(error))  # a trace has no path of the machine it was made on
-    return {"error": shortened(text, _WAITS_MAX)}
+def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
+    """Return what a trace keeps of a deadlock, and of who waited until the end: nothing else in it
+    tells who waits for what."""
+    deadlock = isinstance(error, DeadlockError)
+    some = waits[:_WAITS_KEPT]
+    kept = [(one.since_ns, _without_folders(one.text), one.held[:_HELD_KEPT]) for one in some]
+    return {
+        **({"error": _without_folders(str(error))} if deadlock else {}),
+        **({"waits": json.dumps(kept)} if kept else {}),
+    }
+
+
+def _without_folders(text: str) -> str:
+    """Return a text without the paths of the machine that a trace was made on."""
+    return shortened(_FOLDER.sub("", text), _WAITS_MAX)

@@ -109,3 +109,74 @@ def test_in_an_executor_of_ones_own(simulate: Any) -> None:
     (note,) = notes(simulate(main_spec(main), duration=10))
     assert "Robot.watch" in note
     assert "/robot: service /ask" in note
+
+
+class Other(Node):
+    """Has nothing to do with the robot, but for the executor that they share."""
+
+    def __init__(self) -> None:
+        super().__init__("other")
+        self.create_timer(2.0, self.tick)
+
+    def tick(self) -> None: ...
+
+
+SHARED = {"nodes": ["/robot", "/other"], "workers": 1}
+
+
+class Ahead(Robot):
+    """Waits for ever; what it waits for is in another group, and in the same executor."""
+
+    def __init__(self) -> None:
+        super().__init__(apart=True)
+
+
+def test_an_executor_that_a_callback_keeps_busy(simulate: Any) -> None:
+    class Beside(Node):
+        def __init__(self) -> None:
+            super().__init__("beside")
+            self.create_timer(1.0, lambda: None)
+
+    recorded = simulate(Ahead, Other, Beside, duration=10, job={"executors": [SHARED]})
+    (note,) = notes(recorded)
+    assert note.startswith("held back for 9 s until the end, by a callback that keeps their exec")
+    assert "/robot: service /ask" in note
+    assert "/other: timer Other.tick" in note
+    assert "Beside" not in note
+    assert "/robot: timer Robot.begin waits for the response to a service call, of /ask" in note
+    assert notes(simulate(Ahead, Other, Beside, duration=10)) == []
+
+
+@pytest.mark.parametrize("policy", ["fifo", "rclpy", "permutation"])
+def test_a_main_that_waits_for_ever_is_told(simulate: Any, policy: str) -> None:
+    def main() -> None:
+        rclpy.init()
+        threading.Event().wait()
+
+    class Beside(Node):
+        def __init__(self) -> None:
+            super().__init__("beside")
+            self.create_timer(1.0, lambda: None)
+
+    recorded = simulate(main_spec(main), Beside, duration=10, job={"policy": policy})
+    (note,) = (note for note in recorded.result.notes if note.startswith("waited for 10 s until"))
+    assert f"at {__file__}:" in note
+
+
+def test_a_call_that_keeps_nobody_waiting_is_told_alone(simulate: Any) -> None:
+    class Alone(Robot):
+        def __init__(self) -> None:
+            super().__init__(apart=True)
+            self.destroy_timer(self.start)
+            alone = MutuallyExclusiveCallbackGroup()
+            self.start = self.create_timer(1.0, self.begin, callback_group=alone)
+
+        def begin(self) -> None:
+            self.start.cancel()
+            self.done.wait()
+
+    recorded = simulate(Alone, duration=10)
+    assert notes(recorded) == []
+    (note,) = (note for note in recorded.result.notes if note.startswith("waited for 9 s until"))
+    assert "Alone.begin waits" in note
+    assert f"at {__file__}:" in note

@@ -20,7 +20,7 @@ from rsltrace.diff.causes.record_command import record_again
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.causes.swapped import swapped_with
-from rsltrace.diff.causes.waits import slept_text
+from rsltrace.diff.causes.waits import slept_text, still_waits
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.divergence import (
     CauseStep,
@@ -156,7 +156,8 @@ class Explainer:
                 settings=self.settings,
                 relevance=self._relevance,
                 state=state_differences(self.run_a, self.run_b, a, b),
-                lost=lost_message(self.run_a, self.run_b, a, b),
+                lost=still_waits(self.run_a, self.run_b, a, b)
+                or lost_message(self.run_a, self.run_b, a, b),
                 periods=self._periods(a, b),
                 slept=slept_text(self.run_a, self.run_b, a, b),
                 swapped_with_ns=swapped_with(self.run_a, self.run_b, a, b),

@@ -395,7 +395,8 @@ class Propagation:
             return
         outputs = self._different_outputs(item)
         nodes, number = rows.run.matching.nodes, rows.number[place]
-        if not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
+        ran_alone = item.a < 0 or item.b < 0
+        if ran_alone or not outputs or any(o[0] != _DRAW or nodes[o[1]] == o[1] for o in outputs):
             # What chance decides on the way leaves the sender as it was; its own clock does not.
             self._taint(owner, origin)
         if any(o[0] == _DRAW for o in outputs):

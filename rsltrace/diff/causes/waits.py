@@ -1,13 +1,54 @@
-"""How long a callback slept: in the trace a wait is two events of its entity."""
+"""How long a callback slept, and which one waited until the end of a run.
+
+In the trace a wait is two events of its entity; what it was for stands at the end.
+"""
 
 from __future__ import annotations
+
+import json
 
 from rsltrace.diff.alignment.rows import Run, load_rows
 from rsltrace.diff.result.events import EventView
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
+from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration
+from rsltrace.words.phrases import seconds_text
 
 _LOOKED_AT_MAX = 1000
+_WAITS_MAX = 160
+
+
+def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> str:
+    """Say which call waited to the end of a run and kept an event from happening there that the
+    other has; "" if there is no such call."""
+    view = a or b
+    if view is None or (a and b):
+        return ""
+    name, lacking, having = ("b", run_b, run_a) if a else ("a", run_a, run_b)
+    elsewhere = {text for _, text, _ in _waits(having)}
+    number = lacking.matching.by_key[view.entity]
+    table = lacking.matching.numbers_b if lacking.of_b else lacking.matching.numbers_a
+    for since_ns, text, held in _waits(lacking):
+        is_held = any(0 <= one < len(table) and table[one] == number for one in held)
+        if since_ns <= view.stamp_ns and (is_held or text not in elsewhere):
+            since = seconds_text(since_ns)
+            return f"{shortened(text, _WAITS_MAX)} from {since} s to the end of {name}"
+    return ""
+
+
+def _waits(run: Run) -> list[tuple[int, str, list[int]]]:
+    """Return since when who waited for what at the end of a run, and the ids of what that held
+    back, as far as its trace tells."""
+    if not run.trace.complete:
+        return []
+    try:
+        told = json.loads(run.trace.result.get("waits", "[]"))
+        return [
+            (int(since), printable(" ".join(str(text).split())), [int(one) for one in held])
+            for since, text, held in told
+        ]
+    except (ValueError, TypeError):
+        return []  # not written by us
 
 
 def slept_text(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> str:

@@ -24,7 +24,7 @@ from rsltrace.doors.rclpy.handles.node_state import NodeStates
 from rsltrace.doors.rclpy.node_clocks import ClockRule, NodeClocks
 from rsltrace.doors.rclpy.parameters import Parameters, parameters_of
 from rsltrace.doors.rclpy.stacks.asyncio_loops import simulated_event_loops
-from rsltrace.doors.rclpy.stacks.blocked_groups import held_back
+from rsltrace.doors.rclpy.stacks.blocked_groups import note_waits
 from rsltrace.doors.rclpy.stacks.blocking_calls import end_blocked
 from rsltrace.doors.rclpy.stacks.construction import Construction
 from rsltrace.doors.rclpy.stacks.exit_handlers import own_exit_handlers
@@ -281,8 +281,8 @@ class World:
         if stacks.loop.stopped is None and runners.error is None:
             return  # paused
         outcome.note_end(stacks.loop.events)
-        if outcome.error is None and not ending.stuck:
-            outcome.notes += held_back(stacks)
+        if outcome.error is None:
+            note_waits(stacks, outcome)
         note_exchanged(stacks, hosted=bool(self.nodes))
         self.parameters = parameters_of(self.domain.graph)
         end_programs(stacks)

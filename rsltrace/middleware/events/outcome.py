@@ -7,14 +7,25 @@ from dataclasses import dataclass, field
 from rsltrace.errors import RunError
 
 
+@dataclass(frozen=True, slots=True)
+class EndlessWait:
+    """A call that waited until the end of a run and that no time would have ended: since when (ns),
+    who waited for what, and which entities it ``held`` back meanwhile."""
+
+    since_ns: int
+    text: str
+    held: tuple[int, ...] = ()
+
+
 @dataclass(slots=True)
 class Outcome:
     """``ended_after`` is how many events there were when the run ended: what follows is the
-    ending."""
+    ending. ``waits`` are the calls that still waited then."""
 
     error: RunError | None = None
     notes: list[str] = field(default_factory=list)
     ended_after: int | None = None
+    waits: list[EndlessWait] = field(default_factory=list)
 
     def note_end(self, events: int) -> None:
         """Remember how many events there were when the run ended; the first call counts."""

@@ -81,7 +81,7 @@ def deadlock_by_executors(rng: random.Random) -> Planted:
     lines.append("    self.other.call(Trigger.Request())")
     a.job["executors"] = "per_node"
     b = changed(a, "executors", "single_threaded")
-    stuck = (r"got stuck at .*waits for the response",)
+    stuck = (r"(got stuck at .*|/relay0: .*)waits for the response",)
     truth = Truth(first=stuck, says=(r"executors",), never=ALWAYS_FALSE, independent=None)
     return Planted(a, b, truth)
 

@@ -114,6 +114,7 @@ class Wait:
         self.error: BaseException | None = None
         """What to raise in the blocked call when it goes on."""
         self.program = programs.present
+        self.since_ns = domain.loop.now_ns
         self.deadline_ns: int | None = None
         self.quiet = quiet
         self._group = group
