@@ -14,6 +14,7 @@ from rclpy.node import Node
 from std_msgs.msg import UInt64
 from std_srvs.srv import Trigger
 
+from rsltrace.doors.rclpy.executors import user_executors
 from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
@@ -199,3 +200,20 @@ def test_a_replaced_wait_is_told_where_nobody_spins(simulate: Any) -> None:
     assert not asked
     assert told(simulate(main_spec(program), duration=1.5)) == []
     assert asked
+
+
+def test_who_spins_a_node_again_and_again_looks_once(
+    simulate: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``spin_once`` adds its node each time; to look takes longer than all the rest of it."""
+    looks: list[Any] = []
+    monkeypatch.setattr(user_executors, "note_exchanged", lambda *args: looks.append(args))
+
+    def program() -> None:
+        rclpy.init()
+        node = Busy([])
+        for _ in range(50):
+            rclpy.spin_once(node, timeout_sec=0.1)
+
+    simulate(main_spec(program), duration=10.0)
+    assert len(looks) == 3  # the run's own executor, the global one, the node

@@ -82,9 +82,10 @@ def _methods(
     def add_node(self: Any, node: Any) -> bool:
         if stacks.ending.closing:  # ``while True: rclpy.spin(node)`` does nothing else from then on
             lose_patience(stacks)
-        note_exchanged(stacks, type(self))
         added: bool = real["add_node"](self, node)
         if added:
+            if node.handle.mailbox is None:  # the first time: ``spin_once`` adds it again and again
+                note_exchanged(stacks, type(self))
             pump_of(stacks, self).add(node)
         return added
 
