@@ -11,6 +11,7 @@ import click
 
 from rsltrace.cli.output.native_text import NO_DIGEST, native_json, native_lines, real_time
 from rsltrace.model.built_in import is_built_in
+from rsltrace.model.endless_wait import waits_of
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.printable import printable
@@ -72,6 +73,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
             ("trace", f"{printable(Path(trace.name).name)}  ({size})"),
             ("state", _state(trace)),
             *(() if trace.complete or native else (("next", _CUT_OFF),)),
+            *(("waiting", text) for text in _waits(trace)),
             ("digest", NO_DIGEST if native else trace.digest),
             time,
             ("events", _by_kind(trace.event_count, counts.event_kinds, EventKind)),
@@ -108,6 +110,11 @@ def _state(trace: Trace) -> str:
         return "cut off: the file has no end (the run was killed or crashed, or is still going on)"
     reason = printable(trace.result.get("stop_reason", "no reason given"))
     return f"complete: {reason}, exit code {printable(trace.result.get('exit_code', 'unknown'))}"
+
+
+def _waits(trace: Trace) -> list[str]:
+    """Say which calls still waited at the end, without anything that would have ended them."""
+    return [f"since {format_seconds(w.since_ns)} s: {w.text}" for w in waits_of(trace.result)]
 
 
 def _node_lines(trace: Trace, counts: Counts) -> list[str]:

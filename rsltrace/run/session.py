@@ -6,11 +6,10 @@ outside say how far to go.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -24,8 +23,8 @@ from rsltrace.loop.stop import Stop
 from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.events.census import Census
-from rsltrace.middleware.events.outcome import EndlessWait
 from rsltrace.middleware.faults import FaultsOfAll
+from rsltrace.model.endless_wait import EndlessWait, kept_waits
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
@@ -89,8 +88,6 @@ if TYPE_CHECKING:
 
 _FOLDER = re.compile(r"/\S*/(?=[^/\s]+:\d)")
 _WAITS_MAX = 2000
-_WAITS_KEPT = 10
-_HELD_KEPT = 1000
 """Characters of who waits for what in a deadlock that a trace keeps."""
 
 
@@ -565,13 +562,8 @@ class Session:
 def _waits(error: RunError | None, waits: list[EndlessWait]) -> dict[str, str]:
     """Return what a trace keeps of a deadlock, and of who waited until the end: nothing else in it
     tells who waits for what."""
-    deadlock = isinstance(error, DeadlockError)
-    some = waits[:_WAITS_KEPT]
-    kept = [(one.since_ns, _without_folders(one.text), one.held[:_HELD_KEPT]) for one in some]
-    return {
-        **({"error": _without_folders(str(error))} if deadlock else {}),
-        **({"waits": json.dumps(kept)} if kept else {}),
-    }
+    told = {"error": _without_folders(str(error))} if isinstance(error, DeadlockError) else {}
+    return told | kept_waits(replace(one, text=_without_folders(one.text)) for one in waits)
 
 
 def _without_folders(text: str) -> str:

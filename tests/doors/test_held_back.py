@@ -8,12 +8,15 @@ from typing import Any
 
 import pytest
 import rclpy
+from click.testing import CliRunner
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
+from rsltrace.cli.main import cli
+from rsltrace.model.endless_wait import waits_of
 from tests.doors.test_mains import main_spec
 
 pytestmark = pytest.mark.ros
@@ -143,6 +146,15 @@ def test_an_executor_that_a_callback_keeps_busy(simulate: Any) -> None:
     assert "/robot: service /ask" in note
     assert "/other: timer Other.tick" in note
     assert "Beside" not in note
+    with recorded.trace() as trace:
+        (wait,) = waits_of(trace.result)
+        names = {trace.entities[one].name for one in wait.held}
+    assert wait.since_ns == 1_000_000_000
+    line = Robot.begin.__code__.co_firstlineno + 2
+    assert wait.text.endswith(f"of /ask (1 server) at test_held_back.py:{line} in begin")
+    assert names >= {"/ask", "Other.tick"}
+    told = CliRunner().invoke(cli, ["info", str(recorded.path)]).output
+    assert f"waiting    since 1.000000000 s: {wait.text}" in told
     assert "/robot: timer Robot.begin waits for the response to a service call, of /ask" in note
     assert notes(simulate(Ahead, Other, Beside, duration=10)) == []
 

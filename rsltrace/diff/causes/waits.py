@@ -5,12 +5,11 @@ In the trace a wait is two events of its entity; what it was for stands at the e
 
 from __future__ import annotations
 
-import json
-
 from rsltrace.diff.alignment.rows import Run, load_rows
 from rsltrace.diff.result.events import EventView
+from rsltrace.model.endless_wait import EndlessWait, waits_of
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind
-from rsltrace.model.printable import printable, shortened
+from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_duration
 from rsltrace.words.phrases import seconds_text
 
@@ -25,30 +24,19 @@ def still_waits(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
     if view is None or (a and b):
         return ""
     name, lacking, having = ("b", run_b, run_a) if a else ("a", run_a, run_b)
-    elsewhere = {text for _, text, _ in _waits(having)}
+    elsewhere = {one.text for one in _waits(having)}
     number = lacking.matching.by_key[view.entity]
     table = lacking.matching.numbers_b if lacking.of_b else lacking.matching.numbers_a
-    for since_ns, text, held in _waits(lacking):
-        is_held = any(0 <= one < len(table) and table[one] == number for one in held)
-        if since_ns <= view.stamp_ns and (is_held or text not in elsewhere):
-            since = seconds_text(since_ns)
-            return f"{shortened(text, _WAITS_MAX)} from {since} s to the end of {name}"
+    for wait in _waits(lacking):
+        is_held = any(0 <= one < len(table) and table[one] == number for one in wait.held)
+        if wait.since_ns <= view.stamp_ns and (is_held or wait.text not in elsewhere):
+            since = seconds_text(wait.since_ns)
+            return f"{shortened(wait.text, _WAITS_MAX)}, from {since} s to the end of {name}"
     return ""
 
 
-def _waits(run: Run) -> list[tuple[int, str, list[int]]]:
-    """Return since when who waited for what at the end of a run, and the ids of what that held
-    back, as far as its trace tells."""
-    if not run.trace.complete:
-        return []
-    try:
-        told = json.loads(run.trace.result.get("waits", "[]"))
-        return [
-            (int(since), printable(" ".join(str(text).split())), [int(one) for one in held])
-            for since, text, held in told
-        ]
-    except (ValueError, TypeError):
-        return []  # not written by us
+def _waits(run: Run) -> list[EndlessWait]:
+    return waits_of(run.trace.result) if run.trace.complete else []
 
 
 def slept_text(run_a: Run, run_b: Run, a: EventView | None, b: EventView | None) -> str:

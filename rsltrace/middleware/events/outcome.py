@@ -5,16 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from rsltrace.errors import RunError
-
-
-@dataclass(frozen=True, slots=True)
-class EndlessWait:
-    """A call that waited until the end of a run and that no time would have ended: since when (ns),
-    who waited for what, and which entities it ``held`` back meanwhile."""
-
-    since_ns: int
-    text: str
-    held: tuple[int, ...] = ()
+from rsltrace.model.endless_wait import EndlessWait
 
 
 @dataclass(slots=True)

@@ -14,7 +14,8 @@ from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.loop.ordered import OrderedLoop, Workers
 from rsltrace.middleware.entity import DomainEntity
-from rsltrace.middleware.events.outcome import EndlessWait, Outcome
+from rsltrace.middleware.events.outcome import Outcome
+from rsltrace.model.endless_wait import EndlessWait
 from rsltrace.model.stamp import format_duration, format_seconds
 
 _LONG_NS = 1_000_000_000
