@@ -18,16 +18,29 @@ from typing import Any
 
 _ASK = """
 import json, sys, types
+from importlib.machinery import ModuleSpec
 sys.stdout = sys.stderr
 said = {}
-class Setuptools(types.ModuleType):
+class Names(type):
     def __getattr__(self, name):
         if name.startswith("__"):
             raise AttributeError(name)
-        return lambda *words, **named: []
-for name in ("setuptools", "distutils", "distutils.core", "setuptools.command"):
-    sys.modules[name] = Setuptools(name)
-    sys.modules[name].setup = lambda *words, **named: said.update(named)
+        return Anything
+class Anything(list, metaclass=Names):  # called, derived from, asked for names: as setuptools' own
+    def __init__(self, *words, **named):
+        pass
+    def __getattr__(self, name):
+        return getattr(Anything, name)
+class Modules:
+    def find_spec(self, name, path=None, target=None):
+        known = name.partition(".")[0] in ("setuptools", "distutils")
+        return ModuleSpec(name, self, is_package=True) if known else None
+    def create_module(self, spec):
+        return types.ModuleType(spec.name)
+    def exec_module(self, module):
+        module.__getattr__ = lambda name: getattr(Anything, name)
+        module.setup = lambda *words, **named: said.update(named)
+sys.meta_path.insert(0, Modules())
 code = compile(open("setup.py", "rb").read(), "setup.py", "exec")
 sys.path.insert(0, "")
 sys.argv[:] = ["setup.py"]
@@ -43,11 +56,20 @@ Groups = dict[str, dict[str, str]]
 """Entry points: what each name stands for, by group."""
 
 
-@cache
 def setup_py(folder: Path) -> dict[str, Any]:
     """Return what a ``setup.py`` gives setuptools; nothing if it cannot be run without it."""
+    return _asked(folder)[0]
+
+
+def setup_fault(folder: Path) -> str:
+    """Return how a ``setup.py`` failed when it was asked; an empty text if it did not."""
+    return _asked(folder)[1]
+
+
+@cache
+def _asked(folder: Path) -> tuple[dict[str, Any], str]:
     if not (folder / "setup.py").is_file():
-        return {}
+        return {}, ""
     try:
         done = subprocess.run(
             [sys.executable, "-c", _ASK],
@@ -59,9 +81,10 @@ def setup_py(folder: Path) -> dict[str, Any]:
             check=False,
         )
         said = json.loads(done.stdout or "{}")
-    except (OSError, ValueError, subprocess.TimeoutExpired):
-        return {}  # what lies in its folder is there all the same
-    return said if isinstance(said, dict) else {}
+    except (OSError, ValueError, subprocess.TimeoutExpired) as error:
+        return {}, str(error)  # what lies in its folder is there all the same
+    lines = done.stderr.strip().splitlines() if done.returncode else []
+    return said if isinstance(said, dict) else {}, lines[-1] if lines else ""
 
 
 def setup_cfg(folder: Path) -> configparser.ConfigParser:
@@ -156,4 +179,7 @@ def text_mapping(value: object) -> dict[str, str]:
     return {str(k): str(v) for k, v in value.items()} if isinstance(value, Mapping) else {}
 
 
-__all__ = ["Groups", "entry_points", "name_and_version", "setup_cfg", "setup_py", "text_mapping"]
+__all__ = [
+    *("Groups", "entry_points", "name_and_version"),
+    *("setup_cfg", "setup_fault", "setup_py", "text_mapping"),
+]

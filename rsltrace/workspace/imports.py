@@ -209,6 +209,14 @@ def unbuilt_programs(package: str) -> set[str]:
     return {name for source in sources for name in compiled_executables(source)}
 
 
+def unbuilt_fault(package: str) -> str:
+    """Return how the ``setup.py`` of a package failed when it was asked; empty if it did not."""
+    from rsltrace.workspace.build_files import setup_fault
+
+    faults = (setup_fault(one.packages[package].folder) for one in _open if package in one.packages)
+    return next(filter(None, faults), "")
+
+
 def unbuilt_prefix(package: str) -> Path | None:
     """Return a prefix with the ``share`` of a package that is used as if it were built."""
     prefixes = (workspace.prefix(package) for workspace in _open)

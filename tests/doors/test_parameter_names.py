@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -35,6 +36,24 @@ def test_names_that_no_rule_can_have(simulate: Any) -> None:
     assert {name: list(v) if isinstance(VALUES[name], list) else v for name, v in seen.items()} == (
         VALUES
     )
+
+
+def test_an_empty_list_leaves_a_parameter_unset_as_in_ros(simulate: Any, tmp_path: Path) -> None:
+    seen: dict[str, Any] = {}
+
+    class Declares(Node):
+        def __init__(self, name: str) -> None:
+            super().__init__(name)
+            declared = [self.declare_parameter(one, ["default"]) for one in ("a b", "c")]
+            seen[name] = [(one.type_.name, one.value) for one in declared]
+
+    (tmp_path / "all.yaml").write_text("/**: {ros__parameters: {a b: [], c: []}}\n")
+    for name, parts in [
+        ("by_file", {"parameter_files": ["all.yaml"]}),
+        ("by_value", {"parameters": {"a b": [], "c": []}}),
+    ]:
+        simulate(NodeSpec(node=Declares, arguments={"name": name}, **parts), duration=0.1)
+    assert seen == dict.fromkeys(["by_file", "by_value"], [("NOT_SET", None)] * 2)
 
 
 @settings(max_examples=50, deadline=None)

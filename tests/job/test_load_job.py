@@ -623,7 +623,6 @@ GOLDEN = {
               nested: {a: , b: [[1]]}
               nested.a: 1
               3: x
-              list: []
               a..b: 1
               words: [a, null]
               pairs: [{a: 1}]
@@ -647,17 +646,14 @@ GOLDEN = {
         job.yaml:9:7: nodes[0].parameters: a parameter's name is text, got the number 3
             9 |       3: x
               |       ^
-        job.yaml:10:13: nodes[0].parameters.list: an empty list has no type, rcl would leave it unset: leave it out
-           10 |       list: []
-              |             ^
-        job.yaml:11:7: nodes[0].parameters: 'a..b' is not a parameter name: a part before or after a '.' is empty
-           11 |       a..b: 1
+        job.yaml:10:7: nodes[0].parameters: 'a..b' is not a parameter name: a part before or after a '.' is empty
+           10 |       a..b: 1
               |       ^
-        job.yaml:12:18: nodes[0].parameters.words[1]: no value is given, and a ROS parameter cannot be null
-           12 |       words: [a, null]
+        job.yaml:11:18: nodes[0].parameters.words[1]: no value is given, and a ROS parameter cannot be null
+           11 |       words: [a, null]
               |                  ^
-        job.yaml:13:15: nodes[0].parameters.pairs[0]: a ROS parameter is true or false, a number, text, or a list of these; got a mapping
-           13 |       pairs: [{a: 1}]
+        job.yaml:12:15: nodes[0].parameters.pairs[0]: a ROS parameter is true or false, a number, text, or a list of these; got a mapping
+           12 |       pairs: [{a: 1}]
               |               ^
         """,  # noqa: E501
     ),

@@ -167,6 +167,18 @@ def test_a_value_is_what_ros_makes_of_it(read: Any, written: str, value: object)
     assert parameters(launched) == {"p": value}
 
 
+def test_a_parameter_file_of_the_launch_files_own_may_have_an_empty_list(read: Any) -> None:
+    launched = read(
+        """
+import tempfile
+with tempfile.NamedTemporaryFile("w", suffix=".yaml", delete=False) as file:
+    file.write("/**: {ros__parameters: {stops: [], rate: 2.0}}")
+return LaunchDescription([Node(package='demo', executable='talker', parameters=[file.name])])
+"""
+    )
+    assert parameters(launched) == {"stops": (), "rate": 2.0}
+
+
 def test_groups_includes_and_conditions(read: Any, write: Any) -> None:
     write(
         HEAD + "    return LaunchDescription([DeclareLaunchArgument('who'), Node(package='demo', "

@@ -192,6 +192,21 @@ def test_what_build_files_say(tmp_path: Path) -> None:
                 "[project.scripts]\nfive = 'a.five:main'\n"
                 "[tool.poetry.scripts]\nsix = 'a.six:main'\nfive = 'old:main'\n"
             ),
+            # What setuptools has below it: commands to derive from, functions that answer a list.
+            "c/setup.py": (
+                "import distutils.command.build_py as build\nfrom distutils import log\n"
+                "import setuptools\nfrom setuptools.command.develop import develop\n"
+                "def scripts_in_lib(kind):\n"
+                "    before, kind.run = kind.run, lambda self: before(self)\n"
+                "    return kind\n"
+                "@scripts_in_lib\nclass Develop(develop):\n    pass\n"
+                "class Build(build.build_py, object):\n    pass\n"
+                "log.info('once more')\n"
+                "setuptools.setup(cmdclass={'develop': Develop, 'build_py': Build},\n"
+                "    packages=setuptools.find_packages() + ['c'],\n"
+                "    entry_points={'console_scripts': ['seven = c:main']})\n"
+            ),
+            "c/c/__init__.py": "",
             "b/pyproject.toml": "project = 'no table'\n[tool.poetry]\nscripts = []\n",
             **dict.fromkeys(["a/source/single.py", "a/source/b/__init__.py"], ""),
             **dict.fromkeys(["a/bin/three", "a/four.py", "a/test/__init__.py"], ""),
@@ -201,6 +216,8 @@ def test_what_build_files_say(tmp_path: Path) -> None:
     )
     a = SourcePackage("a", tmp_path / "a")
     assert executables(SourcePackage("b", tmp_path / "b")) == {}
+    c = SourcePackage("c", tmp_path / "c")
+    assert (executables(c), modules(c)) == ({"seven": "c:main"}, {"c": tmp_path / "c" / "c"})
     assert executables(a) == {
         "one": "a.one:main",
         "two": "a.two:main",
@@ -231,6 +248,8 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
             "driver/CMakeLists.txt": cmake,
             "driver/run.py": "",
             "none/package.xml": _PACKAGE.format("none"),
+            "bad/package.xml": _PACKAGE.format("bad"),
+            "bad/setup.py": "import nothing_of_that_name",
         },
     )
     with unbuilt_packages([tmp_path]):
@@ -241,6 +260,11 @@ def test_a_program_that_nobody_has_built_is_said_to_be_that(tmp_path: Path) -> N
                 "did you mean 'driver_node'? It has run.py; once it is built",
             ),
             ("none/x", "package 'none' has no executable 'x': it has none"),
+            (
+                "bad/x",
+                "package 'bad' has no executable 'x': it has none; its setup.py, asked without "
+                "setuptools, failed: ModuleNotFoundError: No module named 'nothing_of_that_name'",
+            ),
         ]:
             with pytest.raises(JobError) as caught:
                 find_executable(target, where="job.yaml:1:1")

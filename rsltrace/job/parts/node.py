@@ -168,7 +168,8 @@ class NodeSpec(Part):
     parameters: Annotated[dict[str, ParameterValue], check(flatten_parameters)] = Field(
         default_factory=dict,
         description="Its ROS parameters; `a: {b: 1}` and `a.b: 1` are the same. They win over "
-        "`parameter_files`.",
+        "`parameter_files`. An empty list has no type: as in ROS, the parameter is then declared "
+        "but not set, whatever its default.",
         examples=[{"frequency": 50.0, "noise": {"x": 0.1, "y": 0.1}}],
     )
     parameter_files: Annotated[tuple[str, ...], check(items(check_path))] = Field(

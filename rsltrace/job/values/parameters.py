@@ -77,11 +77,9 @@ def _value(value: object, loc: Loc) -> ParameterValue:
 
 
 def _list(values: list[object] | tuple[object, ...], loc: Loc) -> ParameterValue:
-    if not values:
-        raise Problem("an empty list has no type, rcl would leave it unset: leave it out", loc)
     elements = tuple(_scalar(value, (*loc, index)) for index, value in enumerate(values))
-    first = _kind(elements[0])
     for index, element in enumerate(elements):
+        first = _kind(elements[0])
         if _kind(element) != first:
             hint = ""
             if {first, _kind(element)} == {"integer", "float"}:

@@ -20,7 +20,12 @@ from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
-from rsltrace.workspace.imports import unbuilt_executables, unbuilt_names, unbuilt_programs
+from rsltrace.workspace.imports import (
+    unbuilt_executables,
+    unbuilt_fault,
+    unbuilt_names,
+    unbuilt_programs,
+)
 
 
 class Mains:
@@ -163,6 +168,8 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
     if compiled:
         listed = ", ".join(sorted(compiled)[:10])
         has += f"; once it is built (colcon build): {listed}"
+    if fault := unbuilt_fault(package):
+        has += f"; its setup.py, asked without setuptools, failed: {fault}"
     it = _near(name, {*available, *compiled}, "it")
     raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 
