@@ -13,6 +13,7 @@ from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
 from rsltrace.doors.rclpy.stacks.runners import Wait
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.loop.ordered import OrderedLoop, Workers
+from rsltrace.loop.policy import Candidate
 from rsltrace.middleware.entity import DomainEntity
 from rsltrace.middleware.events.outcome import Outcome
 from rsltrace.model.endless_wait import EndlessWait
@@ -36,11 +37,12 @@ def note_waits(stacks: Stacks, outcome: Outcome) -> None:
     told = _held_in_groups(stacks, outcome)
     for one in blocked:
         text, waited_ns = one.waits_for(), stacks.loop.now_ns - one.since_ns
-        handles = starved.get(_workers(stacks, one.event[0]), [])
-        names = list(dict.fromkeys(handle.describe() for handle in handles))
+        candidates = starved.get(_workers(stacks, one.event[0]), [])
+        names = list(dict.fromkeys(candidate.item.describe() for candidate in candidates))
         parked = stacks.groups.parked.get(one.group, []) if one.group is not None else []
-        held = [*handles, *(handle for handle, _, _ in parked)]
-        numbers = tuple(sorted({handle.entity_id for handle in held}))
+        held = [candidate.entity_id for candidate in candidates]
+        held += [getattr(handle, "entity_id", 0) for handle, _, _ in parked]
+        numbers = tuple(sorted({number for number in held if number}))
         outcome.waits.append(EndlessWait(one.since_ns, text, numbers))
         if waited_ns < _LONG_NS or one in told:
             continue
@@ -54,13 +56,12 @@ def note_waits(stacks: Stacks, outcome: Outcome) -> None:
             outcome.notes.append(f"waited for {lasted}: {text}")
 
 
-def _starved(stacks: Stacks) -> dict[Workers | None, list[Any]]:
+def _starved(stacks: Stacks) -> dict[Workers | None, list[Candidate]]:
     """Return what is ready and has no worker, by simulated executor."""
-    found: dict[Workers | None, list[Any]] = {}
+    found: dict[Workers | None, list[Candidate]] = {}
     if isinstance(stacks.loop, OrderedLoop):
         for place in stacks.loop.starved():
-            if place.candidate.entity:
-                found.setdefault(place.workers, []).append(place.candidate.item)
+            found.setdefault(place.workers, []).append(place.candidate)
     return found
 
 
