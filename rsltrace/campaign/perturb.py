@@ -23,6 +23,7 @@ from typing import Any
 
 from rsltrace.campaign.processes import Done, Processes
 from rsltrace.guard.pin import THREADS
+from rsltrace.workspace.cache import same_place
 
 HASH_SEED = "hash seed"
 FOLDER = "working directory"
@@ -282,7 +283,7 @@ def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
     env = dict(os.environ)
     env["PYTHONHASHSEED"] = values.get(HASH_SEED, "0")
     if FOLDER in values:
-        env["HOME"] = str(home)
+        env.update(HOME=str(home), **same_place())
     if LOCALE in values:
         env.update(LC_ALL=values[LOCALE], LANG=values[LOCALE])
     if TIME_ZONE in values:

@@ -403,10 +403,13 @@ def _warn(result: RunResult) -> None:
     if not found:
         return
     calls: Counter[tuple[str, str]] = Counter()
+    copied = {met.node for met in found if met.call == _ENVIRONMENT}
     for met in found:
         what, _, library = met.call.partition(READ_BY)
         if library:  # what it is configured by, as a rule
             what = f"environment variables{READ_BY}{library}"
+        elif met.node in copied and what.startswith(f"{_ENVIRONMENT}["):
+            continue  # who asks for all of it, to copy it, is told once
         calls[met.source.value, f"{what} in {met.node or 'the run'}"] += met.count
     tell("guard: these calls can make runs differ (see docs/guard.md):")
     for (source, call), count in sorted(calls.items())[:_SHOWN_MAX]:
@@ -419,3 +422,4 @@ def _warn(result: RunResult) -> None:
 
 
 _SHOWN_MAX = 8
+_ENVIRONMENT = "os.environ"

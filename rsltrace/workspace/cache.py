@@ -16,6 +16,7 @@ from pathlib import Path
 from rsltrace.errors import SetupError
 
 _NEW = ".new-"
+_PLACE = "RSLTRACE_CACHE"
 _LEFT_S = 3600.0
 
 
@@ -73,6 +74,12 @@ def lasting(path: str) -> str:
     return os.path.realpath(path) if Path(path).is_relative_to(_root()) else path
 
 
+def same_place() -> dict[str, str]:
+    """Return what a process needs in its environment to use this process's folder, whatever its
+    ``HOME``: a node may well tell others where its share is."""
+    return {_PLACE: str(_root())}
+
+
 def _is_ours(folder: Path) -> bool:
     """Return whether nobody but this user and root can put something into a folder."""
     found = folder.stat()
@@ -83,6 +90,8 @@ def _is_ours(folder: Path) -> bool:
 def _root() -> Path:
     """Return the user's folder for caches, or one for this process if that cannot be written, or
     not by this user alone."""
+    if given := os.environ.get(_PLACE):
+        return Path(given)
     folder = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(folder) if os.path.isabs(folder) else Path("~/.cache").expanduser()
     try:
@@ -99,4 +108,4 @@ def _root() -> Path:
     return root / "rsltrace"
 
 
-__all__ = ["cached_folder", "key_of", "lasting"]
+__all__ = ["cached_folder", "key_of", "lasting", "same_place"]

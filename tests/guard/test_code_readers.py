@@ -156,3 +156,13 @@ def test_variables_that_a_library_reads_are_told_as_one(
         "  environment: os.environ['MINE'] in /n",
     ]
     sys.modules.pop("loguru", None)
+
+
+def test_who_copies_the_environment_is_told_once(
+    command: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    (tmp_path / "m.py").write_text(node_code("import os\ndict(os.environ)\n{**os.environ}"))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {time: 0.7s}\n")
+    done = command("record", "job.yaml")
+    lines = [line for line in done.stderr.splitlines() if line.startswith("  environment")]
+    assert lines == ["  environment: os.environ in /n, 2 times"]

@@ -174,6 +174,31 @@ def test_processes_of_a_checkout_find_its_modules_and_shares(
     assert heard == ["from cmake"] * 8
 
 
+def test_verify_leaves_shares_where_they_are(
+    command: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    """A node may say where its share is; ``verify`` gives each run another HOME."""
+    _write(
+        tmp_path,
+        {
+            "say/package.xml": _PACKAGE.format("say"),
+            "say/setup.py": (
+                "import setuptools\nsetuptools.setup(data_files=[('share/say/a', ['x'])])"
+            ),
+            "say/x": "",
+            "say/say/__init__.py": (
+                "from ament_index_python.packages import get_package_share_directory\n"
+                "from rclpy.node import Node\nclass N(Node):\n    def __init__(self):\n"
+                "        super().__init__('n')\n"
+                "        self.get_logger().info(get_package_share_directory('say'))\n"
+            ),
+            "job.yaml": "nodes: [{node: 'say:N'}]\nstop: {time: 0.1s}\n",
+        },
+    )
+    done = command("verify", "job.yaml", "--runs", "2")
+    assert done.returncode == 0, done.stdout
+
+
 def test_what_build_files_say(tmp_path: Path) -> None:
     _write(
         tmp_path,
