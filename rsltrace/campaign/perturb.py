@@ -280,10 +280,10 @@ def _result_in(output: str) -> dict[str, Any]:
 
 
 def _environment(values: Mapping[str, str], home: Path) -> dict[str, str]:
-    env = dict(os.environ)
+    env = {**os.environ, **same_place()}
     env["PYTHONHASHSEED"] = values.get(HASH_SEED, "0")
     if FOLDER in values:
-        env.update(HOME=str(home), **same_place())
+        env["HOME"] = str(home)
     if LOCALE in values:
         env.update(LC_ALL=values[LOCALE], LANG=values[LOCALE])
     if TIME_ZONE in values:
