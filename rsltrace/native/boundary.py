@@ -14,6 +14,7 @@ from functools import wraps
 from itertools import count
 from typing import Any
 
+from rsltrace.doors.rclpy.handles.lifecycle import transition_event
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.model.event import OutputKind
 from rsltrace.native.ledger import Ledger, Logged, Sent, Span, Taken, now_ns
@@ -97,6 +98,8 @@ class Boundary:
             (extension.Service, "service_take_request", self._take_exchange(_REQUEST)),
             (extension.Service, "service_send_response", self._send_response),
             (extension.Timer, "call_timer", self._call_timer),
+            (extension.LifecycleStateMachine, "trigger_transition_by_id", self._trigger),
+            (extension.LifecycleStateMachine, "trigger_transition_by_label", self._trigger),
             (extension, "rclpy_logging_rcutils_log", self._log),
         ]
         for name, sends in _ACTION_SENDS.items():
@@ -134,6 +137,25 @@ class Boundary:
                 self._sent(span, _MESSAGE, thing, message, sequence, before_ns, begun_ns)
 
         return publish
+
+    def _trigger(self, original: Callable[..., None]) -> Callable[..., None]:
+        """Wrap what changes the state of a lifecycle node: rcl publishes from where to where."""
+
+        @wraps(original)
+        def trigger(machine: Any, transition: Any, publish_update: bool) -> None:
+            thing = self._things.find(machine)
+            if thing is None or not publish_update:
+                original(machine, transition, publish_update)
+                return
+            start = machine.current_state
+            with self._sending() as span:
+                before_ns = time.time_ns()
+                original(machine, transition, publish_update)
+                message = transition_event(start, machine.current_state)
+                number = next(thing.sequence)
+                self._sent(span, _MESSAGE, thing, message, number, before_ns, now_ns())
+
+        return trigger
 
     @contextmanager
     def _sending(self) -> Iterator[Span]:

@@ -30,7 +30,15 @@ _KINDS = {
 class Executors:
     """Tells a ledger of the callbacks that any executor of this process runs."""
 
-    def __init__(self, ledger: Ledger, things: Things, boundary: Boundary) -> None:
+    def __init__(
+        self,
+        ledger: Ledger,
+        things: Things,
+        boundary: Boundary,
+        meet: Callable[[Any, Any], object],
+    ) -> None:
+        """``meet`` is told, before it is taken from, of a node and of what it has."""
+        self._meet = meet
         self._ledger = ledger
         self._things = things
         self._boundary = boundary
@@ -53,6 +61,7 @@ class Executors:
     def _make_handler(self, original: Callable[..., Any]) -> Callable[..., Any]:
         @wraps(original)
         def make_handler(executor: Any, entity: Any, node: Any, take: Callable[..., Any]) -> Any:
+            self._meet(node, entity)
             return original(executor, entity, node, partial(self._take, take))
 
         return make_handler

@@ -47,6 +47,7 @@ class Nodes:
         """Be told of all nodes that are made meanwhile."""
         from rclpy.action.client import ActionClient
         from rclpy.action.server import ActionServer
+        from rclpy.lifecycle.node import LifecycleNodeMixin
         from rclpy.node import Node
 
         made: dict[str, Callable[[Thing, Any], object]] = {
@@ -61,6 +62,7 @@ class Nodes:
             stack.enter_context(patched(Node, "__init__", self._with_arguments))
             for name, tell in made.items():
                 stack.enter_context(patched(Node, name, self._telling(tell)))
+            stack.enter_context(patched(LifecycleNodeMixin, "__init__", self._with_states))
             stack.enter_context(patched(ActionServer, "__init__", self._action(True)))
             stack.enter_context(patched(ActionClient, "__init__", self._action(False)))
             yield
@@ -98,12 +100,54 @@ class Nodes:
             if entry is not None and kwargs.get("use_global_arguments", True):
                 kwargs = with_arguments(entry, node_name, kwargs)
             original(node, node_name, *args, **kwargs)
-            owner = self.node(node)
+            self.node(node)
             for service in node.services:  # one that rclpy makes without create_service
-                if self._things.find(service) is None:
-                    self._service(owner, service)
+                self.meet(node, service)
 
         return construct
+
+    def meet(self, node: Any, made: Any) -> None:
+        """Tell of what a node has if nobody did: it was made without the node's ``create_…``."""
+        if self._things.find(made) is not None:
+            return
+        from rclpy.client import Client
+        from rclpy.service import Service
+        from rclpy.subscription import Subscription
+
+        tells = {Service: self._service, Client: self._client, Subscription: self._subscription}
+        for kind, tell in tells.items():
+            if isinstance(made, kind):
+                tell(self.node(node), made)
+
+    def _with_states(self, original: Callable[..., None]) -> Callable[..., None]:
+        """Wrap the constructor of lifecycle nodes: rcl makes services, and says what changes."""
+
+        @wraps(original)
+        def construct(node: Any, *args: Any, **kwargs: Any) -> None:
+            original(node, *args, **kwargs)
+            for service in node.services:
+                self.meet(node, service)
+            if hasattr(node, "_service_change_state"):  # it is to communicate
+                self._transitions(self.node(node), node)
+
+        return construct
+
+    def _transitions(self, owner: Thing, node: Any) -> None:
+        from lifecycle_msgs.msg import TransitionEvent
+        from rclpy.qos import QoSProfile
+
+        topic = node.resolve_topic_name("~/transition_event")
+        qos = qos_of(QoSProfile(depth=10).get_c_qos_profile())
+        thing = self._things.add(
+            (node._state_machine,),
+            owner,
+            EntityKind.PUBLISHER,
+            topic,
+            message_type(TransitionEvent).name,
+            qos=qos.summary(),
+        )
+        thing.qos_yaml = qos.to_yaml()
+        _with_types(thing, TransitionEvent)
 
     def _telling(self, tell: Callable[[Thing, Any], object]) -> Callable[..., Any]:
         def wrapping(original: Callable[..., Any]) -> Callable[..., Any]:

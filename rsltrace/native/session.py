@@ -103,7 +103,7 @@ class InThreads(Recording):
             "domain": str(number),
         }
         self.create(stack, output, self.ledger, described, force=force)
-        executors = Executors(self.ledger, self.things, self.boundary)
+        executors = Executors(self.ledger, self.things, self.boundary, self.nodes.meet)
         stack.enter_context(self.boundary.watched(boundary().real))
         if self.priorities is not None:
             stack.enter_context(self.priorities.watched(boundary().real))

@@ -37,7 +37,7 @@ class Observers:
 
     def watch(self) -> None:
         """Begin."""
-        executors = Executors(self.ledger, self.things, self.boundary)
+        executors = Executors(self.ledger, self.things, self.boundary, self.nodes.meet)
         self._stack.enter_context(self.boundary.watched(self._extension))
         self._stack.enter_context(self.nodes.watched())
         self._stack.enter_context(executors.watched(threads_are_processes=False))

@@ -6,6 +6,8 @@ native one); services and the transition event topic are ordinary entities of th
 
 from __future__ import annotations
 
+from typing import Any
+
 from rsltrace.doors.rclpy.handles.destroyable import Handle
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
@@ -54,6 +56,16 @@ _TRANSITIONS = (
 """(transition id, label, start state, goal state), in rcl_lifecycle's order."""
 
 Description = tuple[int, str, int, str, int, str]
+
+
+def transition_event(start: tuple[int, str], goal: tuple[int, str]) -> Any:
+    """Return what rcl_lifecycle publishes of a change between states (numbers and labels)."""
+    from lifecycle_msgs.msg import State, TransitionEvent
+
+    return TransitionEvent(
+        start_state=State(id=start[0], label=start[1]),
+        goal_state=State(id=goal[0], label=goal[1]),
+    )
 
 
 class StateMachineHandle(Handle):
@@ -148,14 +160,7 @@ class StateMachineHandle(Handle):
     def _go(self, start: int, goal: int, publish_update: bool) -> None:
         self._state = goal
         if publish_update and self._events is not None:
-            from lifecycle_msgs.msg import State, TransitionEvent
-
-            self._events.publish(
-                TransitionEvent(
-                    start_state=State(id=start, label=_STATES[start]),
-                    goal_state=State(id=goal, label=_STATES[goal]),
-                )
-            )
+            self._events.publish(transition_event((start, _STATES[start]), (goal, _STATES[goal])))
 
     # -- services ----------------------------------------------------------------------------------
 
