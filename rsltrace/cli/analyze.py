@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rsltrace.job import Job
     from rsltrace.timing.analysis import Analysis
     from rsltrace.timing.curves import Supply
-    from rsltrace.timing.observed import Observed
+    from rsltrace.timing.observed import ObservedChains
 
 
 @click.command()
@@ -165,20 +165,22 @@ def _deadline(text: str) -> tuple[str, int]:
         raise click.BadParameter(str(error), param_hint="--deadline") from None
 
 
-def _opened(traces: Sequence[Path], stack: ExitStack) -> tuple[list[Observed], list[Observed]]:
+def _opened(
+    traces: Sequence[Path], stack: ExitStack
+) -> tuple[list[ObservedChains], list[ObservedChains]]:
     """Return what the simulated and the native ones of some traces show.
 
     :raises TraceError: there are several simulated ones, or one is damaged.
     """
-    from rsltrace.timing.observed import Observed
+    from rsltrace.timing.observed import ObservedChains
     from rsltrace.trace.native import is_native
     from rsltrace.trace.reader import Trace
 
-    simulated: list[Observed] = []
-    native: list[Observed] = []
+    simulated: list[ObservedChains] = []
+    native: list[ObservedChains] = []
     for path in traces:
         trace = stack.enter_context(Trace.open(path))
-        (native if is_native(trace) else simulated).append(Observed(trace))
+        (native if is_native(trace) else simulated).append(ObservedChains(trace))
     if len(simulated) > 1:
         raise TraceError(
             f"{simulated[1].trace.name} is of a simulated run, as {simulated[0].trace.name} is: "
@@ -187,19 +189,19 @@ def _opened(traces: Sequence[Path], stack: ExitStack) -> tuple[list[Observed], l
     return simulated, native
 
 
-def _simulated(job: Job, stack: ExitStack) -> Observed:
+def _simulated(job: Job, stack: ExitStack) -> ObservedChains:
     """Run a job, and return what that shows.
 
     :raises RunError: the run fails.
     """
     from rsltrace.run import record
-    from rsltrace.timing.observed import Observed
+    from rsltrace.timing.observed import ObservedChains
     from rsltrace.trace.reader import Trace
 
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rsltrace-"))
     path = Path(folder) / "run.mcap"
     record(job, path)
-    return Observed(stack.enter_context(Trace.open(path)))
+    return ObservedChains(stack.enter_context(Trace.open(path)))
 
 
 def _print(found: Analysis, times: str, native: Sequence[str]) -> None:

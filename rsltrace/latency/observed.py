@@ -14,7 +14,7 @@ from rsltrace.trace.reader import Trace
 NONE = -1
 
 
-class Observed:
+class ObservedTimes:
     """The times of a native run, by the indexes of its events.
 
     ``durations`` has how long each event took, in ns, shape (events,).
@@ -53,9 +53,9 @@ class Observed:
         return dict(zip(keys, since.tolist(), strict=True))
 
 
-def observed(trace: Trace) -> Observed | None:
+def observed(trace: Trace) -> ObservedTimes | None:
     """Return the times of a native run, None of a simulated one.
 
     :raises TraceError: the trace is damaged.
     """
-    return Observed(trace) if is_native(trace) and len(timings(trace)) else None
+    return ObservedTimes(trace) if is_native(trace) and len(timings(trace)) else None

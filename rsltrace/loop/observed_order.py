@@ -21,7 +21,7 @@ CALLBACKS = frozenset(
 """What has a place in the order; everything else runs as soon as it can."""
 
 
-class Observed(NamedTuple):
+class ObservedCallback(NamedTuple):
     """A callback of the native run: which of its events, and what ran."""
 
     number: int
@@ -37,7 +37,7 @@ class ObservedOrder:
     """
 
     def __init__(
-        self, file: str, observed: Sequence[Observed], name_of: Callable[[int], str | None]
+        self, file: str, observed: Sequence[ObservedCallback], name_of: Callable[[int], str | None]
     ) -> None:
         self.file = file
         self.name_of = name_of
@@ -50,7 +50,7 @@ class ObservedOrder:
         self._ahead_ns: int | None = None
         self._ran = bytearray(len(observed))
         self._in_turn = self._late = self._others = 0
-        self._first: tuple[Observed, str] | None = None
+        self._first: tuple[ObservedCallback, str] | None = None
 
     def hold_until(self, ready: Sequence[Candidate], moment: Moment) -> int | None:
         """Return until when all that is ready is to wait for who comes before; None: one runs."""
@@ -91,7 +91,7 @@ class ObservedOrder:
             self._first = missed, self._why(missed, name, now_ns)
         self._next = place + 1
 
-    def _why(self, missed: Observed, name: str, now_ns: int) -> str:
+    def _why(self, missed: ObservedCallback, name: str, now_ns: int) -> str:
         """Say why what was missed did not run before an event of that name."""
         there = sum(place < self._next for place in self._places[missed.event.name])
         return (

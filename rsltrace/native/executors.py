@@ -77,7 +77,7 @@ class Executors:
         if thing is None:
             return None  # nothing was there after all
         kind = self._kind(entity, thing)
-        return partial(Observed, self._ledger, kind, thing, call, taken)
+        return partial(ObservedTask, self._ledger, kind, thing, call, taken)
 
     def _thing(self, entity: Any) -> Thing | None:
         from rclpy.client import Client
@@ -155,10 +155,10 @@ def _run(
 async def _run_async(
     ledger: Ledger, thing: Thing | None, call: Callable[[], Any], cause: tuple[Span, int]
 ) -> Any:
-    return await Observed(ledger, int(EventKind.TASK), thing, call, None, cause)
+    return await ObservedTask(ledger, int(EventKind.TASK), thing, call, None, cause)
 
 
-class Observed:
+class ObservedTask:
     """Awaits ``call()``, and tells a ledger when it runs and when it waits."""
 
     def __init__(

@@ -12,7 +12,7 @@ from rsltrace.job import Job
 from rsltrace.job.parts.scheduling import EntityExecutionSpec, ExecutionSpec
 from rsltrace.timing.bounds import bounds, utilization
 from rsltrace.timing.model import Wanted, longest_times, system_of
-from rsltrace.timing.observed import Key, Observed
+from rsltrace.timing.observed import Key, ObservedChains
 from rsltrace.timing.system import ONCE_NS, Callback
 
 
@@ -79,7 +79,7 @@ class Analysis:
         return all(one.verdict in ("meets", "no deadline") for one in self.chains)
 
 
-def measured_times(observed: Sequence[Observed], times: str) -> dict[Callback, int]:
+def measured_times(observed: Sequence[ObservedChains], times: str) -> dict[Callback, int]:
     """Return how long callbacks took in runs: the longest, or the 99 % quantile (ns)."""
     found: dict[Callback, list[int]] = {}
     for one in observed:
@@ -106,8 +106,8 @@ def with_times(job: Job, times: Mapping[Callback, int]) -> Job:
 
 def analyze(
     job: Job,
-    simulated: Observed,
-    native: Sequence[Observed],
+    simulated: ObservedChains,
+    native: Sequence[ObservedChains],
     *,
     times: Mapping[Callback, int] | None,
     deadlines: Mapping[str, int],
@@ -166,7 +166,7 @@ def analyze(
     return Analysis(tuple(results), load, times, (*notes, *more))
 
 
-def _seen(observed: Observed, key: Key) -> Seen | None:
+def _seen(observed: ObservedChains, key: Key) -> Seen | None:
     path = observed.path(key)
     return None if path is None else Seen(path.worst_ns, path.worst_event, path.runs)
 

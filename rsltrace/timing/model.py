@@ -24,7 +24,7 @@ from rsltrace.loop.wait_set import RclpyWaitSet, WaitSet
 from rsltrace.run.plans.network import network_plan
 from rsltrace.run.plans.scheduling import policy_of_job, scheduling_plan, switches_at_lines
 from rsltrace.timing.curves import PROCESSOR, Arrivals, Supply
-from rsltrace.timing.observed import Observed, Path
+from rsltrace.timing.observed import ObservedChains, Path
 from rsltrace.timing.system import ONCE_NS, Callback, Executor, Order, System, Task
 
 
@@ -58,7 +58,7 @@ def check_job(job: Job) -> None:
         )
 
 
-def longest_times(job: Job, observed: Observed) -> tuple[dict[Callback, int], list[str]]:
+def longest_times(job: Job, observed: ObservedChains) -> tuple[dict[Callback, int], list[str]]:
     """Return the longest that the job lets each callback take (ns), and what to know of that.
 
     Of distributions without an end it is the longest that the run has drawn.
@@ -109,7 +109,7 @@ def longest(distribution: Distribution) -> int | None:
 
 
 def system_of(
-    job: Job, observed: Observed, times: Mapping[Callback, int], wanted: Wanted
+    job: Job, observed: ObservedChains, times: Mapping[Callback, int], wanted: Wanted
 ) -> tuple[System, list[str]]:
     """Return the system of a job whose tasks are the paths of ``observed``, in their order, and
     what to know of it."""
@@ -118,7 +118,7 @@ def system_of(
 
 class _Maker:
     def __init__(
-        self, job: Job, observed: Observed, times: Mapping[Callback, int], wanted: Wanted
+        self, job: Job, observed: ObservedChains, times: Mapping[Callback, int], wanted: Wanted
     ) -> None:
         self.job = job
         self.observed = observed

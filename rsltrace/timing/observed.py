@@ -49,7 +49,7 @@ class Path:
     last: tuple[int, int] = (-1, 0)
 
 
-class Observed:
+class ObservedChains:
     """The chains of a trace, parents before children, and all durations of callbacks (ns).
 
     :raises TraceError: the trace is damaged.

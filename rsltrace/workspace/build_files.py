@@ -97,14 +97,19 @@ def setup_cfg(folder: Path) -> configparser.ConfigParser:
     return parser
 
 
-def _pyproject(folder: Path, *tables: str) -> Mapping[str, Any]:
-    """Return a table of ``pyproject.toml``; an empty one if it is not there."""
+def _pyproject(folder: Path) -> Mapping[str, Any]:
+    """Return ``pyproject.toml``; empty if there is none, or nothing that can be read."""
     toml = importlib.import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
-        found: object = toml.loads((folder / "pyproject.toml").read_text("utf-8"))
+        found: Mapping[str, Any] = toml.loads((folder / "pyproject.toml").read_text("utf-8"))
     except (OSError, ValueError):
         return {}
-    for name in tables:
+    return found
+
+
+def _table(found: object, *names: str) -> Mapping[str, Any]:
+    """Return the table below these names; an empty one if it is not there."""
+    for name in names:
         found = found.get(name) if isinstance(found, Mapping) else None
     return found if isinstance(found, Mapping) else {}
 
@@ -112,7 +117,8 @@ def _pyproject(folder: Path, *tables: str) -> Mapping[str, Any]:
 def name_and_version(folder: Path) -> tuple[str | None, str | None]:
     """Return what a package calls itself, and its version, as far as its build files say so."""
     setup, listed = setup_py(folder), setup_cfg(folder)
-    project = {**_pyproject(folder, "tool", "poetry"), **_pyproject(folder, "project")}
+    pyproject = _pyproject(folder)
+    project = {**_table(pyproject, "tool", "poetry"), **_table(pyproject, "project")}
 
     def said(key: str) -> str | None:
         given = listed.get("metadata", key, fallback=None)
@@ -157,11 +163,12 @@ def _of_setup_py(given: object) -> Iterator[tuple[str, Iterable[object]]]:
 
 def _of_pyproject(folder: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """Give the entry points of the standard's tables, and of those of an older Poetry."""
-    yield "console_scripts", text_mapping(_pyproject(folder, "tool", "poetry", "scripts"))
-    yield "console_scripts", text_mapping(_pyproject(folder, "project", "scripts"))
-    yield "gui_scripts", text_mapping(_pyproject(folder, "project", "gui-scripts"))
+    pyproject = _pyproject(folder)
+    yield "console_scripts", text_mapping(_table(pyproject, "tool", "poetry", "scripts"))
+    yield "console_scripts", text_mapping(_table(pyproject, "project", "scripts"))
+    yield "gui_scripts", text_mapping(_table(pyproject, "project", "gui-scripts"))
     for above in (("tool", "poetry", "plugins"), ("project", "entry-points")):
-        for group, targets in _pyproject(folder, *above).items():
+        for group, targets in _table(pyproject, *above).items():
             yield group, text_mapping(targets)
 
 

@@ -15,7 +15,7 @@ from rsltrace.job import Job
 from rsltrace.run import record
 from rsltrace.timing.bounds import Bound, bounds
 from rsltrace.timing.model import Wanted, longest_times, system_of
-from rsltrace.timing.observed import Observed
+from rsltrace.timing.observed import ObservedChains
 from rsltrace.timing.observed import Path as Chain
 from rsltrace.trace.reader import Trace
 
@@ -161,7 +161,7 @@ def held(plan: Plan, folder: Path) -> list[tuple[Chain, Bound]]:
     job = plan.job()
     record(job, folder / "run.mcap", force=True)
     with Trace.open(folder / "run.mcap") as trace:
-        observed = Observed(trace)
+        observed = ObservedChains(trace)
         times, notes = longest_times(job, observed)
         assert not notes
         system, _ = system_of(job, observed, times, Wanted())

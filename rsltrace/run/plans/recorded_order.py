@@ -13,7 +13,7 @@ from rsltrace.errors import JobError, TraceError
 from rsltrace.job import Job, locate
 from rsltrace.loop.choices import Choices, decoded
 from rsltrace.loop.loop import EventLoop
-from rsltrace.loop.observed_order import CALLBACKS, Observed, ObservedOrder
+from rsltrace.loop.observed_order import CALLBACKS, ObservedCallback, ObservedOrder
 from rsltrace.loop.ordered import OrderedLoop
 from rsltrace.loop.policy import Candidate, Fifo, Moment, Policy, Priority, PriorityRule
 from rsltrace.loop.recorded import THE_RUN, Recorded, RecordedEvent, described
@@ -53,7 +53,7 @@ def recorded_run(job: Job, domain: Domain, stack: ExitStack) -> RecordedRun | Ob
     file = Path(job.policy.recorded).name
     if is_native(trace):
         events = enumerate(_events(trace))
-        observed = [Observed(index, one) for index, one in events if one.kind in CALLBACKS]
+        observed = [ObservedCallback(index, one) for index, one in events if one.kind in CALLBACKS]
         return ObservedRun(domain.dispatcher, ObservedOrder(file, observed, census.describe_all()))
     order = Recorded(file, _Events(trace).event, _chosen(trace), census.describe_all())
     from_ns = _polls_from_ns(trace)
