@@ -6,7 +6,9 @@ import os
 import sys
 from types import FrameType
 
+from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import engage
+from rsltrace.guard.libraries import TARGETS
 
 _INSTALLED = (
     os.path.join(sys.prefix, ""),
@@ -16,8 +18,10 @@ _INSTALLED = (
     "/etc/mime.types",
     "/dev/null",
     "/dev/tty",
+    *TARGETS,
 )
 READERS_OF_CODE = {"linecache", "tokenize", "inspect", "traceback", "zipimport", "pkgutil"}
+_COMPILED = "/__pycache__/"
 _BETWEEN = ("genericpath", "posixpath", "rsltrace.guard.recorded.files")
 """By way of which others ask the file system."""
 
@@ -34,8 +38,14 @@ def asking_module(frame: FrameType) -> str | None:
     return name
 
 
+def is_resolving(frame: FrameType) -> bool:
+    """Return whether a path's links are followed: of a folder on the way nothing else counts."""
+    return code_of(frame).co_name in ("realpath", "_joinrealpath")
+
+
 def is_installed(path: object) -> bool:
-    """Return whether a file is part of what is installed, whose versions a trace knows."""
+    """Return whether a file is part of what is installed, whose versions a trace knows, or is made
+    of source code and kept beside it."""
     if not isinstance(path, (str, bytes, os.PathLike)):
         return False
     name = os.fsdecode(path)
@@ -44,4 +54,4 @@ def is_installed(path: object) -> bool:
             name = os.path.abspath(name)
     elif "/." in name or "//" in name:
         name = os.path.abspath(name)
-    return name.startswith(_INSTALLED)
+    return name.startswith(_INSTALLED) or _COMPILED in f"{name}/"

@@ -7,7 +7,7 @@ import sysconfig
 from types import FrameType
 
 from rsltrace.guard.frames import code_of
-from rsltrace.guard.libraries import is_library
+from rsltrace.guard.libraries import INSTALLED, is_library
 
 _HERE = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 _GUARD = os.path.join(_HERE, "guard", "")
@@ -15,7 +15,6 @@ _PYTHON = tuple(
     path.rstrip(os.sep) + os.sep
     for path in {sysconfig.get_path("stdlib"), sysconfig.get_path("platstdlib")}
 )
-_INSTALLED = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
 _MIDDLEWARE = ("rclpy", "rpyutils", "ament_index_python", "rosidl_parser", "rosidl_pycommon")
 _LINES_MAX = 6
 
@@ -49,7 +48,7 @@ def _kind_of(file: str) -> int:
     if file.startswith(_GUARD) or file in _STANDS_IN:
         return STANDARD  # a redirected function: its caller counts
     if file.startswith(_HERE) or any(
-        f"{installed}{name}{os.sep}" in file for installed in _INSTALLED for name in _MIDDLEWARE
+        f"{installed}{name}{os.sep}" in file for installed in INSTALLED for name in _MIDDLEWARE
     ):
         return OURS  # rclpy, too: what it looks at is not the user's doing
     if is_library(file):
@@ -65,7 +64,7 @@ KINDS = _Kinds()
 
 def is_installed(file: str) -> bool:
     """Whether a file lies among what is installed, be it a library's or the user's."""
-    return any(part in file for part in _INSTALLED)
+    return any(part in file for part in INSTALLED)
 
 
 def _calls_back(file: str) -> bool:

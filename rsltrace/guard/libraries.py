@@ -3,14 +3,38 @@
 Where a package lies does not tell: a colcon workspace and pip put the user's packages into a
 ``site-packages`` folder, among all others. So libraries are known by name: ROS's own, and those
 that many programs use and that are large. Whatever else is installed is taken for the user's.
+Installed is what lies in such a folder, or in one of the import path that holds what pip writes of
+its packages (``pip install --target``).
 """
 
 from __future__ import annotations
 
 import os
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import lru_cache
 
-_INSTALLED = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
+_SITES = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
+
+
+def _targets() -> Iterator[str]:
+    """Give the folders of the import path that pip installed packages into, by their records."""
+    for folder in sys.path:
+        path = os.path.join(folder, "")
+        with suppress(OSError):
+            if (
+                os.path.isabs(folder)
+                and not path.endswith(_SITES)
+                and any(name.endswith(".dist-info") for name in os.listdir(folder))
+            ):
+                yield path
+
+
+TARGETS = tuple(_targets())
+"""Such folders as the process began with: ``PYTHONPATH``, mostly."""
+INSTALLED = (*_SITES, *TARGETS)
+"""A path that has one of these in it is of an installed package, be it a library's or not."""
 _ROS = f"{os.sep}opt{os.sep}ros{os.sep}"
 _INTERFACES = frozenset(("msg", "srv", "action"))
 
@@ -69,7 +93,7 @@ _KNOWN = frozenset(
 
 def is_library(file: str) -> bool:
     """Return whether a source file is of an installed library (or of generated interfaces)."""
-    for installed in _INSTALLED:
+    for installed in INSTALLED:
         place = file.rfind(installed)
         if place >= 0:
             parts = file[place + len(installed) :].split(os.sep, 2)
@@ -89,4 +113,4 @@ def _is_known(name: str) -> bool:
     )
 
 
-__all__ = ["is_library"]
+__all__ = ["INSTALLED", "TARGETS", "is_library"]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -101,3 +104,40 @@ def test_a_thread_that_an_import_leaves_running_is_named(
         found = [one for per_event in trace.findings.values() for one in per_event]
     calls = [one.call for one in found if one.source is Source.THREAD]
     assert calls == ["threading.Thread.start() while lib_that_goes_on is imported"] * 2
+
+
+def test_a_folder_that_pip_installed_into_is_of_libraries(tmp_path: Path) -> None:
+    """As ``pip install --target`` makes one, for ``PYTHONPATH``."""
+    from rsltrace.trace.reader import Trace
+
+    libs = tmp_path / "libs"
+    (libs / "lib_in_target-1.0.dist-info").mkdir(parents=True)
+    cache = tmp_path / "cache"
+    code = _LIBRARY.format(cache=str(cache), join="pass")
+    (libs / "lib_in_target.py").write_text(code + "os.path.realpath(__file__)\n")
+    (tmp_path / "m.py").write_text(node_code(_TICK.format(name="lib_in_target")))
+    (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 1.2s}\n")
+    digests = []
+    for name in ("first", "second"):
+        command = [sys.executable, "-m", "rsltrace", "record", "job.yaml", "-o", f"{name}.mcap"]
+        environment = {**os.environ, "PYTHONPATH": str(libs)}
+        subprocess.run(command, cwd=tmp_path, env=environment, check=True, capture_output=True)
+        with Trace.open(tmp_path / f"{name}.mcap") as trace:
+            digests.append(trace.digest)
+            found = [one.call for many in trace.findings.values() for one in many]
+            assert not [call for call in found if str(libs) in call]
+    assert cache.exists()
+    assert digests[0] == digests[1]
+
+
+def test_following_the_links_of_a_path_is_news_only_of_links(
+    said: Callable[..., Any], tmp_path: Path
+) -> None:
+    from rsltrace.trace.reader import Trace
+
+    (tmp_path / "deep" / "er").mkdir(parents=True)
+    (tmp_path / "link").symlink_to(tmp_path / "deep")
+    said(node_code(f"import os\nself.say(os.path.realpath({str(tmp_path / 'link' / 'er')!r}))"))
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        found = {one.call for many in trace.findings.values() for one in many}
+    assert found == {f"os.lstat({str(tmp_path / 'link')!r})"}

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import io
 import os
-import stat
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import lru_cache, partial
+from stat import S_ISDIR, S_ISREG
 from sys import _getframe
 from typing import Any
 
 from rsltrace.guard import frames
-from rsltrace.guard.asked_files import NOT_NEWS, asking_module, is_installed
+from rsltrace.guard.asked_files import NOT_NEWS, asking_module, is_installed, is_resolving
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, at_least, engaged
 from rsltrace.guard.process_ids import meant_path
@@ -80,7 +80,7 @@ def _is_device(file: Any) -> bool:
         kind = _real_stat(file).st_mode
     except OSError:
         return True  # in a re-run it may be gone; a plain file cannot be opened in any case
-    return not (stat.S_ISREG(kind) or stat.S_ISDIR(kind))
+    return not (S_ISREG(kind) or S_ISDIR(kind))
 
 
 def _recorded(guard: Guard, file: Any, mode: str, text: Any, real: Callable[..., Any]) -> Any:
@@ -131,7 +131,11 @@ def _looking(name: str, real: Callable[..., Any]) -> Any:
             call = f"{name}({os.fsdecode(path)!r})"
             return recorded_stat(guard, _FILE, call, lambda: real(path, **options), frame)
         value = real(path, **options) if options else real(path)
-        if mode is not _ALLOW and asking_module(frame) not in NOT_NEWS:
+        if (
+            mode is not _ALLOW
+            and asking_module(frame) not in NOT_NEWS
+            and not (S_ISDIR(value.st_mode) and is_resolving(frame))
+        ):
             is_plain = type(path) is str and path[:1] == "/"
             call = _news_of_path(name, path) if is_plain else _news(name, path)
             if call:
