@@ -81,16 +81,18 @@ def main(order: Mapping[str, object]) -> None:
     """Do what an order asks, and write the answer: a ``Launched``, or the text of an error."""
     from rsltrace.launch.api.basics import as_job_error, shown
     from rsltrace.launch.python_file import read_launch_file
+    from rsltrace.launch.values import argument_words
     from rsltrace.workspace.imports import unbuilt_packages
 
     _end_with(int(str(order["reader"])))
     folders = [Path(folder) for folder in order["folders"]]  # type: ignore[attr-defined]
     sys.path[:0] = map(str, folders)
-    sys.argv[1:] = []
+    arguments: Mapping[str, str] = order["arguments"]  # type: ignore[assignment]
+    sys.argv[:] = ["ros2", "launch", str(order["file"]), *argument_words(arguments)]
     found: Launched | str
     try:
         with unbuilt_packages(folders):
-            found = read_launch_file(Path(str(order["file"])), order["arguments"])  # type: ignore[arg-type]
+            found = read_launch_file(Path(str(order["file"])), arguments)
     except BaseException as error:
         found = str(as_job_error(error, shown(str(order["file"]))))
     answer = Path(str(order["answer"]))

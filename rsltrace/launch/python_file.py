@@ -18,6 +18,7 @@ from rsltrace.launch.api.packages import missing_packages_allowed
 from rsltrace.launch.api.sources import get_launch_description_from_python_launch_file
 from rsltrace.launch.model import Launched
 from rsltrace.launch.reader import ActionReader
+from rsltrace.launch.values import argument_words
 
 
 def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
@@ -25,7 +26,7 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
 
     :raises JobError: with file and line, if something in it is wrong, missing or not known here.
     """
-    context = LaunchContext()
+    context = LaunchContext(argv=argument_words(arguments))
 
     def run(file: Path) -> None:
         _run(context, file)

@@ -8,6 +8,7 @@ it would be started with is noted instead.
 from __future__ import annotations
 
 import os
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -29,7 +30,7 @@ from rsltrace.launch.model import (
 )
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.launch.scope import ParameterFile, Parameters, full_name
-from rsltrace.launch.values import yaml_value
+from rsltrace.launch.values import argument_words, yaml_value
 
 _NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
 _PROCESS = "other programs do not run in a simulation"
@@ -51,8 +52,9 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
     from launch.actions import IncludeLaunchDescription
     from launch.launch_description_sources import AnyLaunchDescriptionSource
 
-    with _own_environment():
-        context = LaunchContext(argv=[])
+    words = argument_words(arguments)
+    with _own_environment(["ros2", "launch", str(path), *words]):
+        context = LaunchContext(argv=words)
         context.launch_configurations.update(arguments)
         visitor = _Visitor(context, path)
         try:
@@ -70,12 +72,14 @@ def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:
 
 
 @contextmanager
-def _own_environment() -> Iterator[None]:
-    """Take back what launch actions do to this process's environment."""
-    saved = dict(os.environ)
+def _own_environment(argv: list[str]) -> Iterator[None]:
+    """Give Python launch files their command line; take back what they do to the environment."""
+    saved, before = dict(os.environ), sys.argv
+    sys.argv = argv
     try:
         yield
     finally:
+        sys.argv = before
         os.environ.clear()
         os.environ.update(saved)
 

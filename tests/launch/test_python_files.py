@@ -458,3 +458,16 @@ def test_a_run_of_a_python_launch_file(
     assert unasked.returncode == 2
     assert "without running code" in unasked.stderr
     assert not Path("ran").exists()
+
+
+def test_the_command_line_is_that_of_ros2_launch(
+    write: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    body = """
+def words(context):
+    print(context.argv, sys.argv[:2], sys.argv[2][-11:], sys.argv[3:])
+return LaunchDescription([DeclareLaunchArgument("laps"), OpaqueFunction(function=words)])
+"""
+    read_apart(write_body(write, body), {"laps": "2"}, [])
+    said = "['laps:=2'] ['ros2', 'launch'] a.launch.py ['laps:=2']\n"
+    assert capsys.readouterr().err == said
