@@ -1,7 +1,8 @@
 """Waiting for what is outside of the run, in threads and event loops: others go on meanwhile.
 
 Simulated time then passes as fast as real time does, in steps of a millisecond. The trace keeps how
-many steps it took, and a re-run takes as many without waiting for anything.
+many steps it took, and a re-run takes as many without waiting for anything. A program that answers
+or ends soon takes no simulated time at all: how long it takes is another matter in each run.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from types import FrameType
 from typing import Any
 
 from rsltrace.guard.context import Context
+from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.guard.library_imports import present_import
 from rsltrace.guard.real_time import STEP_NS
@@ -27,8 +29,12 @@ NOT_YET: Any = object()
 Attempt = Callable[[float], Any]
 """Waits in real time, at most the given seconds, and returns the answer or ``NOT_YET``."""
 
+_PROGRAM_S = 5.0
+"""How long simulated time stands still, in real seconds, for a program that was started."""
+
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
 _sleep = copy_of(time.sleep)  # type: ignore[arg-type]
+_monotonic = copy_of(time.monotonic)  # type: ignore[arg-type]
 
 
 def wait_recorded(
@@ -51,14 +57,14 @@ def wait_recorded(
     context = guard.context
     step = step or context.step
     deadline_ns = _deadline_ns(context, timeout_s)
-    steps = 0
+    steps, at_first_s = 0, _at_first_s(frame, timeout_s)
     kept = guard.answers.next_answer(context.node(), call, of) if guard.answers.replays else None
     text: str | None = None
     try:
         while True:
             if kept is None:
                 with engage(None):
-                    seconds = guard.pace.ahead_s(context.now_ns()) if steps else 0.0
+                    seconds = guard.pace.ahead_s(context.now_ns()) if steps else at_first_s
                     text = _looked(look, seconds)
                 if text is not None:
                     break
@@ -85,6 +91,7 @@ def wait_recorded(
 def wait_unrecorded(
     guard: Guard,
     look: Attempt,
+    frame: FrameType,
     timeout_s: float | None = None,
     step: Callable[[int], object] | None = None,
 ) -> Any:
@@ -94,13 +101,14 @@ def wait_unrecorded(
     """
     context, steps = guard.context, 0
     step = step or context.step
+    at_first_s = _at_first_s(frame, timeout_s)
     deadline_ns = _deadline_ns(context, timeout_s)
     while True:
         with engage(None):
-            found = look(guard.pace.ahead_s(context.now_ns()) if steps else 0.0)
+            found = look(guard.pace.ahead_s(context.now_ns()) if steps else at_first_s)
         if found is not NOT_YET:
             # Who always finds something may look at what another thread is to fetch.
-            if steps == 0 and guard.pace.is_greedy():
+            if steps == 0 and not at_first_s and guard.pace.is_greedy():
                 context.step(STEP_NS)
             return found
         left_ns = STEP_NS
@@ -116,6 +124,20 @@ def wait_unrecorded(
 
 def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
     return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
+
+
+def _at_first_s(frame: FrameType, timeout_s: float | None) -> float:
+    """Return how long simulated time stands still for whoever waits, in real seconds.
+
+    It does for a program of ``subprocess``, but not for one that can still be told something: it
+    may wait for the run. Until a program has begun that does not matter.
+    """
+    if frame.f_globals.get("__name__") != "subprocess":
+        return 0.0
+    stdin = getattr(frame.f_locals.get("self"), "stdin", None)
+    if stdin is not None and not stdin.closed and code_of(frame).co_name != "_execute_child":
+        return 0.0
+    return _PROGRAM_S if timeout_s is None else min(timeout_s, _PROGRAM_S)
 
 
 def waiting_guard(frame: FrameType) -> Guard | None:
@@ -158,10 +180,12 @@ def polled(real: Callable[[], Any]) -> Attempt:
     """Return a look at something that nobody can wait for: ``real`` returns it, or ``NOT_YET``."""
 
     def look(seconds: float) -> Any:
-        found = real()
-        if found is NOT_YET and seconds > 0:
-            _sleep(seconds)
+        until_s = _monotonic() + seconds
+        while True:
             found = real()
-        return found
+            left_s = until_s - _monotonic()
+            if found is not NOT_YET or left_s <= 0:
+                return found
+            _sleep(min(left_s, STEP_NS / 1e9))
 
     return look

@@ -26,10 +26,12 @@ pytestmark = pytest.mark.ros
 def go(tmp_path: Path) -> Callable[..., Any]:
     """Write and record a job of node ``m:N``; its result."""
 
-    def record(code: str, guard: str, name: str, replay: Path | None = None) -> Any:
+    def record(
+        code: str, guard: str, name: str, replay: Path | None = None, entry: str = "node: 'm:N'"
+    ) -> Any:
         (tmp_path / "m.py").write_text(code)
         (tmp_path / "job.yaml").write_text(
-            f"nodes: [{{node: 'm:N'}}]\nstop: {{duration: 1.2s}}\nguard: {guard}\n"
+            f"nodes: [{{{entry}}}]\nstop: {{duration: 1.2s}}\nguard: {guard}\n"
         )
         job = load_job(tmp_path / "job.yaml")
         return run(job, tmp_path / f"{name}.mcap", force=True, replay=replay)
@@ -317,3 +319,45 @@ def test_an_asyncio_loop_waits_for_a_process_that_is_not_recorded(go: Callable[.
         texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
     assert len(texts) == 1
     assert "cba" in texts[0]
+
+
+OF_A_PROGRAM = """
+COMMAND = f'sleep $(cat {PACE}); echo done'
+def ask(node):
+    subprocess.run(COMMAND, shell=True, stdout=subprocess.DEVNULL)
+    said = [subprocess.check_output(COMMAND, shell=True, text=True)]
+    said.append(subprocess.run(COMMAND, shell=True, capture_output=True, timeout=4).returncode)
+    with subprocess.Popen(['sh', '-c', COMMAND + '; exit 3']) as process: pass
+    said.append(process.returncode)
+    node.say(*said, node.ticks, time.time())
+def tick(node):
+    node.ticks += 1
+def main():
+    rclpy.init()
+    node = N()
+    ask(node)
+    rclpy.spin(node)
+"""
+
+
+@pytest.mark.parametrize("mode", ["warn", "record"])
+def test_a_program_that_ends_soon_takes_no_simulated_time(
+    go: Callable[..., Any], tmp_path: Path, mode: str
+) -> None:
+    pace = tmp_path / "pace"
+    code = node_code(
+        "pass",
+        imports="import rclpy, subprocess, threading, time",
+        module=f"PACE = {str(pace)!r}{OF_A_PROGRAM}",
+        init="self.ticks = 0\nself.create_timer(0.01, lambda: tick(self))\n"
+        "threading.Thread(target=ask, args=(self,)).start()",
+    )
+    pace.write_text("0")
+    quick = go(code, f"{{process: {mode}}}", "quick", entry="main: 'm:main'")
+    pace.write_text("0.08")
+    slow = go(code, f"{{process: {mode}}}", "slow", entry="main: 'm:main'")
+    assert quick.error is None
+    assert quick.digest == slow.digest
+    with Trace.open(slow.path) as trace:
+        texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
+    assert [json.loads(text)[:3] for text in texts] == [["done\n", 0, 3]] * 2

@@ -143,9 +143,10 @@ def _reading(real: Callable[..., bytes]) -> Any:
     def read(fd: int, size: int, /) -> Any:
         found = tracked(fd)
         if found is None:
-            patient = waiting_guard(sys._getframe(1))
+            frame = sys._getframe(1)
+            patient = waiting_guard(frame)
             if patient is not None and _blocks(fd):
-                return wait_unrecorded(patient, when_readable(fd, lambda: real(fd, size)))
+                return wait_unrecorded(patient, when_readable(fd, lambda: real(fd, size)), frame)
             return real(fd, size)
         return _read(*found, "os.read()", fd, lambda: real(fd, size), sys._getframe(1))
 

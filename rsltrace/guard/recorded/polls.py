@@ -110,11 +110,11 @@ class RecordedPoll:
         """Return what is ready, in what was registered."""
         limits = (maxevents,) if self._seconds else ()
         guard = engaged()
-        frame = sys._getframe(1)
+        frame = _past_selectors(sys._getframe(1))
         unit = 1 if self._seconds else 1000
         timeout_s = None if timeout is None or timeout < 0 else timeout / unit
         if guard is None or self._source is None or not self.has_outside():
-            patient = guard if self.step else waiting_guard(_past_selectors(frame))
+            patient = guard if self.step else waiting_guard(frame)
             if timeout_s == 0:
                 patient = None
             if patient is None:
@@ -123,6 +123,7 @@ class RecordedPoll:
                 wait_unrecorded(
                     patient,
                     lambda seconds: self._real.poll(seconds * unit, *limits) or NOT_YET,
+                    frame,
                     timeout_s,
                     self.step,
                 )
@@ -195,7 +196,7 @@ def _selecting(real: Callable[..., Any]) -> Any:
                 ready = real(*kinds, seconds)
                 return ready if any(ready) else NOT_YET
 
-            return wait_unrecorded(patient, look, timeout) or ([], [], [])
+            return wait_unrecorded(patient, look, frame, timeout) or ([], [], [])
 
         def places(seconds: float | None) -> list[Any]:
             chosen = real(*kinds, seconds)

@@ -64,7 +64,7 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
         if guard is None or process not in guard.descriptors.processes:
             patient = None if options & os.WNOHANG else waiting_guard(frame)
             if patient is not None:
-                return wait_unrecorded(patient, polled(ended))
+                return wait_unrecorded(patient, polled(ended), frame)
             return real(process, options)
         if options & os.WNOHANG or not guard.context.is_aside():
             return guard.recorded(
@@ -140,7 +140,7 @@ def _acquiring(real: Callable[..., bool]) -> Any:
         if guard is None or not block or not guard.context.can_step():
             return real(self, block, timeout)
         look = polled(lambda: real(self, False) or NOT_YET)
-        return wait_unrecorded(guard, look, timeout) is True
+        return wait_unrecorded(guard, look, sys._getframe(1), timeout) is True
 
     return acquire
 

@@ -75,7 +75,8 @@ def _wait_for(sock: Any, frame: FrameType) -> None:
     guard, timeout_s = waiting_guard(frame), sock.gettimeout()
     if guard is None or timeout_s == 0 or sock.fileno() < 0:
         return
-    if wait_unrecorded(guard, when_readable(sock.fileno(), lambda: True), timeout_s) is None:
+    look = when_readable(sock.fileno(), lambda: True)
+    if wait_unrecorded(guard, look, frame, timeout_s) is None:
         raise TimeoutError("timed out")
 
 
