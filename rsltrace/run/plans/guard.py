@@ -19,6 +19,7 @@ from rsltrace.guard.install import installed
 from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import READERS, show_original
+from rsltrace.guard.virtual.pygame_clock import pygame_clock
 from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.set_order import ordered_sets
@@ -168,6 +169,7 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         stack.enter_context(installed())
         at_once: dict[str, Callable[[], None]] = {
             "cv2": lambda: opencv_clock(stack),
+            "pygame": lambda: pygame_clock(stack),
             COMPILES: plain_in_graphs,
             LOADS_LIBRARIES: lambda: watched_libraries(stack),
             **{name: partial(show_original, name, stack) for name in READERS},
