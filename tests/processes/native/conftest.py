@@ -46,9 +46,13 @@ class Programs:
         native: bool = False,
         before: Sequence[str] = (),
         given: str = "",
+        timeout_s: float = 300,
         **environment: str,
     ) -> Ran:
-        """Run one, behind the words ``before``; ``given`` comes to its standard input."""
+        """Run one, behind the words ``before``; ``given`` comes to its standard input.
+
+        :raises subprocess.TimeoutExpired: if it takes longer than ``timeout_s``.
+        """
         library = {"LD_PRELOAD": str(self.folder / "libtry.so"), "RSLTRACE_LONE": "1"}
         if native:
             library = {}
@@ -58,7 +62,7 @@ class Programs:
             input=given,
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=timeout_s,
             check=False,
         )
         return Ran(done.stdout, done.stderr, done.returncode)
