@@ -40,7 +40,8 @@ def asking_module(frame: FrameType) -> str | None:
 
 def is_resolving(frame: FrameType) -> bool:
     """Return whether a path's links are followed: of a folder on the way nothing else counts."""
-    return code_of(frame).co_name in ("realpath", "_joinrealpath")
+    is_of_python = frame.f_globals.get("__name__") == "posixpath"
+    return is_of_python and code_of(frame).co_name in ("realpath", "_joinrealpath")
 
 
 def is_installed(path: object) -> bool:

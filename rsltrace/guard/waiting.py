@@ -31,6 +31,8 @@ Attempt = Callable[[float], Any]
 
 _PROGRAM_S = 5.0
 """How long simulated time stands still, in real seconds, for a program that was started."""
+_OF_A_PROGRAM = ("_communicate", "_try_wait")
+"""Where ``subprocess`` waits for the output of a program, and for its end."""
 
 _poll = copy_of(select.poll)  # type: ignore[arg-type]
 _sleep = copy_of(time.sleep)  # type: ignore[arg-type]
@@ -57,14 +59,14 @@ def wait_recorded(
     context = guard.context
     step = step or context.step
     deadline_ns = _deadline_ns(context, timeout_s)
-    steps, at_first_s = 0, _at_first_s(frame, timeout_s)
+    steps, first_s = 0, at_first_s(frame, timeout_s)
     kept = guard.answers.next_answer(context.node(), call, of) if guard.answers.replays else None
     text: str | None = None
     try:
         while True:
             if kept is None:
                 with engage(None):
-                    seconds = guard.pace.ahead_s(context.now_ns()) if steps else at_first_s
+                    seconds = guard.pace.ahead_s(context.now_ns()) if steps else first_s
                     text = _looked(look, seconds)
                 if text is not None:
                     break
@@ -101,14 +103,14 @@ def wait_unrecorded(
     """
     context, steps = guard.context, 0
     step = step or context.step
-    at_first_s = _at_first_s(frame, timeout_s)
+    first_s = at_first_s(frame, timeout_s)
     deadline_ns = _deadline_ns(context, timeout_s)
     while True:
         with engage(None):
-            found = look(guard.pace.ahead_s(context.now_ns()) if steps else at_first_s)
+            found = look(guard.pace.ahead_s(context.now_ns()) if steps else first_s)
         if found is not NOT_YET:
             # Who always finds something may look at what another thread is to fetch.
-            if steps == 0 and not at_first_s and guard.pace.is_greedy():
+            if steps == 0 and not first_s and guard.pace.is_greedy():
                 context.step(STEP_NS)
             return found
         left_ns = STEP_NS
@@ -126,7 +128,7 @@ def _deadline_ns(context: Context, timeout_s: float | None) -> int | None:
     return None if timeout_s is None else context.now_ns() + max(patience_ns(timeout_s), 0)
 
 
-def _at_first_s(frame: FrameType, timeout_s: float | None) -> float:
+def at_first_s(frame: FrameType, timeout_s: float | None) -> float:
     """Return how long simulated time stands still for whoever waits, in real seconds.
 
     It does for a program of ``subprocess``, but not for one that can still be told something: it
@@ -134,9 +136,11 @@ def _at_first_s(frame: FrameType, timeout_s: float | None) -> float:
     """
     if frame.f_globals.get("__name__") != "subprocess":
         return 0.0
-    stdin = getattr(frame.f_locals.get("self"), "stdin", None)
-    if stdin is not None and not stdin.closed and code_of(frame).co_name != "_execute_child":
-        return 0.0
+    name = code_of(frame).co_name
+    if name != "_execute_child":
+        stdin = getattr(frame.f_locals.get("self"), "stdin", None)
+        if name not in _OF_A_PROGRAM or (stdin is not None and not stdin.closed):
+            return 0.0
     return _PROGRAM_S if timeout_s is None else min(timeout_s, _PROGRAM_S)
 
 

@@ -17,7 +17,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rsltrace.errors import JobError
-from rsltrace.launch.model import Launched
+from rsltrace.launch.model import Launched, argument_words
 from rsltrace.terminal import tell
 
 _OUTPUT_MAX = 1 << 16
@@ -81,7 +81,6 @@ def main(order: Mapping[str, object]) -> None:
     """Do what an order asks, and write the answer: a ``Launched``, or the text of an error."""
     from rsltrace.launch.api.basics import as_job_error, shown
     from rsltrace.launch.python_file import read_launch_file
-    from rsltrace.launch.values import argument_words
     from rsltrace.workspace.imports import unbuilt_packages
 
     _end_with(int(str(order["reader"])))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from rsltrace.launch.scope import Parameters, full_name
@@ -100,6 +101,11 @@ class Argument:
     def __str__(self) -> str:
         value = "required" if self.default is None else f"default {self.default!r}"
         return f"{self.name} ({value}{', ' + self.description if self.description else ''})"
+
+
+def argument_words(arguments: Mapping[str, str]) -> list[str]:
+    """Return launch arguments as words of a command line: launch files look at these, too."""
+    return [f"{name}:={value}" for name, value in arguments.items()]
 
 
 @dataclass(slots=True)

@@ -16,9 +16,8 @@ from rsltrace.launch.api.basics import LaunchContext, LaunchDescription, as_job_
 from rsltrace.launch.api.names import own_launch
 from rsltrace.launch.api.packages import missing_packages_allowed
 from rsltrace.launch.api.sources import get_launch_description_from_python_launch_file
-from rsltrace.launch.model import Launched
+from rsltrace.launch.model import Launched, argument_words
 from rsltrace.launch.reader import ActionReader
-from rsltrace.launch.values import argument_words
 
 
 def read_launch_file(path: Path, arguments: Mapping[str, str]) -> Launched:

@@ -26,11 +26,12 @@ from rsltrace.launch.model import (
     LaunchedNode,
     Surroundings,
     Unsupported,
+    argument_words,
     respawning,
 )
 from rsltrace.launch.parameter_files import parameters_for
 from rsltrace.launch.scope import ParameterFile, Parameters, full_name
-from rsltrace.launch.values import argument_words, yaml_value
+from rsltrace.launch.values import yaml_value
 
 _NOT_IN_A_RUN = "a run has all its nodes from the start, and ends by the job's stop: conditions"
 _PROCESS = "other programs do not run in a simulation"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 from ruamel.yaml import YAML
@@ -30,11 +29,6 @@ _Constructor.add_constructor(
     "tag:yaml.org,2002:python/tuple",
     lambda constructor, node: constructor.construct_sequence(node, deep=True),
 )
-
-
-def argument_words(arguments: Mapping[str, str]) -> list[str]:
-    """Return launch arguments as words of a command line: launch files look at these, too."""
-    return [f"{name}:={value}" for name, value in arguments.items()]
 
 
 def yaml_value(text: str) -> Any:

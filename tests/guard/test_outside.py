@@ -326,9 +326,11 @@ COMMAND = f'sleep $(cat {PACE}); echo done'
 def ask(node):
     subprocess.run(COMMAND, shell=True, stdout=subprocess.DEVNULL)
     said = [subprocess.check_output(COMMAND, shell=True, text=True)]
-    said.append(subprocess.run(COMMAND, shell=True, capture_output=True, timeout=4).returncode)
+    closed = f'{COMMAND}; exec >&- 2>&-; {COMMAND}'
+    said.append(subprocess.run(closed, shell=True, capture_output=True, timeout=4).returncode)
     with subprocess.Popen(['sh', '-c', COMMAND + '; exit 3']) as process: pass
     said.append(process.returncode)
+    said.append(subprocess.Popen(COMMAND + ' >&2; exit 4', shell=True).wait(timeout=4))
     node.say(*said, node.ticks, time.time())
 def tick(node):
     node.ticks += 1
@@ -360,4 +362,4 @@ def test_a_program_that_ends_soon_takes_no_simulated_time(
     assert quick.digest == slow.digest
     with Trace.open(slow.path) as trace:
         texts = [trace.decode("/rosout", data).msg for *_, data in trace.messages("/rosout")]  # type: ignore[attr-defined]
-    assert [json.loads(text)[:3] for text in texts] == [["done\n", 0, 3]] * 2
+    assert [json.loads(text)[:4] for text in texts] == [["done\n", 1, 3, 4]] * 2

@@ -21,10 +21,18 @@ from rsltrace.guard.extension_types import exchange
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.recorded.descriptors import recording, stand_in
 from rsltrace.guard.redirect import redirect, replace_attribute
-from rsltrace.guard.waiting import NOT_YET, polled, wait_recorded, wait_unrecorded, waiting_guard
+from rsltrace.guard.waiting import (
+    NOT_YET,
+    at_first_s,
+    polled,
+    wait_recorded,
+    wait_unrecorded,
+    waiting_guard,
+)
 from rsltrace.model.finding import Source
 
 _KEPT_OPEN = 3
+_LOOKED = "_rsltrace_looked"
 _CHILDS_ENDS = (6, 9, 11, 13)
 """Arguments of ``fork_exec``: which descriptors stay open in the child; its standard streams, and
 the pipe through which it tells that it cannot start the program."""
@@ -66,13 +74,31 @@ def _waiting(real: Callable[[int, int], Any]) -> Any:
             if patient is not None:
                 return wait_unrecorded(patient, polled(ended), frame)
             return real(process, options)
-        if options & os.WNOHANG or not guard.context.is_aside():
+        if options & os.WNOHANG:
+
+            def now_or_soon() -> Any:
+                found = polled(ended)(_looks_first(frame))
+                return (0, 0) if found is NOT_YET else found
+
+            return guard.recorded(Source.PROCESS, call, now_or_soon, frame, process)
+        if not guard.context.is_aside():
             return guard.recorded(
                 Source.PROCESS, call, lambda: real(process, options), frame, process
             )
         return wait_recorded(guard, Source.PROCESS, call, polled(ended), frame, of=process)
 
     return waitpid
+
+
+def _looks_first(frame: FrameType) -> float:
+    """Return how long to wait for a program's end where ``subprocess`` looks again and again, in
+    real seconds: when it looks for the first time."""
+    waiting = frame.f_back
+    first_s = at_first_s(frame, None)
+    if not first_s or waiting is None or vars(waiting.f_locals["self"]).get(_LOOKED):
+        return 0.0
+    setattr(waiting.f_locals["self"], _LOOKED, True)
+    return min(first_s, float(waiting.f_locals["timeout"]))
 
 
 def _of_process(name: str, real: Callable[..., Any]) -> Any:
