@@ -70,23 +70,23 @@ test-long: compiled
 test-random: compiled
 	HYPOTHESIS_PROFILE=long $(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis $(PYTEST)
 
-# The standing attack (tests/attack); what gave way is kept in out/attack with the line that repeats
+# The standing attack (campaigns/attack); what gave way is kept in out/attack with the line that repeats
 # it, beside the figures of the run: make attack ATTACK_MINUTES=5 ATTACK_SEED=1234
 ATTACK_MINUTES ?= 60
 ATTACK_SEED ?=
 attack: compiled
-	$(BIN)/python -m tests.attack --minutes $(ATTACK_MINUTES) $(if $(ATTACK_SEED),--seed $(ATTACK_SEED))
+	$(BIN)/python -m campaigns.attack --minutes $(ATTACK_MINUTES) $(if $(ATTACK_SEED),--seed $(ATTACK_SEED))
 
 # Faults planted in random graphs, and an oracle that reads the traces with the mcap package alone
-# (tests/truth); the table of classes is in out/truth/table.md: make truth TRUTH_FAULTS=200
+# (campaigns/truth); the table of classes is in out/truth/table.md: make truth TRUTH_FAULTS=200
 TRUTH_FAULTS ?= 1000
 truth: compiled
-	$(BIN)/python -m tests.truth --faults $(TRUTH_FAULTS)
+	$(BIN)/python -m campaigns.truth --faults $(TRUTH_FAULTS)
 
 # rclpy's own tests on our middleware: make rclpy-tests RCLPY=path/to/a/checkout/of/rclpy
 RCLPY ?=
 rclpy-tests: $(INSTALLED)
-	$(BIN)/python tests/rclpy_suite --rclpy $(RCLPY)
+	$(BIN)/python campaigns/rclpy_suite --rclpy $(RCLPY)
 
 # The tests that run nodes, on the next release of ROS 2, in an environment of its own.
 KILTED := VENV=.venv-kilted ROS=ros-kilted,dev-ros-kilted

@@ -6,7 +6,7 @@
     python benchmarks/explore.py --keep out.json        figures that are there are not made again
     python benchmarks/explore.py --markdown             the table of docs/exploring.md
 
-The bugs are those of tests/explore/bugs. Each strategy searches with ``--stop-at-first`` and
+The bugs are those of campaigns/explore/bugs. Each strategy searches with ``--stop-at-first`` and
 several seeds; a figure is the median of the runs it took, ``>1000`` that it was not found in so
 many ("not in 12": the systematic search had nothing left to try after 12). Natively the same nodes
 run over DDS, each in a process of its own, again and again for ``--native`` seconds: in how many of
@@ -29,7 +29,7 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
-from tests.explore.suite import Bug, all_bugs  # noqa: E402
+from campaigns.explore.suite import Bug, all_bugs  # noqa: E402
 
 STRATEGIES = ("pct", "random", "feedback", "systematic", "faults")
 WAYS = (*STRATEGIES, "native")

@@ -1,6 +1,6 @@
 """A job of plain nodes, run natively: a process for each node, over DDS, in real time.
 
-    python benchmarks/explore_native.py tests/explore/bugs/order/late_tf/job.yaml --seconds 20
+    python benchmarks/explore_native.py campaigns/explore/bugs/order/late_tf/job.yaml --seconds 20
 
 Says in how many of the runs that fit into the time the job's checks were violated. The nodes are
 constructed and find each other; then all of their timers start together, so that what counts is

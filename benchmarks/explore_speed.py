@@ -28,7 +28,7 @@ from rsltrace.explore.workers import Worker
 from rsltrace.job.values.times import parse_time
 
 ROOT = Path(__file__).resolve().parents[1]
-SHORT = ROOT / "tests/explore/bugs/order/command_after_stop/job.yaml"
+SHORT = ROOT / "campaigns/explore/bugs/order/command_after_stop/job.yaml"
 TICKS = os.sysconf("SC_CLK_TCK")
 
 NODES = """

@@ -17,14 +17,14 @@ from pathlib import Path
 import pytest
 
 import rsltrace
-from tests.attack import campaign, execution, mcap_parts, oracle
-from tests.attack.corpus import REPOSITORY, SAMPLES, Corpus
-from tests.attack.families import NAMES, Family, families
-from tests.attack.families.common import stream
-from tests.attack.families.trace_case import attack_trace
-from tests.attack.known import KNOWN, mended
-from tests.attack.model import Case, Command, Complaint, Kill, Limits, Ran, Verdict, Wrong
-from tests.attack.reading import content
+from campaigns.attack import campaign, execution, mcap_parts, oracle
+from campaigns.attack.corpus import REPOSITORY, SAMPLES, Corpus
+from campaigns.attack.families import NAMES, Family, families
+from campaigns.attack.families.common import stream
+from campaigns.attack.families.trace_case import attack_trace
+from campaigns.attack.known import KNOWN, mended
+from campaigns.attack.model import Case, Command, Complaint, Kill, Limits, Ran, Verdict, Wrong
+from campaigns.attack.reading import content
 
 pytestmark = pytest.mark.ros
 
@@ -44,7 +44,7 @@ def test_the_halves_are_all_families() -> None:
 def test_nothing_gives_way_that_is_not_known(
     tmp_path: Path, half: tuple[str, ...], every: int
 ) -> None:
-    words = [sys.executable, "-m", "tests.attack", "--slice", "--out", str(tmp_path)]
+    words = [sys.executable, "-m", "campaigns.attack", "--slice", "--out", str(tmp_path)]
     words += ["--every", str(every)]
     for name in half:
         words += ["--family", name]
@@ -308,7 +308,7 @@ def test_what_gave_way_is_kept_with_its_reproducer(tmp_path: Path, corpus: Corpu
     place = tmp_path / "kept" / "sabotage-other-7"
     assert (place / "bad.mcap").read_bytes() == b"bad"
     report = (place / "report.txt").read_text()
-    assert report.startswith("python -m tests.attack --family sabotage --seed 7\n")
+    assert report.startswith("python -m campaigns.attack --family sabotage --seed 7\n")
     assert "\x1b" not in report
     assert campaign.from_json(campaign.as_json(verdict)) == verdict
 
@@ -327,7 +327,7 @@ def test_the_table_has_a_row_for_each_family() -> None:
 
 
 def test_the_reproducer_does_it_again(tmp_path: Path) -> None:
-    words = [sys.executable, "-m", "tests.attack", "--family", "texts", "--seed", "5"]
+    words = [sys.executable, "-m", "campaigns.attack", "--family", "texts", "--seed", "5"]
     done = subprocess.run(
         [*words, "--out", str(tmp_path)],
         cwd=REPOSITORY,
@@ -340,5 +340,5 @@ def test_the_reproducer_does_it_again(tmp_path: Path) -> None:
     (line,) = (tmp_path / "cases.jsonl").read_text().splitlines()
     verdict = campaign.from_json(line)
     assert (verdict.family, verdict.seed, verdict.attack) == ("texts", 5, "code-lines")
-    assert verdict.reproducer == "python -m tests.attack --family texts --seed 5"
+    assert verdict.reproducer == "python -m campaigns.attack --family texts --seed 5"
     assert done.returncode in (0, 1)

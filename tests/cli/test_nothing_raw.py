@@ -11,10 +11,10 @@ from click.testing import CliRunner
 from mcap import records
 from mcap.opcode import Opcode
 
+from campaigns.attack import mcap_parts
+from campaigns.attack.families.texts import with_strings
 from rsltrace.cli.main import cli
 from rsltrace.model.printable import printable_lines
-from tests.attack import mcap_parts
-from tests.attack.families.texts import with_strings
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\r\x08\x9b31m\u202eevil\u2066"

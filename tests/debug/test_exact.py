@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
+from campaigns.truth.graph import random_world
 from rsltrace import DebugSession
 from rsltrace.job import load_job
 from rsltrace.run import record
 from rsltrace.trace.reader import Trace
 from tests.run.conftest import TALKER
 from tests.run.test_recorded_order import ALL, MIXED
-from tests.truth.graph import random_world
 
 pytestmark = pytest.mark.ros
 ROOT = Path(__file__).resolve().parents[2]

@@ -12,9 +12,9 @@ from typing import Any
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from campaigns.truth.graph import write_bag
 from rsltrace import DiffOptions, diff_bags
 from tests.diff.judged_messages import Rules, encoded, judged, write_mcap, write_sqlite
-from tests.truth.graph import write_bag
 
 COUNTS = ("equal", "tolerated", "ignored", "differing")
 

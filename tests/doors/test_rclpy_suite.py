@@ -13,7 +13,7 @@ import pytest
 pytestmark = pytest.mark.ros
 
 ROOT = Path(__file__).parents[2]
-SUITE = ROOT / "tests" / "rclpy_suite"
+SUITE = ROOT / "campaigns" / "rclpy_suite"
 
 # A checkout of something like rclpy.
 MODULE = """

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.explore.suite import Bug, all_bugs
+from campaigns.explore.suite import Bug, all_bugs
 from tests.forked_command import Forks
 
 pytestmark = pytest.mark.ros

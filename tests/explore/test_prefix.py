@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from campaigns.explore.suite import all_bugs
 from rsltrace.errors import ExploreError
 from rsltrace.explore.outcome import Wants
 from rsltrace.explore.strategies.faults import FaultWalk
@@ -19,7 +20,6 @@ from rsltrace.explore.strategies.strategy import choices_left
 from rsltrace.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.explore.workers import Worker
 from rsltrace.job import job_from_text
-from tests.explore.suite import all_bugs
 
 ALIKE_NS = 450_000_000
 JOB = """\

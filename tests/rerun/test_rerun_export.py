@@ -14,9 +14,9 @@ import trace_maker
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Schema
 
+from campaigns.attack import mcap_parts
 from rsltrace.errors import OutputError, TraceError
 from rsltrace.model.event import NO_EVENT, OutputKind
-from tests.attack import mcap_parts
 
 pytest.importorskip("rerun")
 

@@ -28,7 +28,7 @@ from rsltrace.run import record  # noqa: E402
 from rsltrace.run.plans.changed_fields import UnfitError, changer  # noqa: E402
 from rsltrace.trace.reader import Trace  # noqa: E402
 
-BAG = Path(__file__).parents[1] / "explore/bugs/bags/nan_poisons_average/drive"
+BAG = Path(__file__).parents[2] / "campaigns/explore/bugs/bags/nan_poisons_average/drive"
 """Forty messages on /range, 2.0 - 0.04 n."""
 
 heard: list[float] = []

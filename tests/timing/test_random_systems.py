@@ -1,4 +1,4 @@
-"""No run takes longer than its bound: random systems (many: ``python -m tests.timing``)."""
+"""No run takes longer than its bound: random systems (many: ``python -m campaigns.timing``)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from tests.timing.random_systems import draw, held
+from campaigns.timing.random_systems import draw, held
 
 pytestmark = pytest.mark.ros
 

@@ -12,12 +12,12 @@ from click.testing import CliRunner
 from mcap.opcode import Opcode
 from mcap.records import Schema
 
+from campaigns.attack import mcap_parts
+from campaigns.attack.families.texts import with_strings
 from rsltrace.cli.main import cli
 from rsltrace.errors import TraceError
 from rsltrace.trace.contents import check_contents
 from rsltrace.trace.reader import Trace
-from tests.attack import mcap_parts
-from tests.attack.families.texts import with_strings
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces"
 SAMPLE = SAMPLES / "nondeterministic_callback" / "a.mcap"

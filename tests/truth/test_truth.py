@@ -9,10 +9,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
-from tests.truth import faults
-from tests.truth.campaign import FAMILIES, Outcome, try_cases
-from tests.truth.faults.answers import LEFT_OPEN
-from tests.truth.known import KNOWN, mended
+from campaigns.truth import faults
+from campaigns.truth.campaign import FAMILIES, Outcome, try_cases
+from campaigns.truth.faults.answers import LEFT_OPEN
+from campaigns.truth.known import KNOWN, mended
 
 faults.load()
 NAMES = list(faults.FAULTS)
@@ -51,7 +51,7 @@ def test_what_is_said_of_a_third_of_the_classes_is_true(part: int) -> None:
     assert not wrong(outcomes), wrong(outcomes)
     keys = [key for outcome in outcomes for key in outcome.keys]
     stale = mended(keys, [outcome.name for outcome in outcomes])
-    assert not stale, f"no longer wrong, so tests/truth/known.py must forget it: {stale}"
+    assert not stale, f"no longer wrong, so campaigns/truth/known.py must forget it: {stale}"
 
 
 @pytest.mark.long
@@ -72,7 +72,7 @@ def test_the_oracle_sees_what_is_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     """A report with another index, another sentence and another cause is not let through."""
     from dataclasses import replace
 
-    from tests.truth import oracle
+    from campaigns.truth import oracle
 
     real = oracle.diff
 
