@@ -16,6 +16,7 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, settings
 
 from rsltrace.cli.main import cli
+from tests import golden_files
 from tests.forked_command import Forks
 
 settings.register_profile(
@@ -33,6 +34,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 APART = ("native", "long")
 """Marked sets that run when they are asked for: with ``-m``, or by the name of a file or test."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the one switch for all golden files."""
+    parser.addoption("--update-golden", action="store_true", help="write the golden files anew")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Pass the switch to ``golden_files``."""
+    golden_files.update = config.getoption("--update-golden")
 
 
 @pytest.hookimpl(wrapper=True)

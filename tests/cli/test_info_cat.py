@@ -1,7 +1,7 @@
 """``rsltrace info`` and ``rsltrace cat``, and what the command does with errors and pipes.
 
 The texts people read are in ``golden/``. After a change that is meant, run this with
-``UPDATE_GOLDEN=1`` and review the difference.
+``--update-golden`` and review the difference.
 """
 
 from __future__ import annotations
@@ -33,16 +33,14 @@ from rsltrace.model.event import NO_SEQUENCE, EventKind, OutputKind
 from rsltrace.model.printable import printable
 from rsltrace.trace.cdr import log_content
 from rsltrace.words.table import table
+from tests.golden_files import check_golden
 
 GOLDEN = Path(__file__).parent / "golden"
 
 
 def golden(name: str, text: str) -> None:
     """Compare ``text`` with a golden file."""
-    path = GOLDEN / name
-    if os.environ.get("UPDATE_GOLDEN"):
-        path.write_text(text)
-    assert text == path.read_text()
+    check_golden(GOLDEN / name, text)
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,12 @@
 """Reports of hand-made diffs: what people read is a golden file, what programs read a contract.
 
-``UPDATE_GOLDEN=1 pytest tests/diff/test_report.py`` rewrites the golden files; look at their diff.
+``pytest --update-golden tests/diff/test_report.py`` rewrites the golden files; look at their diff.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -45,6 +44,7 @@ from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.phrases import as_sentence
+from tests.golden_files import check_golden
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "diff"
 DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "diff.md"
@@ -320,32 +320,26 @@ SUFFIXES = {
 }
 
 
-def check_golden(name: str, text: str) -> None:
-    path = GOLDEN / name
-    if os.environ.get("UPDATE_GOLDEN"):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    assert text == path.read_text(encoding="utf-8"), f"{path} differs; see the docstring above"
-
-
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("case", list(CASES))
 def test_golden_reports(case: str, form: str) -> None:
-    check_golden(f"{case}.{SUFFIXES[form]}", render(CASES[case](), form))
+    check_golden(GOLDEN / f"{case}.{SUFFIXES[form]}", render(CASES[case](), form))
 
 
 def test_golden_report_of_everything() -> None:
     text = render(nondeterministic(), "text", DiffOptions(everything=True))
-    check_golden("nondeterministic_all.txt", text)
+    check_golden(GOLDEN / "nondeterministic_all.txt", text)
     assert "independent divergence 2: exception" in text
     assert "… 3 more fields" in text
-    check_golden("recordings_all.txt", render(recordings(), "text", DiffOptions(everything=True)))
+    check_golden(
+        GOLDEN / "recordings_all.txt", render(recordings(), "text", DiffOptions(everything=True))
+    )
 
 
 @pytest.mark.parametrize("form", FORMATS)
 def test_golden_reports_of_several_runs(form: str) -> None:
     runs: list[Diff | BagDiff] = [nondeterministic(), identical(), missing(), tolerated(), cut()]
-    check_golden(f"several.{SUFFIXES[form]}", render(runs, form))
+    check_golden(GOLDEN / f"several.{SUFFIXES[form]}", render(runs, form))
 
 
 @pytest.mark.parametrize("made", [cut, cut_recording])

@@ -1,7 +1,7 @@
 """Sixty nasty nodes: each differs from run to run, unless the guard prevents or reports it.
 
 All nodes are in one job, which is recorded a few times in unlike surroundings with the guard and
-without. ``docs/guard.md`` has the table of what came out (UPDATE_GOLDEN=1 writes it).
+without. ``docs/guard.md`` has the table of what came out (``--update-golden`` writes it).
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from rsltrace.campaign.perturb import (
     surroundings,
 )
 from rsltrace.trace.reader import Trace
+from tests.golden_files import check_golden
 from tests.guard.nasty_nodes import CASES, DETECTED, DETERMINISTIC
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
@@ -190,7 +191,6 @@ def test_the_document_has_the_table() -> None:
     table = "\n".join(rows)
     begin, end = "<!-- nasty nodes -->\n", "\n<!-- end -->"
     text = DOCUMENT.read_text()
-    if os.environ.get("UPDATE_GOLDEN"):
-        text = re.sub(f"{begin}.*?{end}", lambda _: begin + table + end, text, flags=re.DOTALL)
-        DOCUMENT.write_text(text)
-    assert begin + table + end in text
+    wanted = re.sub(f"{begin}.*?{end}", lambda _: begin + table + end, text, flags=re.DOTALL)
+    assert begin + table + end in wanted
+    check_golden(DOCUMENT, wanted)

@@ -1,12 +1,11 @@
 """Jobs with one mistake each: every message must be enough to correct it without the docs.
 
 The messages are in ``golden/broken.txt``, to be read by a person when they change:
-``RSLTRACE_GOLDEN=write python -m pytest tests/job/test_broken_jobs.py`` writes them anew.
+``pytest --update-golden tests/job/test_broken_jobs.py`` writes them anew.
 """
 
 from __future__ import annotations
 
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +17,7 @@ from ruamel.yaml import YAML, YAMLError
 from rsltrace.errors import JobError
 from rsltrace.job import load_job
 from rsltrace.job.documents.schema import job_schema
+from tests.golden_files import check_golden
 
 GOLDEN = Path(__file__).parent / "golden"
 GOOD = (GOLDEN / "good.yaml").read_text("utf-8")
@@ -192,10 +192,7 @@ def test_every_mistake_is_told_as_written_down() -> None:
     for number, (what, text, _) in enumerate(broken(), 1):
         shown = what.replace("\n", "\\n").replace("\t", "\\t")
         told += f"--- {number}. {shown}\n{message(text)}\n\n"
-    golden = GOLDEN / "broken.txt"
-    if os.environ.get("RSLTRACE_GOLDEN") == "write":
-        golden.write_text(told, encoding="utf-8")
-    assert told == golden.read_text("utf-8")
+    check_golden(GOLDEN / "broken.txt", told)
 
 
 @pytest.mark.parametrize(("what", "text", "line"), list(broken()), ids=[w for w, _, _ in broken()])

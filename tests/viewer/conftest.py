@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib.util
-import os
 import sys
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
@@ -20,6 +19,8 @@ from rsltrace_viewer.terminal import screenshot, shell
 from rsltrace_viewer.terminal.app import ViewerApp, open_session
 from rsltrace_viewer.terminal.screenshot import settle, text_of
 from textual.pilot import Pilot
+
+from tests.golden_files import check_golden
 
 if "trace_maker" not in sys.modules:
     _spec = importlib.util.spec_from_file_location(
@@ -90,20 +91,10 @@ def pair() -> tuple[Path, Path]:
     return folder / "a.mcap", folder / "b.mcap"
 
 
-def check_golden(name: str, text: str) -> None:
-    """Compare with a golden file. ``UPDATE_GOLDEN=1`` writes it; look at its diff."""
-    path = GOLDEN / name
-    if os.environ.get("UPDATE_GOLDEN"):
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    assert path.exists(), f"{path} is missing; UPDATE_GOLDEN=1 writes it"
-    assert text == path.read_text(encoding="utf-8")
-
-
 @pytest.fixture
 def golden() -> object:
     """``golden(name, text)`` compares with a golden file."""
-    return check_golden
+    return lambda name, text: check_golden(GOLDEN / name, text)
 
 
 class Driver:

@@ -3,7 +3,7 @@
 A screen is its text at 80x24 and 120x36, the largest at 200x60; of a few there is a map of the
 styles of its cells, too (NAME_THEME_80x24.txt): a letter each, with a legend.
 
-``UPDATE_GOLDEN=1 pytest tests/viewer/test_viewer_screens.py`` rewrites them; look at their diff.
+``pytest --update-golden tests/viewer/test_viewer_screens.py`` rewrites them; look at their diff.
 """
 
 from __future__ import annotations
