@@ -57,8 +57,13 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_finish() -> None:
-    """Every simulated run collects garbage when it ends; it need not walk all tests each time."""
+    """What was collected never becomes garbage."""
     gc.collect()
+
+
+def pytest_runtest_setup() -> None:
+    """Keep what there is out of garbage collection up to the end of the test's first run, which
+    thaws it: each run collects garbage, and need not walk all tests and libraries."""
     gc.freeze()
 
 

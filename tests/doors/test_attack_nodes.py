@@ -303,6 +303,7 @@ def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
             time.sleep(0.7)
 
     def worlds() -> int:
+        gc.unfreeze()
         gc.collect()
         return sum(isinstance(thing, Stacks) for thing in gc.get_objects())
 

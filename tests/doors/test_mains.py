@@ -584,6 +584,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
                 executor.spin_once()
         import gc
 
+        gc.unfreeze()
         held = [each for each in gc.get_objects() if isinstance(each, Program)]
         kept.extend(len(each.failures) for each in held if each.entry is not None)
         rclpy.shutdown()

@@ -40,7 +40,7 @@ table_before: dict[str, Callable[..., Any]] = {
 }
 
 
-@pytest.fixture(scope="module", autouse=True)
+@pytest.fixture(autouse=True)
 def bound_methods() -> None:
     """Bound here: the garbage collector, which lists them, does not list what modules hold."""
     table_before["now"] = datetime.datetime.now
