@@ -1,10 +1,8 @@
 # Two commands do everything on a fresh machine, set-up included:
 #   make demo   record the sample job twice and compare; show where two other runs diverge
-#   make test   lint, types, architecture and tests
-# What takes long or needs a quiet machine has targets of its own, which CI runs, too:
-#   make test-native   comparisons with rclpy's own executors over DDS, in real time
-#   make test-long     long campaigns, planted faults in numbers, a hundred perturbed runs
-#   make test-random   property tests with many more examples (not in CI)
+#   make test   lint, types, architecture and tests: under five minutes on two quiet cores
+# What takes longer has targets of its own (tests/README.md, campaigns/README.md):
+#   make test-all      the other tests: all cases of each kind, and what runs in real time
 #   make truth         a thousand planted faults, and what diff says of them
 #   make dist          wheel and sdist, tried in empty environments
 #   make attack        hostile files, jobs, nodes, servers and disks, for an hour
@@ -18,7 +16,7 @@ INSTALLED := $(VENV)/.installed
 OUT ?= out
 SAMPLE := sample_traces/nondeterministic_callback
 
-.PHONY: demo test test-native test-long test-random test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
+.PHONY: demo test test-all test-long test-native test-kilted truth attack rclpy-tests lint types architecture compiled unit setup docs site docs-serve dist samples bench pictures clean
 
 setup: $(INSTALLED)
 
@@ -47,7 +45,7 @@ lint: $(INSTALLED)
 	$(BIN)/ruff format --check .
 
 types: $(INSTALLED)
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 architecture: $(INSTALLED)
 	$(BIN)/lint-imports
@@ -60,15 +58,15 @@ compiled: $(INSTALLED)
 unit: compiled
 	$(BIN)/python -m pytest -n auto --dist worksteal $(PYTEST)
 
-test-native: compiled
-	$(BIN)/python -m pytest -m native $(PYTEST)
+# What make test leaves out, and with many cases what tries few of them there (tests/README.md).
+test-all: test-long test-native
 
 test-long: compiled
-	RSLTRACE_RUNS=100 RSLTRACE_PLANTED=40 $(BIN)/python -m pytest -n auto --dist worksteal -m 'long or repeated' $(PYTEST)
+	$(BIN)/python -m pytest -n auto --dist worksteal --many-cases -m '(long or repeated or hypothesis) and not native' $(PYTEST)
 
-# Property tests with four hundred examples each: they look for what nobody has seen yet.
-test-random: compiled
-	HYPOTHESIS_PROFILE=long $(BIN)/python -m pytest -n auto --dist worksteal -m hypothesis $(PYTEST)
+# Comparisons with rclpy's own executors over DDS, in real time: one at a time.
+test-native: compiled
+	$(BIN)/python -m pytest --many-cases -m native $(PYTEST)
 
 # The standing attack (campaigns/attack); what gave way is kept in out/attack with the line that repeats
 # it, beside the figures of the run: make attack ATTACK_MINUTES=5 ATTACK_SEED=1234

@@ -1,13 +1,14 @@
-"""For all tests: how hypothesis searches, what garbage collection walks, which sets stay out.
+"""For all tests: which tier they are in, how Hypothesis searches, what garbage collection walks.
 
 A loaded machine must not fail a test, nor may a test pass today and fail tomorrow. To look for new
-counterexamples: ``HYPOTHESIS_PROFILE=explore python -m pytest …``.
+counterexamples: ``HYPOTHESIS_PROFILE=new python -m pytest …``. README.md has the tiers.
 """
 
 import gc
 import os
 import signal
 import subprocess
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 
@@ -16,17 +17,18 @@ from click.testing import CliRunner
 from hypothesis import HealthCheck, settings
 
 from rsltrace.cli.main import cli
-from tests import golden_files
+from tests import golden_files, tiers
 from tests.forked_command import Forks
 
 settings.register_profile(
-    "same", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow]
+    "few",
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+    max_examples=20,
 )
-settings.register_profile(
-    "explore", deadline=None, suppress_health_check=[HealthCheck.too_slow], print_blob=True
-)
-settings.register_profile("long", settings.get_profile("same"), max_examples=400)
-settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "same"))
+settings.register_profile("many", settings.get_profile("few"), max_examples=400)
+settings.register_profile("new", settings.get_profile("few"), derandomize=False, print_blob=True)
 
 # A shell that starts us in the background has us ignore Ctrl-C, and so would all that we start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -37,13 +39,19 @@ APART = ("native", "long")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the one switch for all golden files."""
+    """Add the switches of these tests."""
     parser.addoption("--update-golden", action="store_true", help="write the golden files anew")
+    parser.addoption(
+        "--many-cases", action="store_true", help="as many cases of each test as make test-all"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Pass the switch to ``golden_files``."""
+    """Pass the switches on, before any module of tests is imported."""
     golden_files.update = config.getoption("--update-golden")
+    tiers.many = config.getoption("--many-cases")
+    profile = os.environ.get("HYPOTHESIS_PROFILE", "many" if tiers.many else "few")
+    settings.load_profile(profile)
 
 
 @pytest.hookimpl(wrapper=True)
@@ -70,6 +78,13 @@ def pytest_runtest_setup() -> None:
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the sets of ``APART`` unless they are asked for."""
+    seen: Counter[str] = Counter()
+    for item in items:
+        if (few := item.get_closest_marker("few")) is not None:
+            family = item.nodeid.partition("[")[0]
+            seen[family] += 1
+            if seen[family] > few.args[0]:
+                item.add_marker("long")
     if config.option.markexpr:
         return
     named = {(config.invocation_params.dir / arg.split("::")[0]).resolve() for arg in config.args}

@@ -39,6 +39,7 @@ def test_the_halves_are_all_families() -> None:
     assert sorted(HALVES[0] + HALVES[1]) == sorted(NAMES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("every", [3, pytest.param(1, marks=pytest.mark.long)])
 @pytest.mark.parametrize("half", HALVES, ids=("files", "runs"))
 def test_nothing_gives_way_that_is_not_known(
@@ -204,6 +205,7 @@ def _run(case: Case, code: str, allowed: frozenset[int] = oracle.READING) -> Ran
     return execution.run(command, case.folder.parent / "streams")
 
 
+@pytest.mark.few(65)
 @pytest.mark.parametrize("wrong", _SABOTAGE, ids=lambda wrong: wrong.value)
 def test_the_oracle_sees_sabotage(
     wrong: Wrong, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -326,6 +328,7 @@ def test_the_table_has_a_row_for_each_family() -> None:
     assert tally.unknown() == [bad]
 
 
+@pytest.mark.long
 def test_the_reproducer_does_it_again(tmp_path: Path) -> None:
     words = [sys.executable, "-m", "campaigns.attack", "--family", "texts", "--seed", "5"]
     done = subprocess.run(

@@ -76,6 +76,7 @@ def test_others_read_what_was_published(trace: Path, tmp_path: Path) -> None:
     assert read == [(5 * 10**9 + n * 10**7, n / 7) for n in range(1, 201)]
 
 
+@pytest.mark.long
 def test_our_reader_reads_the_same_as_from_the_trace(trace: Path, tmp_path: Path) -> None:
     export_bag(trace, tmp_path / "out", topics=["/imu", "/text"])
     with open_bag(tmp_path / "out") as bag, open_bag(trace, topics=["/imu", "/text"]) as original:
@@ -88,6 +89,7 @@ def test_our_reader_reads_the_same_as_from_the_trace(trace: Path, tmp_path: Path
     assert replayed.events >= 220
 
 
+@pytest.mark.long
 def test_the_same_trace_gives_the_same_bag(trace: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
@@ -97,6 +99,7 @@ def test_the_same_trace_gives_the_same_bag(trace: Path, tmp_path: Path) -> None:
         assert a == b
 
 
+@pytest.mark.long
 def test_a_trace_without_messages_is_an_empty_bag(tmp_path: Path) -> None:
     from rosbags.highlevel import AnyReader
 
@@ -111,6 +114,7 @@ def test_a_trace_without_messages_is_an_empty_bag(tmp_path: Path) -> None:
         assert bag.message_count == 0
 
 
+@pytest.mark.long
 def test_a_cut_off_trace_gives_what_is_whole(trace: Path, tmp_path: Path) -> None:
     data = trace.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) * 3 // 4])
@@ -119,6 +123,7 @@ def test_a_cut_off_trace_gives_what_is_whole(trace: Path, tmp_path: Path) -> Non
         assert sum(1 for _ in bag.messages()) == count > 0
 
 
+@pytest.mark.long
 def test_nothing_is_lost_or_left_half_done(
     trace: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

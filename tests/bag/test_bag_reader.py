@@ -19,6 +19,7 @@ from mcap.writer import CompressionType, IndexType
 
 import rsltrace.errors
 from rsltrace.bag import Bag, BagQos, open_bag
+from tests.tiers import cases
 
 Maker = Callable[..., Path]
 Sample = tuple[int, str, bytes]
@@ -130,7 +131,9 @@ def test_messages_come_by_time_and_equal_times_as_written(
 
 
 @settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=30
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    deadline=None,
+    max_examples=cases(10, 30),
 )
 @given(stamped, st.integers(0, 20), st.sets(st.sampled_from(["/a", "/b", "/c"]), min_size=1))
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -334,6 +337,7 @@ def test_several_iterators_run_at_once(
         ] == list(bag.messages())
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_memory_does_not_grow_with_the_bag(
     tmp_path: Path, mcap_maker: Maker, bag_maker: Maker, storage: str

@@ -234,6 +234,7 @@ def test_what_a_job_takes_from_outside_of_its_revisions(robot: Robot, tmp_path: 
     assert "6.0  |  7.0" in done.stdout
 
 
+@pytest.mark.few(30)
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -259,6 +260,7 @@ def test_what_cannot_be_searched_is_said(
     assert said in str(caught.value)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("files", "said"),
     [
@@ -320,6 +322,7 @@ def test_packages_that_are_installed_in_place_are_those_of_the_revision(
     assert note.startswith(f"copied is loaded from {robot.top}/build/copied.py at every revision")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
 def test_however_it_ends_nothing_is_left_behind(
     robot: Robot, temporary: Path, number: signal.Signals
@@ -359,6 +362,7 @@ def _wait(condition: Callable[[], Any]) -> Any:
     raise AssertionError("it did not come about within ten minutes")
 
 
+@pytest.mark.long
 def test_hooks_and_a_search_of_the_users_own_are_left_alone(robot: Robot, tmp_path: Path) -> None:
     robot.commit("Begin", job__yaml=JOB)
     robot.commit("More", README__md="more")

@@ -72,6 +72,7 @@ def test_libraries_are_looked_for_in_one_order(monkeypatch: pytest.MonkeyPatch) 
     assert before["LD_LIBRARY_PATH"] == "/site/ros_b.libs:/mine:/site/ros_a.libs"
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("words", "more"),
     [(["--no-pin"], ""), ([], "guard: {pin: false}\n"), ([], "guard: false\n")],

@@ -136,6 +136,7 @@ def test_a_job_that_differs_by_itself_is_told_so(rsltrace: Command, job: WriteJo
     assert result["diff"]["verdict"] == "same-input-different-output"
 
 
+@pytest.mark.long
 def test_a_job_that_fails_is_trouble(rsltrace: Command, job: WriteJob) -> None:
     done = rsltrace("verify", job("raise ValueError('bad')"))
     assert done.returncode == 2
@@ -167,6 +168,7 @@ def test_a_run_that_hangs_is_killed(rsltrace: Command, job: WriteJob) -> None:
     assert "took too long" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interruption_leaves_nothing_behind(
     job: WriteJob, tmp_path: Path, number: int, status: int

@@ -22,6 +22,7 @@ from rsltrace.chance.channel import (
 )
 from rsltrace.chance.distribution import Constant, Distribution, Gamma, Normal, Uniform
 from rsltrace.chance.network import LinkRule, NameRule, NetworkPlan, OutageRule
+from tests.tiers import cases
 
 N = 100_000
 MS = 1_000_000
@@ -161,7 +162,7 @@ def drawn(plan: NetworkPlan, links: list[tuple[str, str, str]]) -> dict[object, 
     return found
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=cases(30, 200), deadline=None)
 @given(st.dictionaries(LINKS, MODELS, min_size=2, max_size=8), LINKS, MODELS, st.data())
 def test_adding_removing_or_renaming_a_link_leaves_all_others_as_they_were(
     links: dict[tuple[str, str, str], Model], other: tuple[str, str, str], model: Model, data: Any

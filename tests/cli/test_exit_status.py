@@ -33,6 +33,7 @@ def run(words: str, redirect: str, cwd: Path | None = None) -> subprocess.Comple
     )
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("words", "status"),
     [("info A", 0), ("diff A B", 1), ("diff A no.mcap", 2), ("--help", 0), ("diff --no", 2)],
@@ -82,6 +83,7 @@ def test_ctrl_c_while_the_command_is_loaded_is_no_traceback(module: str, status:
     assert (done.returncode, done.stdout, done.stderr.strip()) == (status, "", "")
 
 
+@pytest.mark.long
 @pytest.mark.ros
 @pytest.mark.parametrize(("body", "status"), [("pass", 0), ("1 / 0", 3)])
 def test_a_run_has_its_own_status_first(tmp_path: Path, body: str, status: int) -> None:

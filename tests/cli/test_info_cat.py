@@ -452,6 +452,7 @@ def test_a_terminal_without_unicode_shows_escapes(tmp_path: Path) -> None:
     assert r"/gr\xf6\xdfe" in done.stdout
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="Linux tells the peak there")
 def test_memory_of_cat_does_not_grow_with_the_trace(tmp_path: Path) -> None:
     script = """

@@ -77,6 +77,7 @@ def test_the_whole_command_is_there(ros2: object, tmp_path: Path) -> None:
     assert "none.mcap does not exist" in failed.stderr
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_ros_arguments_arrive(ros2: object, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")

@@ -133,6 +133,7 @@ def test_pdb_in_the_first_line_of_a_callback(folder: Path) -> None:
     assert answers["print last > 0"] == ["True"]
 
 
+@pytest.mark.long
 def test_what_if_at_the_prompt(folder: Path) -> None:
     edit = 'edit node("/filter").state = 1000.0'
     done = script(folder, ["goto 300", edit, "print filter.state", "keep if.mcap", "edit what"])
@@ -142,6 +143,7 @@ def test_what_if_at_the_prompt(folder: Path) -> None:
     (folder / "if.mcap").unlink()
 
 
+@pytest.mark.long
 def test_a_script_ends_at_the_first_command_that_is_wrong(folder: Path) -> None:
     done = script(folder, ["break /smooth: data > 3", "break /smoth: data > 3", "continue"])
     assert done.returncode == 2
@@ -153,6 +155,7 @@ def test_a_script_ends_at_the_first_command_that_is_wrong(folder: Path) -> None:
     assert "(rsltrace) continue" not in done.stdout
 
 
+@pytest.mark.long
 def test_a_job_can_be_debugged_without_a_trace(folder: Path) -> None:
     done = script(
         folder,
@@ -179,6 +182,7 @@ def test_a_job_can_be_debugged_without_a_trace(folder: Path) -> None:
     assert said(done)["info ch"][0].startswith("before event 0")
 
 
+@pytest.mark.long
 def test_a_run_that_does_something_else_is_a_status(folder: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     shutil.copytree(folder, other)
@@ -190,6 +194,7 @@ def test_a_run_that_does_something_else_is_a_status(folder: Path, tmp_path: Path
     assert said(done)["continue"][0].startswith("the run has diverged")
 
 
+@pytest.mark.long
 def test_what_a_trace_names_runs_only_if_somebody_agrees(folder: Path, tmp_path: Path) -> None:
     done = script(tmp_path, ["step"], source=str(folder / "run.mcap"))
     assert done.returncode == 2
@@ -253,6 +258,7 @@ class Terminal:
         return os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
 
 
+@pytest.mark.long
 def test_a_session_on_a_terminal(folder: Path) -> None:
     terminal = Terminal(folder, "run.mcap")
     terminal.until("(rsltrace) ")
@@ -278,6 +284,7 @@ def test_a_session_on_a_terminal(folder: Path) -> None:
     assert terminal.end() == 0
 
 
+@pytest.mark.long
 def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) -> None:
     long = tmp_path / "long"
     shutil.copytree(folder, long)
@@ -299,6 +306,7 @@ def test_ctrl_c_stops_the_run_and_not_the_session(folder: Path, tmp_path: Path) 
     assert terminal.end() == 0
 
 
+@pytest.mark.long
 def test_a_session_that_is_killed_leaves_nobody(folder: Path) -> None:
     terminal = Terminal(folder, "run.mcap")
     terminal.until("(rsltrace) ")

@@ -167,6 +167,7 @@ def test_an_editor_stops_in_the_first_line_and_time_stands_still(
     assert under(edit)[0] == "the editor has disconnected"
 
 
+@pytest.mark.long
 def test_without_breakpoints_it_runs_to_the_end(under: Callable[..., tuple[str, Any]]) -> None:
     def edit(editor: Editor) -> None:
         editor.attach({})
@@ -177,6 +178,7 @@ def test_without_breakpoints_it_runs_to_the_end(under: Callable[..., tuple[str, 
     assert under(edit, at="t=2.95s")[0] == "duration of 3.000000000 s"
 
 
+@pytest.mark.long
 def test_a_port_that_is_taken_and_ctrl_c_while_it_waits(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -82,6 +82,7 @@ def test_processes_of_the_simulation(seeds: range, folder: Path) -> None:
             assert session.evaluate("filter.state") == state, seed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "seeds", [range(1), pytest.param(range(1, 8), marks=pytest.mark.long)], ids=["few", "many"]
 )

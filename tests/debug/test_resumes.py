@@ -143,6 +143,7 @@ def stops(session: DebugSession) -> list[Stopped]:
     return found
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "at",
     [

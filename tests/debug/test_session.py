@@ -91,6 +91,7 @@ def test_next_and_reverse_next_stay_in_a_node(session: DebugSession) -> None:
         session.next("filtr")
 
 
+@pytest.mark.long
 def test_breakpoints_stop_forwards_and_backwards(session: DebugSession) -> None:
     too_fast = session.break_at("log warn /fast/")
     stopped = session.go_on()
@@ -188,6 +189,7 @@ def test_an_expression_changes_nothing(session: DebugSession) -> None:
     assert session.go_on().reason == "end"
 
 
+@pytest.mark.long
 def test_a_job_that_was_never_recorded(folder: Path) -> None:
     with DebugSession(folder / "job.yaml") as session, Trace.open(folder / "run.mcap") as trace:
         assert session.events is None
@@ -206,6 +208,7 @@ def test_a_trace_that_nobody_trusts_is_not_run(folder: Path) -> None:
         DebugSession(folder / "run.mcap")
 
 
+@pytest.mark.long
 def test_what_if(folder: Path, tmp_path: Path, trace: Trace) -> None:
     """A session goes on in the branch that an edit makes, back and ahead, and keeps it."""
     with DebugSession(folder / "run.mcap", trust=True) as session:

@@ -162,6 +162,7 @@ def test_what_cannot_be_copied_is_refused_and_one_goes_back_without(
             assert session.checkpoints()["indices"][-1] > 102
 
 
+@pytest.mark.long
 def test_without_checkpoints_going_back_is_running_again(folder: Path) -> None:
     notices: list[dict[str, Any]] = []
     trace = folder / "run.mcap"
@@ -178,6 +179,7 @@ def test_without_checkpoints_going_back_is_running_again(folder: Path) -> None:
         assert eventually(lambda: len(list(filter(is_running, children_of(session)))) == 1)
 
 
+@pytest.mark.long
 def test_killed_children_are_noticed_and_made_again(folder: Path) -> None:
     with DebugSession(folder / "run.mcap", trust=True) as session:
         session.run_to(500)
@@ -239,6 +241,7 @@ def test_checkpoints_keep_within_their_bounds(job: Callable[..., Path], tmp_path
         assert found[0] == 0
 
 
+@pytest.mark.long
 def test_a_callback_that_does_not_come_back(job: Callable[..., Path]) -> None:
     with DebugSession(job("while True: pass")) as session:
         session.run_to(20)
@@ -293,6 +296,7 @@ def test_a_fork_that_fails(job: Callable[..., Path], tmp_path: Path) -> None:
         assert session.evaluate("ticks.n") == 78
 
 
+@pytest.mark.long
 def test_a_trace_whose_job_does_not_load_any_more(tmp_path: Path, folder: Path) -> None:
     for name in ("job.yaml", "run.mcap", "nodes_of_debug.py"):
         shutil.copy(folder / name, tmp_path)
@@ -306,6 +310,7 @@ def test_a_trace_whose_job_does_not_load_any_more(tmp_path: Path, folder: Path) 
         DebugSession(tmp_path / "nothing.mcap")
 
 
+@pytest.mark.long
 def test_a_run_that_is_not_what_the_trace_says_stops_there(tmp_path: Path, folder: Path) -> None:
     for name in ("job.yaml", "run.mcap", "nodes_of_debug.py"):
         shutil.copy(folder / name, tmp_path)
@@ -347,6 +352,7 @@ def test_a_client_that_disconnects_in_the_middle(job: Callable[..., Path]) -> No
     session.close()
 
 
+@pytest.mark.long
 def test_a_client_that_is_killed(job: Callable[..., Path]) -> None:
     path = job("subprocess.Popen(['sleep', '600'], start_new_session=True)", duration="3600s")
     script = f"import rsltrace\nrsltrace.DebugSession({str(path)!r}).go_on()\n"

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.alignment.align import EarlierPairs
 from rsltrace.diff.alignment.match import NO_CAUSE, UNKNOWN, EventSequence, match
+from tests.tiers import cases
 
 # (stamp, input, cause, nth)
 Row = tuple[int, int, int, int]
@@ -58,7 +59,7 @@ def test_a_sequence_is_its_own_counterpart(a: list[Row]) -> None:
     assert pairs(a, a) == {(i, i) for i in range(len(a))}
 
 
-@settings(max_examples=200)
+@settings(max_examples=cases(30, 200))
 @given(st.integers(1, 40), st.sets(st.integers(0, 39)), st.sets(st.integers(0, 39)), st.booleans())
 def test_missing_and_extra_events_are_the_ones_left_over(
     count: int, missing: set[int], extra: set[int], timers: bool

@@ -19,6 +19,7 @@ from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.result.bags import BagDiff, BagVerdict, Presence
 from rsltrace.errors import BagError, TraceError
+from tests.tiers import cases
 
 POINT = "geometry_msgs/msg/PointStamped"
 UINT64 = "std_msgs/msg/UInt64"
@@ -220,6 +221,7 @@ def test_ignored_fields(compare: Any) -> None:
     assert diff.first.a.index == 5
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("first", [0, 4, 8])
 @pytest.mark.parametrize("padding", [0, 3])
 @pytest.mark.parametrize("tolerance", [(), (("*", 1e-3),)])
@@ -296,6 +298,7 @@ def test_tolerances_and_a_missing_message(compare: Any) -> None:
     assert (diff.first.presence, diff.first.a.index) == (Presence.ONLY_A, 25)
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("at", range(1, 9))
 def test_one_missing_here_and_another_there_among_noise(compare: Any, at: int) -> None:
     """Both recordings are of one length, and no two messages of them are equal."""
@@ -475,6 +478,7 @@ def test_files_that_are_no_recordings(tmp_path: Path) -> None:
     assert not is_recording(tmp_path / "nothing")
 
 
+@pytest.mark.long
 def test_many_topics_and_messages_take_one_pass_where_nothing_differs(tmp_path: Path) -> None:
     samples = [(i + 1, f"/n{i % 20}", uint64(i)) for i in range(20_000)]
     a, b = write(tmp_path / "a", samples), write(tmp_path / "b", samples)
@@ -505,7 +509,7 @@ def rebuilt(a: list[int], b: list[int], gaps: list[Gap]) -> bool:
 small = st.lists(st.integers(0, 6), max_size=25)
 
 
-@settings(max_examples=300)
+@settings(max_examples=cases(50, 300))
 @given(small, small)
 def test_outside_of_gaps_sequences_are_equal(a: list[int], b: list[int]) -> None:
     gaps = gaps_by_order(keys(a), keys(b))
@@ -514,7 +518,7 @@ def test_outside_of_gaps_sequences_are_equal(a: list[int], b: list[int]) -> None
     assert all(gap.a_end > gap.a_start or gap.b_end > gap.b_start for gap in gaps)
 
 
-@settings(max_examples=200)
+@settings(max_examples=cases(30, 200))
 @given(st.lists(st.integers(0, 2**64 - 1), unique=True, min_size=1), st.data())
 def test_removed_keys_are_found_exactly(a: list[int], data: Any) -> None:
     removed = data.draw(st.sets(st.integers(0, len(a) - 1)))

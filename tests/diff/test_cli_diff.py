@@ -329,6 +329,7 @@ def test_colour_on_a_terminal_only() -> None:
     assert max(len(line) for line in lines if not line.startswith(("  a ", "  b ", "next"))) <= 90
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("sample", sorted(p.parent.name for p in SAMPLES.glob("*/a.mcap")))
 def test_a_small_terminal_is_enough(sample: str) -> None:
     pair = [str(SAMPLES / sample / f"{name}.mcap") for name in "ab"]

@@ -142,6 +142,7 @@ def test_the_window_limits_what_is_aligned(tmp_path: Path, window: int) -> None:
         assert 0 < reached <= max(window, 2 * PER_STEP) + PER_STEP
 
 
+@pytest.mark.long
 def test_all_looks_at_everything_in_blocks(tmp_path: Path) -> None:
     """A second divergence far behind the first, with equal events in between."""
     long = replace(PLAN, end_ns=40_000 * MS)

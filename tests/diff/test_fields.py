@@ -20,6 +20,7 @@ from rsltrace.diff.values.numbers import ulp_distance
 from rsltrace.errors import TraceError
 from rsltrace.trace.decode import Decoder
 from rsltrace.trace.index import ChannelInfo
+from tests.tiers import cases
 
 SCHEMA = f"""\
 std_msgs/Header header
@@ -414,7 +415,7 @@ arrays = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=cases(10, 60), deadline=None)
 @given(arrays, arrays, floats, floats, st.text(max_size=5), st.text(max_size=5))
 def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
     ranges_a: list[float], ranges_b: list[float], x: float, y: float, s: str, t: str
@@ -431,7 +432,7 @@ def test_no_difference_is_found_exactly_when_the_bytes_are_equal(
     ]
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=cases(25, 150), deadline=None)
 @given(
     st.lists(st.sampled_from([0.0, -0.0, 1.0, math.nan]), min_size=1, max_size=3),
     st.lists(st.sampled_from([0.0, -0.0, 1.0, math.nan]), min_size=1, max_size=3),

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from campaigns.truth.graph import write_bag
 from rsltrace import DiffOptions, diff_bags
 from tests.diff.judged_messages import Rules, encoded, judged, write_mcap, write_sqlite
+from tests.tiers import cases
 
 COUNTS = ("equal", "tolerated", "ignored", "differing")
 
@@ -119,7 +120,7 @@ def _write(path: Path, messages: list[Any], how: tuple[str, int, int, int]) -> P
     return path
 
 
-@settings(max_examples=25)
+@settings(max_examples=cases(10, 25))
 @given(recordings(), rules, storage, storage)
 def test_every_message_is_judged_as_its_values_are(
     two: tuple[list[Any], list[Any]], rule: Rules, how_a: Any, how_b: Any
@@ -166,7 +167,7 @@ def edited(draw: Any) -> tuple[list[float], list[float]]:
     return a, [value + draw(st.sampled_from((0.0, 0.0, 1e-4, -1e-4))) for value in b]
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(10, 40))
 @given(edited(), st.booleans())
 def test_both_orders_say_the_same_and_name_where_the_recordings_first_differ(
     two: tuple[list[float], list[float]], tolerant: bool

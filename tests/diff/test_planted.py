@@ -2,12 +2,11 @@
 
 Each case is a random job (fan-in, fan-out, services, feedback loops, a bag), run twice, the second
 time with one fault. The diff has to name the event, the entity, the verdict and the root, and must
-claim no other independent divergence. ``RSLTRACE_PLANTED`` sets how many cases are tried per kind.
+claim no other independent divergence. ``make test-all`` tries many of each kind.
 """
 
 from __future__ import annotations
 
-import os
 import random
 from collections import Counter
 from dataclasses import replace
@@ -29,8 +28,9 @@ from rsltrace.diff.result.verdicts import Verdict
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace.model.event import EventKind
 from rsltrace.trace.reader import Trace
+from tests.tiers import cases
 
-CASES = int(os.environ.get("RSLTRACE_PLANTED", "3"))
+CASES = cases(3, 40)
 pytestmark = pytest.mark.repeated
 SEEDS = st.integers(0, 2**32 - 1)
 
@@ -161,6 +161,7 @@ def test_the_check_bites(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert wrong > 3
 
 
+@pytest.mark.long
 @settings(max_examples=2 * CASES, deadline=None, suppress_health_check=list(HealthCheck))
 @given(SEEDS, st.sampled_from([5, 50, 500]))
 def test_every_event_is_counted_once_whatever_the_runs_are(

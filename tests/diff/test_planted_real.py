@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import random
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +13,7 @@ pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 import rsltrace
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Root, Verdict
+from tests.tiers import cases
 
 pytestmark = pytest.mark.ros
 
@@ -131,11 +131,13 @@ def diffed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Dif
     return go
 
 
+@pytest.mark.long
 def test_nothing_planted(diffed: Callable[..., Diff]) -> None:
     assert diffed().identical
     assert diffed(both="random").identical
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("mode", "verdict", "root", "node", "entity"),
     [
@@ -196,15 +198,15 @@ KINDS = {
     "silent": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/filter", "/reading"),
     "service": (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK, "/checker", "/check"),
 }
-CASES = int(os.environ.get("RSLTRACE_PLANTED", "4"))
+CASES = cases(4, 40)
 
 
+@pytest.mark.long
 @pytest.mark.repeated
 def test_a_fault_at_any_event_of_real_nodes(
     diffed: Callable[..., Diff], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The callback that misbehaves is named, whichever it is and whenever. ``RSLTRACE_PLANTED``
-    sets how many are tried."""
+    """The callback that misbehaves is named, whichever it is and whenever."""
     rng = random.Random(CASES)
     for number in range(CASES):
         kind = rng.choice(sorted(KINDS))

@@ -45,6 +45,7 @@ from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 from rsltrace.words.entities import EntityKey
 from rsltrace.words.phrases import as_sentence
 from tests.golden_files import check_golden
+from tests.tiers import cases
 
 GOLDEN = Path(__file__).parent.parent / "golden" / "diff"
 DOCUMENT = Path(__file__).parent.parent.parent / "docs" / "diff.md"
@@ -464,7 +465,7 @@ def test_what_a_file_says_cannot_steer_a_terminal_or_a_build(case: str, form: st
         assert not re.search(r"(?<!\\)@everyone", outside)
 
 
-@settings(max_examples=50)
+@settings(max_examples=cases(10, 50))
 @given(st.text(max_size=30))
 def test_junit_is_well_formed_whatever_the_sentence(sentence: str) -> None:
     plain, told = (

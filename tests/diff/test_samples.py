@@ -62,6 +62,7 @@ def test_the_verdict_is_the_one_promised(pair: Any) -> None:
     assert f"`{pair.verdict}`" in readme
 
 
+@pytest.mark.few(1)
 @pytest.mark.ros
 @pairs
 def test_recording_them_again_gives_the_same_runs(pair: Any, tmp_path: Path) -> None:

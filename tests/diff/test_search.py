@@ -35,6 +35,7 @@ def expected(a: Trace, b: Trace) -> int | None:
     return None
 
 
+@pytest.mark.long
 @settings(max_examples=60, deadline=None)
 @given(
     st.integers(0, 350),

@@ -53,6 +53,7 @@ def test_a_diff_over_http(server: RangeServer, tmp_path: Path) -> None:
     assert server.sent < whole * 0.8, "even here, where the files are small"
 
 
+@pytest.mark.long
 def test_identical_runs_over_http_cost_a_few_requests(server: RangeServer, tmp_path: Path) -> None:
     Simulation(PLAN, tmp_path / "a.mcap").run()
     assert rsltrace.diff(f"{server.address}/a.mcap", f"{server.address}/a.mcap").identical
@@ -60,6 +61,7 @@ def test_identical_runs_over_http_cost_a_few_requests(server: RangeServer, tmp_p
     assert server.sent < 10 * BLOCK_BYTES
 
 
+@pytest.mark.long
 def test_an_interrupted_trace_over_http(server: RangeServer, tmp_path: Path) -> None:
     """It has no index and is read from front to back, in pieces that grow."""
     Simulation(PLAN, tmp_path / "a.mcap", storage=Storage(100, "")).run()

@@ -251,6 +251,7 @@ def test_goals_whose_execution_is_deferred(simulate: Any) -> None:
     ]
 
 
+@pytest.mark.long
 def test_goal_ids_come_from_the_seed(simulate: Any) -> None:
     def goal_ids(seed: int) -> list[str]:
         seen: list[str] = []

@@ -49,6 +49,7 @@ class Unprintable(Exception):
         raise ValueError("no text")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("error", "said"),
     [
@@ -111,6 +112,7 @@ def test_a_destroy_node_that_waits_for_ever_ends(simulate: Any) -> None:
     assert simulate(Endless, duration=1).result.stop_reason.startswith("duration")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("group", [None, ReentrantCallbackGroup])
 def test_who_swallows_the_end_of_the_run_is_left_behind(simulate: Any, group: Any) -> None:
     class Deaf(Ticker):
@@ -149,6 +151,7 @@ def test_finalizers_and_stop_functions_that_sleep_make_no_events(simulate: Any) 
     assert recorded.kinds() == ["construct", "timer", "timer", "shutdown"]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("status", "code"), [(4, 4), (None, 0), ("enough of it", 1)])
 def test_a_stop_function_may_call_sys_exit(simulate: Any, status: Any, code: int) -> None:
     def enough(progress: Any) -> None:
@@ -177,6 +180,7 @@ def _nap() -> None:
     time.sleep(0.01)
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_worker_really_sleeps(simulate: Any) -> None:
     codes: list[Any] = []
@@ -195,6 +199,7 @@ def test_a_forked_worker_really_sleeps(simulate: Any) -> None:
     assert set(recorded.kinds()) == {"construct", "timer", "resume", "shutdown"}
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_a_forked_child_that_exits_does_not_go_on_with_the_run(simulate: Any) -> None:
     codes: list[int] = []
@@ -216,6 +221,7 @@ def test_a_forked_child_that_exits_does_not_go_on_with_the_run(simulate: Any) ->
         assert trace.event_count == 4
 
 
+@pytest.mark.long
 def test_a_cancelled_task_waits_for_nothing(simulate: Any) -> None:
     class Cancels(Node):
         def __init__(self) -> None:
@@ -272,6 +278,7 @@ def test_constructors_that_wait_are_unwound_when_another_one_fails(simulate: Any
     assert log == ["cleaned up"]
 
 
+@pytest.mark.long
 def test_a_module_that_keeps_sleep_sleeps_in_every_run(
     simulate: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -312,6 +319,7 @@ def test_a_run_with_blocked_calls_leaves_no_world_behind(simulate: Any) -> None:
     assert worlds() == before
 
 
+@pytest.mark.long
 def test_a_closed_terminal_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from rsltrace import Job, NodeSpec, StopSpec, record
 
@@ -342,6 +350,7 @@ class Rude:
         raise AttributeError(name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("callback", [MagicMock(), Rude()])
 def test_a_callback_may_be_any_callable(simulate: Any, callback: Any) -> None:
     class Odd(Ticker):

@@ -45,6 +45,7 @@ def no_real_sleep() -> Iterator[None]:
         yield
 
 
+@pytest.mark.long
 def test_a_constructor_may_wait_for_a_server_that_is_made_later(simulate: Any) -> None:
     log: list[Any] = []
 
@@ -68,6 +69,7 @@ def test_a_constructor_may_wait_for_a_server_that_is_made_later(simulate: Any) -
     assert kinds == ["construct", "construct", "resume", "service", "client", "resume", "timer"]
 
 
+@pytest.mark.long
 def test_waiting_for_a_service_times_out_in_simulated_time(simulate: Any) -> None:
     log: list[Any] = []
 
@@ -83,6 +85,7 @@ def test_waiting_for_a_service_times_out_in_simulated_time(simulate: Any) -> Non
     assert log == [(False, 10.0), (False, pytest.approx(15.0))]
 
 
+@pytest.mark.long
 def test_blocking_service_calls_inside_callbacks_two_deep(simulate: Any) -> None:
     log: list[Any] = []
 
@@ -198,6 +201,7 @@ def test_sleeping_lets_others_run_and_keeps_the_group_busy(simulate: Any) -> Non
         ], method
 
 
+@pytest.mark.long
 def test_what_a_woken_callback_does_is_caused_by_who_woke_it(simulate: Any) -> None:
     class Asker(Node):
         def __init__(self) -> None:
@@ -219,6 +223,7 @@ def test_what_a_woken_callback_does_is_caused_by_who_woke_it(simulate: Any) -> N
     assert resume.input_hash == client.input_hash
 
 
+@pytest.mark.long
 def test_exceptions_after_a_wait_are_the_callbacks_own(simulate: Any) -> None:
     class Faulty(Node):
         def __init__(self) -> None:
@@ -233,6 +238,7 @@ def test_exceptions_after_a_wait_are_the_callbacks_own(simulate: Any) -> None:
         simulate(Faulty)
 
 
+@pytest.mark.long
 def test_whoever_is_blocked_at_the_end_is_unwound(simulate: Any) -> None:
     log: list[str] = []
 
@@ -301,6 +307,7 @@ def test_sleep_is_real_again_after_a_run(simulate: Any) -> None:
     assert time.sleep is real
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", [{}, {"policy": {"order": "permutation"}}])
 def test_a_callback_that_polls_a_clock_for_long_is_no_livelock(simulate: Any, policy: Any) -> None:
     class Poller(Node):

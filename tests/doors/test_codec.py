@@ -67,6 +67,7 @@ from rsltrace.doors.rclpy.wire.message_spec import (  # noqa: E402
     Text,
     message_spec,
 )
+from tests.tiers import cases  # noqa: E402
 
 pytestmark = pytest.mark.ros
 
@@ -227,6 +228,7 @@ def fast_only(cls: type, monkeypatch: pytest.MonkeyPatch) -> tuple[Any, Any]:
         return codec_write.make_serializer(spec), codec_read.make_deserializer(spec)
 
 
+@pytest.mark.few(30)
 @every_class
 @settings(QUICK, max_examples=3)
 @given(seed=st.integers(0, 2**32))
@@ -247,6 +249,7 @@ def test_bytes_and_messages_are_those_of_rclpy(
     assert serialize(deserialize(raw)) == raw
 
 
+@pytest.mark.few(30)
 @every_class
 @settings(QUICK, max_examples=2)
 @given(seed=st.integers(0, 2**32))
@@ -656,6 +659,7 @@ def test_bytes_that_are_no_cdr_at_all_are_refused() -> None:
         codec_for(UInt64).deserialize(b"")
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("cls", [String, *SAMPLES[2:7], BoundedSequences], ids=type_name)
 def test_a_hostile_length_allocates_nothing(cls: type) -> None:
     message = random_message(message_spec(cls), random.Random(2))
@@ -675,7 +679,7 @@ def test_a_hostile_length_allocates_nothing(cls: type) -> None:
 
 
 @pytest.mark.parametrize("cls", SAMPLES, ids=type_name)
-@settings(QUICK, max_examples=60)
+@settings(QUICK, max_examples=cases(10, 60))
 @given(seed=st.integers(0, 2**32))
 def test_flipped_bytes_are_read_as_rclpy_reads_them_or_refused(cls: type, seed: int) -> None:
     rng = random.Random(seed)
@@ -766,6 +770,7 @@ def value_of(message: Any, field: Any) -> Any:
     return getattr(message, field.name)
 
 
+@pytest.mark.few(8)
 @every_class
 def test_rosbags_reads_the_schema_and_the_bytes(cls: type) -> None:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore

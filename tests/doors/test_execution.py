@@ -100,12 +100,14 @@ def test_a_short_queue_drops_what_a_slow_node_cannot_take(run: Any) -> None:
     assert SEEN == [("detector 1", 10), ("detector 3", 35), ("detector 5", 60), ("detector 8", 85)]
 
 
+@pytest.mark.long
 def test_zero_costs_nothing_and_changes_nothing(run: Any) -> None:
     plain = run(Camera, Detector, Planner, ms=100)
     same = run(Camera, Detector, Planner, ms=100, executors=[{"workers": 8}])
     assert same.result.digest == plain.result.digest
 
 
+@pytest.mark.long
 def test_a_single_threaded_executor_runs_one_callback_of_all_nodes_at_a_time(run: Any) -> None:
     run(
         lambda: Camera(50),
@@ -127,6 +129,7 @@ def test_a_single_threaded_executor_runs_one_callback_of_all_nodes_at_a_time(run
     assert SEEN == [("a 1", 50), ("b 1", 50), ("a 2", 100), ("b 2", 100)]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("workers", "starts"), [(1, [20, 50, 80, 110]), (2, [20, 20, 50, 50]), (4, [20, 20, 20, 20])]
 )

@@ -112,6 +112,7 @@ def test_messages_of_a_topic_are_counted_whoever_sends_them() -> None:
 # -- nodes ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_run_with_faults_follows_its_own_recorded_order_and_a_diff_names_the_fault(
     simulate: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -129,6 +130,7 @@ def test_a_run_with_faults_follows_its_own_recorded_order_and_a_diff_names_the_f
     assert "faults" in found.divergences[0].root_sentence
 
 
+@pytest.mark.long
 def test_a_node_that_crashes_is_gone_and_everything_before_it_is_as_without(
     simulate: Callable[..., Any],
 ) -> None:
@@ -153,6 +155,7 @@ def test_a_node_that_crashes_is_gone_and_everything_before_it_is_as_without(
         assert trace.entity(struck.entity).name == "/talker"
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("number", [0, 13, 900])
 def test_a_fault_strikes_right_after_the_event_with_its_number(
     simulate: Callable[..., Any], number: int
@@ -180,6 +183,7 @@ def test_a_node_that_hangs_finds_its_queue_and_a_late_timer_afterwards() -> None
     assert ticks == [650, 800]
 
 
+@pytest.mark.long
 def test_calls_and_coroutines_of_a_node_that_hangs_go_on_with_it() -> None:
     done: list[tuple[str, int]] = []
 
@@ -224,6 +228,7 @@ def test_calls_and_coroutines_of_a_node_that_hangs_go_on_with_it() -> None:
     assert done == []
 
 
+@pytest.mark.long
 def test_who_waits_for_a_node_that_is_gone_waits_for_ever() -> None:
     class Asker(Node):
         def __init__(self) -> None:
@@ -278,6 +283,7 @@ def test_one_process_has_all_nodes_of_its_entry() -> None:
 # -- mains ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_mains_crash_hang_and_start_again() -> None:
     ends: list[str] = []
 

@@ -87,6 +87,7 @@ def count_of(recorded: Any) -> int:
         return int(trace.decode("/count", data).data)
 
 
+@pytest.mark.long
 def test_threads_take_turns_at_lines_and_lose_updates_only_without_a_lock(simulate: Any) -> None:
     plain = simulate(Tally, duration=0.2)
     digest = plain.result.digest
@@ -181,6 +182,7 @@ def exclusive() -> Sums:
     return MOST[-1]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     ("runs", "job", "most"),
     [

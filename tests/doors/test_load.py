@@ -62,6 +62,7 @@ def growth(work: Callable[[int], int]) -> float:
     return (many - some) / (some - few)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "make",
     [
@@ -77,6 +78,7 @@ def test_work_grows_with_what_there_is(make: Callable[[int], Any], tmp_path: Pat
     assert growth(work) < 2.2
 
 
+@pytest.mark.long
 def test_the_work_of_a_job_file_grows_with_its_entries(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

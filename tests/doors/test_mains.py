@@ -102,6 +102,7 @@ def test_mains_spin_and_are_told_to_end_as_by_ctrl_c(simulate: Any) -> None:
     assert kinds == ["construct"] * 2 + ["timer", "subscription"] * 4 + ["resume"] * 2
 
 
+@pytest.mark.long
 def test_every_main_has_its_own_arguments_and_default_context(simulate: Any) -> None:
     seen: list[Any] = []
 
@@ -314,6 +315,7 @@ def test_an_executor_class_of_the_users_own(simulate: Any) -> None:
     assert order == ["task", "made", *["counter", "listener"] * 2]
 
 
+@pytest.mark.long
 def test_polling_without_a_timeout_takes_time(simulate: Any) -> None:
     turns = 0
 
@@ -333,6 +335,7 @@ def test_polling_without_a_timeout_takes_time(simulate: Any) -> None:
     assert recorded.kinds() == ["construct", "timer", "timer", "resume"]
 
 
+@pytest.mark.long
 def test_the_same_twice_gives_the_same_digest(simulate: Any) -> None:
     def run() -> str:
         log: list[Any] = []
@@ -350,6 +353,7 @@ def test_the_same_twice_gives_the_same_digest(simulate: Any) -> None:
     assert run() == run()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("record_it", [True, False])
 def test_a_run_without_recording_has_as_many_events(record_it: bool, tmp_path: Any) -> None:
     from rsltrace import Job, StopSpec, record
@@ -365,6 +369,7 @@ def test_a_run_without_recording_has_as_many_events(record_it: bool, tmp_path: A
     assert record(job, tmp_path / "run.mcap" if record_it else None).events == 7
 
 
+@pytest.mark.long
 def test_wait_for_message_in_a_main_and_in_a_callback(simulate: Any) -> None:
     from rclpy.wait_for_message import wait_for_message
 
@@ -448,6 +453,7 @@ def test_exit_handlers_run_when_their_main_ends(simulate: Any) -> None:
     ]  # fmt: skip
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "work",
     [
@@ -557,6 +563,7 @@ def test_an_execution_time_keeps_the_callback_group_busy_among_several_threads(
     assert log == [("a", 1.0), ("r", 1.25), ("b", 1.5), ("a", 2.0)]
 
 
+@pytest.mark.long
 def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) -> None:
     from rsltrace.doors.rclpy.stacks.program import _FAILURES_MAX, Program
 
@@ -593,6 +600,7 @@ def test_a_program_keeps_no_more_than_the_last_of_its_failures(simulate: Any) ->
     assert kept == [_FAILURES_MAX]
 
 
+@pytest.mark.long
 def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any) -> None:
     from rclpy.action import ActionClient
     from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -646,6 +654,7 @@ def test_what_belongs_to_a_context_that_is_down_can_do_little_more(simulate: Any
     assert [number for number, _ in heard] == [1, 2]  # type: ignore[misc]
 
 
+@pytest.mark.long
 def test_after_a_shutdown_a_program_begins_anew(simulate: Any) -> None:
     heard: list[Any] = []
 

@@ -12,6 +12,7 @@ from rclpy.node import Node
 
 from rsltrace import NodeSpec
 from rsltrace.doors.rclpy.entry import ros_arguments
+from tests.tiers import cases
 
 pytestmark = pytest.mark.ros
 
@@ -56,7 +57,7 @@ def test_an_empty_list_leaves_a_parameter_unset_as_in_ros(simulate: Any, tmp_pat
     assert seen == dict.fromkeys(["by_file", "by_value"], [("NOT_SET", None)] * 2)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=cases(10, 50), deadline=None)
 @given(
     st.dictionaries(
         st.text("abz_-7 ü:#\"'", min_size=1).filter(lambda name: name.strip()),

@@ -141,6 +141,7 @@ def test_what_no_timer_has_caused_has_the_rate_of_its_node(order: Any) -> None:
     assert order(*makers, policy="rate_monotonic") == ["fast", "slow"]
 
 
+@pytest.mark.long
 def test_wait_sets_run_what_polling_points_find(order: Any) -> None:
     """/b is created before /a's second message comes: it waits for its polling point; timers of
     rclcpp do not, those of rclpy do."""
@@ -175,6 +176,7 @@ def test_wait_sets_run_what_polling_points_find(order: Any) -> None:
     assert order(Polled, policy="rclpy", **slow) == ["b", "a", "t", "c"]
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("rules", "expected"),
     [
@@ -197,6 +199,7 @@ def test_priorities_of_nodes_decide_over_timers_too(order: Any) -> None:
     assert order(*makers, policy={"priority": rules}) == ["h", "l"]
 
 
+@pytest.mark.long
 def test_a_permutation_has_every_order_and_the_seed_decides(order: Any) -> None:
     seen = {tuple(order(Burst, policy="permutation", seed=seed)) for seed in range(12)}
     assert len(seen) == 6
@@ -287,6 +290,7 @@ def test_a_least_time_step_gathers_what_is_due(simulate: Any) -> None:
     assert recorded.result.end_ns == 50_000_000
 
 
+@pytest.mark.long
 def test_the_ordered_loop_keeps_the_order_of_the_plain_one(tmp_path: Any) -> None:
     """RSLCPP's network through the other loop, with more workers than it could ever use."""
     from pathlib import Path

@@ -158,6 +158,7 @@ def test_no_other_program_takes_the_place_of_the_run(simulate: Any) -> None:
         simulate(Changeling, duration=1)
 
 
+@pytest.mark.long
 def test_a_crash_prints_the_line_and_the_file_says_that_it_was_cut_off(tmp_path: Path) -> None:
     (tmp_path / "crash_node.py").write_text(
         "import ctypes\n"

@@ -66,6 +66,7 @@ def harness(*arguments: object) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.long
 def test_every_outcome_is_told(tmp_path: Path) -> None:
     folder = tmp_path / "rclpy" / "test"
     folder.mkdir(parents=True)

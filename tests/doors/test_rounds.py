@@ -62,6 +62,7 @@ def test_nodes_of_a_job_keep_rclpys_order(simulate: Any) -> None:
         assert run_nodes(simulate, seed, "rclpy")[0] == golden()[seed]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["rclpy", {"order": "rclpy", "after": "20ms"}])
 def test_that_order_can_be_replayed(simulate: Any, tmp_path: Path, policy: Any) -> None:
     """Also the replay of a replay, and of a main with an executor of its own."""

@@ -98,6 +98,7 @@ def test_a_thread_that_is_started_in_a_callback(simulate: Any) -> None:
     assert recorded.logs() == ["thread", "callback"]
 
 
+@pytest.mark.long
 def test_threads_that_start_each_other_for_ever_do_not_nest(simulate: Any) -> None:
     log: list[int] = []
 

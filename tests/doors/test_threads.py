@@ -38,6 +38,7 @@ class Answers(Node):
         return response
 
 
+@pytest.mark.long
 def test_the_thread_that_spins_beside_main(simulate: Any) -> None:
     """Half of all rclpy programs."""
     log: list[Any] = []
@@ -340,6 +341,7 @@ def test_what_a_thread_raises_ends_the_run(simulate: Any) -> None:
         simulate(Fails, duration=3)
 
 
+@pytest.mark.long
 def test_shutdown_ends_a_thread_that_spins(simulate: Any) -> None:
     log: list[str] = []
 
@@ -397,6 +399,7 @@ def test_a_main_waits_for_its_threads_and_takes_its_daemons_with_it(simulate: An
     ]  # fmt: skip
 
 
+@pytest.mark.long
 def test_nothing_is_left_after_a_run(simulate: Any) -> None:
     before = (
         threading.Lock, threading.RLock(), threading.local, threading.Thread.start, time.sleep,
@@ -427,6 +430,7 @@ def test_nothing_is_left_after_a_run(simulate: Any) -> None:
     kept[0].shutdown(wait=True)
 
 
+@pytest.mark.long
 def test_a_real_thread_is_told_what_it_cannot_do(simulate: Any) -> None:
     """As a library in C starts them."""
     heard: list[BaseException] = []
@@ -461,6 +465,7 @@ def test_a_real_thread_is_told_what_it_cannot_do(simulate: Any) -> None:
     assert "waits for the response to a service call" in str(heard[0])
 
 
+@pytest.mark.long
 def test_threads_give_the_same_digest_every_time(simulate: Any) -> None:
     def run() -> str:
         def program() -> None:
@@ -483,6 +488,7 @@ def test_threads_give_the_same_digest_every_time(simulate: Any) -> None:
     assert len({run() for _ in range(4)}) == 1
 
 
+@pytest.mark.long
 def test_asyncio_loops_keep_simulated_time_and_wake_each_other(simulate: Any) -> None:
     log: list[Any] = []
 
@@ -525,6 +531,7 @@ def test_asyncio_loops_keep_simulated_time_and_wake_each_other(simulate: Any) ->
     assert round(log[-1], 6) == 1.65
 
 
+@pytest.mark.long
 def test_an_rclpy_future_awaited_in_asyncio_is_polled_and_time_passes(simulate: Any) -> None:
     """asyncio asks again at once whatever is not its own: its loop is never idle, as in reality."""
     log: list[Any] = []
@@ -560,6 +567,7 @@ def test_an_rclpy_future_awaited_in_asyncio_is_polled_and_time_passes(simulate: 
     assert 0.5 <= done[1] < 0.52
 
 
+@pytest.mark.long
 def test_asyncio_is_real_again_after_a_run(simulate: Any) -> None:
     before = asyncio.BaseEventLoop.time, asyncio.SelectorEventLoop.__init__
     simulate(Counter, duration=1)
@@ -569,6 +577,7 @@ def test_asyncio_is_real_again_after_a_run(simulate: Any) -> None:
     assert time.monotonic() - began >= 0.009
 
 
+@pytest.mark.long
 def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
     alive: list[int] = []
 
@@ -586,6 +595,7 @@ def test_threads_that_have_ended_are_forgotten(simulate: Any) -> None:
     assert max(alive) <= 3
 
 
+@pytest.mark.long
 def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(
     simulate: Any,
 ) -> None:
@@ -604,6 +614,7 @@ def test_a_timer_is_written_down_although_a_thread_spins_its_node_only_later(
         assert [trace.entities[trace.entities[n].node].name for n in timers] == ["/late"]
 
 
+@pytest.mark.long
 def test_a_pool_that_is_used_in_the_pool_of_an_executor(simulate: Any) -> None:
     """All pools of a process share a lock, which is taken while a worker is started."""
     log: list[Any] = []

@@ -75,6 +75,7 @@ def _after_a_while(sim: Any, benchmark8: ModuleType, groups: int) -> list[Any]:
     return nodes
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("arguments", [{"groups": 0}, {"seed": 0}, {"period": 0.0}])
 def test_senseless_arguments_are_refused(
     benchmark8: ModuleType, arguments: dict[str, float]
@@ -83,6 +84,7 @@ def test_senseless_arguments_are_refused(
         benchmark8.make_nodes(**arguments)
 
 
+@pytest.mark.long
 def test_xorshift_never_dies_and_never_merges(benchmark8: ModuleType) -> None:
     word = st.integers(1, 2**64 - 1)
 

@@ -38,6 +38,7 @@ def test_a_job_is_valid_and_its_readme_names_it(name: str) -> None:
     assert load_job(EXAMPLES / name).nodes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "callbacks"),
     [
@@ -72,6 +73,7 @@ def test_the_robot_drives_its_laps_and_knows_where_it_is(
     assert "refused" not in log
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not HUSKY.exists(), reason="the Husky recording is not here")
 def test_the_real_robot_is_followed_to_its_end(capfd: pytest.CaptureFixture[str]) -> None:
     result, log = run("sensor_fusion/job_husky.yaml", capfd)

@@ -65,6 +65,7 @@ def test_covariance_is_that_of_the_full_matrix_equations(part: Callable[[str], A
     np.testing.assert_allclose(ekf.covariance, p - np.outer(gain, p[3]), rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.long
 def test_covariance_stays_symmetric_and_positive(part: Callable[[str], Any]) -> None:
     ekf_class = part("ekf").Ekf
     speed, rate, place = st.floats(-3, 3), st.floats(-2, 2), st.floats(-50, 50)
@@ -152,6 +153,7 @@ def test_wrap_angle(part: Callable[[str], Any]) -> None:
     check()
 
 
+@pytest.mark.long
 def test_local_frame_there_and_back(part: Callable[[str], Any]) -> None:
     frame_class = part("geodesy").LocalFrame
 
@@ -174,6 +176,7 @@ def test_local_frame_has_the_size_of_the_earth(part: Callable[[str], Any]) -> No
     assert north == pytest.approx(111.1318, abs=1e-3)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("datum", [(90.0, 0.0), (0.0, 181.0), (math.nan, 0.0)])
 def test_a_datum_off_the_earth_is_refused(
     part: Callable[[str], Any], datum: tuple[float, float]
@@ -182,6 +185,7 @@ def test_a_datum_off_the_earth_is_refused(
         part("geodesy").LocalFrame(*datum)
 
 
+@pytest.mark.long
 def test_alignment_finds_the_turn_and_the_shift(part: Callable[[str], Any]) -> None:
     aligner_class = part("alignment").TrackAligner
 
@@ -220,6 +224,7 @@ def test_a_smooth_loop_meets_its_waypoints_at_even_spacing(part: Callable[[str],
         assert min(course.distance(waypoint, point) for point in loop) < 0.06
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("waypoints", "spacing", "message"),
     [
@@ -243,6 +248,7 @@ def test_a_section_runs_forwards_and_around(part: Callable[[str], Any]) -> None:
     assert section(ring, (3.0, 0.0), (3.0, 0.0)) == ring[3:] + ring[:4]
 
 
+@pytest.mark.long
 def test_pursuit_drives_a_lap_within_its_limits(part: Callable[[str], Any]) -> None:
     course, body = part("course"), part("unicycle").Unicycle(0.0, 0.0, 0.0)
     loop = course.smooth_loop([(0, 0), (5, -0.5), (9, 1.5), (9.5, 5.5), (3, 6)], 0.2)
@@ -263,6 +269,7 @@ def test_pursuit_drives_a_lap_within_its_limits(part: Callable[[str], Any]) -> N
     assert furthest < 0.8
 
 
+@pytest.mark.long
 def test_an_empty_path_cannot_be_followed(part: Callable[[str], Any]) -> None:
     course = part("course")
     with pytest.raises(ValueError, match="no path to follow"):

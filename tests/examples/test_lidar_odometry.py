@@ -40,6 +40,7 @@ def recorded(path: Path, job: str, *words: str, processors: int = 0) -> dict[str
     return result
 
 
+@pytest.mark.long
 def test_processors_and_threads_make_no_difference(tmp_path: Path) -> None:
     few = ("--set", ROBOT + "sweeps=4", "--set", ROBOT + "columns=120")
     one = recorded(tmp_path / "one.mcap", "job.yaml", *few, processors=1)

@@ -50,6 +50,7 @@ def test_network_ends_in_the_states_of_the_cpp_program(sim: Any, nodes: ModuleTy
     ]
 
 
+@pytest.mark.long
 def test_callbacks_run_in_the_order_of_the_cpp_program(sim: Any, nodes: ModuleType) -> None:
     run_network(sim, nodes, keep_order=True)
     with lzma.open(GOLDEN_ORDER, "rt") as lines:

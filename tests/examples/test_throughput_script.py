@@ -123,6 +123,7 @@ def test_the_command_lists_and_filters_its_cases() -> None:
     assert nothing.returncode == 2
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_both_rsltrace_cases_do_the_same_work(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")

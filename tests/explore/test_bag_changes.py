@@ -45,6 +45,7 @@ class Talker(Node):
             end.publish(message)
 
 
+@pytest.mark.long
 def test_changes_that_a_search_tries_fit_the_types_and_hit_all_fields(tmp_path: Path) -> None:
     record(Job(nodes=[NodeSpec(node=Talker)], stop=StopSpec(duration=0.45)), tmp_path / "bag.mcap")
     job = Job(bags=[{"path": str(tmp_path / "bag.mcap")}], progress="/progress")

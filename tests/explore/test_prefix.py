@@ -62,6 +62,7 @@ def _both(
     return found
 
 
+@pytest.mark.long
 def test_a_forked_run_is_the_one_from_the_beginning(alike: Worker, tmp_path: Path) -> None:
     wants = Wants(keep=True, behaviours=True, steps=True, fork_ns=ALIKE_NS)
     digests = set()

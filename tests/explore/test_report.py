@@ -63,6 +63,7 @@ def test_failures_are_put_together_by_cause() -> None:
     assert late.place is None
 
 
+@pytest.mark.long
 def test_the_setting_that_matters_is_told_from_those_that_do_not() -> None:
     found = effects(explored().results)
     by_pair = {(one.setting, one.outcome): one for one in found}
@@ -150,6 +151,7 @@ def test_a_page_of_next_to_nothing(count: int) -> None:
     assert f"None of the {count} runs failed" in seen.text
 
 
+@pytest.mark.long
 def test_a_large_search_makes_no_large_page() -> None:
     assert len(page(explored(20_000))) < 3_000_000
 

@@ -223,6 +223,7 @@ def test_the_command_searches_faults_and_makes_what_it_finds_small(
     assert repeated.returncode == 1
 
 
+@pytest.mark.long
 def test_the_command_tries_each_combination_of_settings(
     write_job: Callable[[str, str], Path], tmp_path: Path, command: Callable[..., Any]
 ) -> None:

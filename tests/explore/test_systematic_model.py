@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from rsltrace.explore.strategies.systematic import Systematic
 from rsltrace.explore.trial import Step, Trial, TrialResult
+from tests.tiers import cases
 
 NODES = 3
 ORDERS_MAX = 400
@@ -60,7 +61,7 @@ def run(model: Model, begin: list[int], departures: dict[int, int]) -> TrialResu
 callbacks = st.tuples(st.integers(0, NODES - 1), st.integers(0, 5), st.none() | st.integers(0, 4))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=cases(15, 100), deadline=None)
 @given(
     st.lists(callbacks, min_size=5, max_size=5), st.lists(st.integers(0, 4), min_size=2, max_size=4)
 )

@@ -18,6 +18,7 @@ from rsltrace.explore.strategies.vary import VaryWalk
 from rsltrace.explore.trial import JobSource, Trial, TrialResult
 from rsltrace.explore.vary import Variations, check_vary
 from rsltrace.job import Job, NodeSpec, VarySpec, load_job
+from tests.tiers import cases
 
 A = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback" / "a.mcap"
 
@@ -44,7 +45,7 @@ def test_a_grid_has_every_combination_once_and_the_last_setting_changes_first() 
     assert Variations(spec).count == 36
 
 
-@settings(max_examples=30)
+@settings(max_examples=cases(10, 30))
 @given(st.integers(1, 60), st.integers(0, 5))
 def test_a_latin_hypercube_has_one_run_in_each_stratum_of_each_setting(n: int, seed: int) -> None:
     pytest.importorskip("scipy")

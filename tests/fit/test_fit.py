@@ -276,6 +276,7 @@ def test_what_an_executor_needs_before_a_callback_is_part_of_its_time(
         assert one.runs.mean() < same.runs.mean()
 
 
+@pytest.mark.long
 def test_a_clock_that_is_set_and_one_that_is_behind(known: Known, tmp_path: Path) -> None:
     """A step leaves out what was on its way; delays are never negative, nor a second long."""
 
@@ -306,6 +307,7 @@ def _stamps(path: Path) -> list[int]:
         return [trace.event(0).stamp_ns]
 
 
+@pytest.mark.long
 def test_messages_of_unknown_senders(known: Known, tmp_path: Path) -> None:
     path = as_native(known.simulated, tmp_path / "unknown.mcap", unknown=frozenset({"/image"}))
     found = look(path)
@@ -322,6 +324,7 @@ def test_messages_of_unknown_senders(known: Known, tmp_path: Path) -> None:
     assert (link.sender, link.receiver) == ("*", "/detector")
 
 
+@pytest.mark.long
 def test_the_jobs_own_times_are_replaced(known: Known) -> None:
     """Those had no effect natively; the note says so."""
     output = known.folder / "replaced.yaml"
@@ -337,6 +340,7 @@ def test_the_jobs_own_times_are_replaced(known: Known) -> None:
     assert "/asker: the callback of /never never ran" in done.stderr
 
 
+@pytest.mark.long
 def test_what_the_run_was_recorded_with_is_in_the_fitted_job(known: Known, tmp_path: Path) -> None:
     """``--set`` and ``--until`` are in no job file; what a job file cannot say is a note."""
     shutil.copytree(known.folder, tmp_path, dirs_exist_ok=True)
@@ -364,6 +368,7 @@ def test_what_the_run_was_recorded_with_is_in_the_fitted_job(known: Known, tmp_p
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("text", ["vars: {n: 10}\nseed: $(var n)\n", ""])
 def test_a_job_that_is_put_together_has_not_changed(
     known: Known, tmp_path: Path, text: str
@@ -378,6 +383,7 @@ def test_a_job_that_is_put_together_has_not_changed(
     assert "another job" in known.fit(str(native), "-o", str(tmp_path / "g.yaml")).stderr
 
 
+@pytest.mark.long
 def test_nodes_that_shared_an_executor_share_one(known: Known, tmp_path: Path) -> None:
     path = as_native(
         known.simulated,
@@ -424,6 +430,7 @@ def test_without_the_libraries_the_message_says_what_to_install(
     assert not (known.folder / "none.png").exists()
 
 
+@pytest.mark.long
 def test_mistakes(known: Known, tmp_path: Path) -> None:
     native, job = str(known.folder / "native.mcap"), str(known.folder / "job.yaml")
     simulated = known.fit(str(known.simulated), job)

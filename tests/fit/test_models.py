@@ -12,11 +12,12 @@ from rsltrace.chance.stream import Stream
 from rsltrace.fit.comparison import compared
 from rsltrace.fit.measured import clock_steps
 from rsltrace.fit.models import ks_distance, model_of, table_of
+from tests.tiers import cases
 
 MS = 1_000_000
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=cases(10, 40), deadline=None)
 @given(st.lists(st.integers(0, 10**10), min_size=2, max_size=300))
 def test_a_table_is_near_every_value_that_was_measured(durations: list[int]) -> None:
     ordered = np.sort(np.array(durations, dtype=np.int64))

@@ -83,6 +83,7 @@ def order(path: Path) -> list[tuple[str, str]]:
         return [(trace.node_of(entity).name, entity.name) for entity in entities]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("delays", [DELAYS, ""], ids=["as late", "without delays"])
 def test_the_order_of_a_run_that_could_be_simulated_is_followed(folder: Path, delays: str) -> None:
     """Also where messages are there too early: they are held back until their turn."""
@@ -107,6 +108,7 @@ def test_the_order_of_a_run_that_could_be_simulated_is_followed(folder: Path, de
     assert order(folder / "plain.mcap") != truth
 
 
+@pytest.mark.long
 def test_it_is_the_same_every_time(folder: Path) -> None:
     text = "delay: {default: 20ms}\npolicy: {recorded: native.mcap}\n"
     assert run(folder, "one", text).digest == run(folder, "two", text).digest

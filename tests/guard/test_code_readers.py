@@ -31,6 +31,7 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
             yield from _codes(part)
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("path", _SAMPLES, ids=lambda path: path.stem)
 def test_every_function_has_its_original(path: Path) -> None:
     source = path.read_bytes()
@@ -60,6 +61,7 @@ self.say(__import__("inspect").getsource(N)[:7])
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("library", "more"), [("dill", ", recurse=True"), ("cloudpickle", "")], ids=["dill", "cloud"]
 )

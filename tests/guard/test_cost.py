@@ -49,6 +49,7 @@ print(json.dumps(found))
 """
 
 
+@pytest.mark.long
 def test_a_callback_that_does_nothing_nasty_costs_nothing(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
     jobs = []

@@ -45,6 +45,7 @@ def recorded(tmp_path: Path) -> Callable[..., Any]:
     return go
 
 
+@pytest.mark.long
 def test_a_finding_says_where_what_and_what_it_gave(
     recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -64,6 +65,7 @@ def test_a_finding_says_where_what_and_what_it_gave(
     assert b"s3cret" not in result.path.read_bytes()
 
 
+@pytest.mark.long
 def test_findings_change_no_digest(
     recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -76,6 +78,7 @@ def test_findings_change_no_digest(
         assert "/rsltrace/findings" not in {c.topic for c in trace.channels.values()}
 
 
+@pytest.mark.long
 def test_an_error_ends_the_run_and_says_what_to_do(recorded: Callable[..., Any]) -> None:
     result = recorded(READS, "{environment: error}")
     assert isinstance(result.error, GuardError)
@@ -86,6 +89,7 @@ def test_an_error_ends_the_run_and_says_what_to_do(recorded: Callable[..., Any])
         assert [f.mode for f in trace.findings[0]] == [Mode.ERROR]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("call", ["time.time()", "random.random()", "random.Random()"])
 def test_what_could_be_virtual_may_be_an_error_too(recorded: Callable[..., Any], call: str) -> None:
     @given(none())
@@ -98,11 +102,13 @@ def test_what_could_be_virtual_may_be_an_error_too(recorded: Callable[..., Any],
     assert TICK in str(result.error)
 
 
+@pytest.mark.long
 def test_modules_on_the_list_are_allowed(recorded: Callable[..., Any]) -> None:
     assert not recorded(READS, "{environment: {mode: error, allow: [m]}}").error
     assert recorded(READS, "{environment: {mode: error, allow: [m.*, other]}}").error
 
 
+@pytest.mark.long
 def test_imports_are_watched_and_libraries_are_not(recorded: Callable[..., Any]) -> None:
     code = node_code(
         "logging.getLogger('x').debug('y'); copy.deepcopy({1: [2]}); json.dumps({1: 2})",
@@ -117,6 +123,7 @@ def test_imports_are_watched_and_libraries_are_not(recorded: Callable[..., Any])
         }
 
 
+@pytest.mark.long
 def test_a_million_calls_in_an_event_are_not_a_million_records(
     recorded: Callable[..., Any],
 ) -> None:
@@ -126,6 +133,7 @@ def test_a_million_calls_in_an_event_are_not_a_million_records(
     assert [met.count for met in result.guarded] == [6000]
 
 
+@pytest.mark.long
 def test_what_a_main_has_read_is_the_likely_cause(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -151,6 +159,7 @@ def test_what_a_main_has_read_is_the_likely_cause(
     assert "not deterministic" not in found.divergences[0].root_sentence
 
 
+@pytest.mark.long
 def test_info_cat_and_diff_tell(
     recorded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -228,6 +237,7 @@ def test_mistakes_in_guard_point_at_their_line(
     assert message in str(raised.value)
 
 
+@pytest.mark.long
 def test_the_c_library_through_cffi_is_a_finding(recorded: Callable[..., Any]) -> None:
     pytest.importorskip("cffi")
     tick = (

@@ -50,6 +50,7 @@ def install(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.syspath_prepend(str(folder))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "place", ["install/helper_a/lib/python3.12/site-packages", "venv/dist-packages", "src/beside"]
 )
@@ -64,6 +65,7 @@ def test_objects_of_an_installed_package_are_in_order(
     assert "__pycache__" not in {path.name for path in (tmp_path / place / name).iterdir()}
 
 
+@pytest.mark.long
 def test_what_cannot_be_put_in_order_is_found_at_its_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -130,6 +132,7 @@ def method_of(name: str) -> Callable[[], str]:
     return lambda: name
 
 
+@pytest.mark.long
 def test_numbers_are_kept_for_as_long_as_an_object_lives() -> None:
     class Thing:
         def __init__(self, name: str, other: object = None) -> None:
@@ -201,6 +204,7 @@ def test_order():
 """
 
 
+@pytest.mark.long
 def test_modules_that_pytest_compiles(
     tmp_path: Path, capfd: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

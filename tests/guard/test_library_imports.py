@@ -62,6 +62,7 @@ def _install(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str, code: str
     monkeypatch.syspath_prepend(str(folder / "site-packages"))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("join", ["pass", "warning.join(); assert not warning.is_alive()"])
 @pytest.mark.parametrize("entry", ["node: 'm:N'", "main: 'm:main'"])
 @pytest.mark.parametrize("at_top", [True, False], ids=["top", "inside"])
@@ -106,6 +107,7 @@ def test_a_thread_that_an_import_leaves_running_is_named(
     assert calls == ["threading.Thread.start() while lib_that_goes_on is imported"] * 2
 
 
+@pytest.mark.long
 def test_a_folder_that_pip_installed_into_is_of_libraries(tmp_path: Path) -> None:
     """As ``pip install --target`` makes one, for ``PYTHONPATH``."""
     from rsltrace.trace.reader import Trace

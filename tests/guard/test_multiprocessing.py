@@ -57,6 +57,7 @@ EXPECTED: dict[str, Any] = {
 }
 
 
+@pytest.mark.few(2)
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # fork, where a library has threads
 @pytest.mark.parametrize("what", EXPECTED)
 @pytest.mark.parametrize("place", ["callback", "thread"])

@@ -76,6 +76,7 @@ def test_outside_of_runs_texts_are_pythons_own(said: Callable[..., Any]) -> None
     assert repr(_Before(1)).endswith("_Before(plain=1)")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("code", "guard", "found"),
     [

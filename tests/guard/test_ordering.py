@@ -38,6 +38,7 @@ WAYS = {
 }
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_texts_are_in_order_whatever_the_hash_seed(said: Callable[..., Any], way: str) -> None:
     code = node_code(

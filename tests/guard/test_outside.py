@@ -39,6 +39,7 @@ def go(tmp_path: Path) -> Callable[..., Any]:
     return record
 
 
+@pytest.mark.long
 def test_real_clocks_and_real_chance_are_given_again(go: Callable[..., Any]) -> None:
     code = node_code(
         "self.say(time.time(), time.monotonic_ns(), str(datetime.now()), time.strftime('%c'),\n"
@@ -57,6 +58,7 @@ def test_real_clocks_and_real_chance_are_given_again(go: Callable[..., Any]) -> 
     assert go(code, guard, "once more", replay=again.path).digest == first.digest
 
 
+@pytest.mark.long
 def test_each_real_clock_is_itself_when_it_is_recorded(go: Callable[..., Any]) -> None:
     code = node_code(
         "near = lambda a, b: abs(a - b) < 100\n"
@@ -71,6 +73,7 @@ def test_each_real_clock_is_itself_when_it_is_recorded(go: Callable[..., Any]) -
     assert go(code, "{clock: record}", "again", replay=first.path).digest == first.digest
 
 
+@pytest.mark.long
 def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
     code = node_code(
         "start = time.perf_counter()\nsum(range(1000))\nself.say(time.perf_counter() - start)",
@@ -82,6 +85,7 @@ def test_a_measured_duration_is_given_again(go: Callable[..., Any]) -> None:
         assert {f.mode for found in trace.findings.values() for f in found} == {Mode.RECORD}
 
 
+@pytest.mark.long
 def test_who_reads_code_asks_nothing_of_the_file_system(
     go: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -156,6 +160,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[http.server.HTTPServer]:
         thread.join()
 
 
+@pytest.mark.long
 def test_an_http_answer_is_given_again_without_the_server(
     go: Callable[..., Any], server: http.server.HTTPServer
 ) -> None:
@@ -175,6 +180,7 @@ def test_an_http_answer_is_given_again_without_the_server(
     assert go(code, "{socket: record}", "other").digest != first.digest
 
 
+@pytest.mark.long
 def test_a_refused_connection_is_given_again(go: Callable[..., Any]) -> None:
     code = node_code(
         "try: socket.create_connection(('127.0.0.1', 1), timeout=200)\n"
@@ -187,6 +193,7 @@ def test_a_refused_connection_is_given_again(go: Callable[..., Any]) -> None:
     assert again.digest == first.digest
 
 
+@pytest.mark.long
 def test_a_run_that_asks_for_more_is_told_so(go: Callable[..., Any]) -> None:
     code = node_code("self.say(time.time())", imports="import time")
     first = go(code, "{clock: record}", "first")
@@ -196,6 +203,7 @@ def test_a_run_that_asks_for_more_is_told_so(go: Callable[..., Any]) -> None:
     assert "has no further answer to time.time() of /n" in str(again.error)
 
 
+@pytest.mark.long
 def test_a_replay_needs_a_trace_and_a_guard(go: Callable[..., Any], tmp_path: Path) -> None:
     code = node_code("pass")
     (tmp_path / "no.mcap").write_text("no")
@@ -285,6 +293,7 @@ def tick(node):
 """
 
 
+@pytest.mark.long
 def test_a_thread_that_waits_for_a_process_lets_time_pass(
     go: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -309,6 +318,7 @@ def test_a_thread_that_waits_for_a_process_lets_time_pass(
     assert said[3][1] == pytest.approx(0.1, abs=1e-4)
 
 
+@pytest.mark.long
 def test_an_asyncio_loop_waits_for_a_process_that_is_not_recorded(go: Callable[..., Any]) -> None:
     code = node_code(
         f"{ONCE}self.say(looped())", imports="import asyncio, subprocess", module=IN_ASYNCIO
@@ -342,6 +352,7 @@ def main():
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("mode", ["warn", "record"])
 def test_a_program_that_ends_soon_takes_no_simulated_time(
     go: Callable[..., Any], tmp_path: Path, mode: str

@@ -113,6 +113,7 @@ async def streaming():
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("client", BY_HTTPS)
 @pytest.mark.parametrize("place", ["callback", "thread"])
 def test_an_answer_over_tls_is_given_again_without_the_server(
@@ -221,6 +222,7 @@ answers.append(socket.create_connection(ADDRESS).getsockname())
 }
 
 
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 @pytest.mark.parametrize("way", BY_SOCKET)
 @pytest.mark.parametrize("place", ["callback", "thread"])
@@ -344,6 +346,7 @@ answers = asyncio.run(lines())
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 @pytest.mark.parametrize("way", BY_DEVICE)
 @pytest.mark.parametrize("place", ["callback", "thread"])

@@ -8,7 +8,6 @@ import copy
 import dataclasses
 import enum
 import math
-import os
 import random
 import threading
 from collections.abc import Callable
@@ -21,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rsltrace.guard.state.hashing import StateHasher
+from tests.tiers import cases
 
 GOLDEN = {
     "plain": "8b37d7770a17ec3c",
@@ -70,6 +70,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.long
 @given(VALUES)
 def test_a_copy_hashes_alike(value: Any) -> None:
     hasher = StateHasher()
@@ -278,7 +279,7 @@ def test_an_object_may_say_itself_what_its_state_is() -> None:
 
 # -- in runs --------------------------------------------------------------------------------------
 
-PLANTINGS = 5 * int(os.environ.get("RSLTRACE_PLANTED", "4"))
+PLANTINGS = cases(20, 200)
 
 PLANTED: dict[str, Any] = {"at": -1, "change": lambda node: None}
 
@@ -348,6 +349,7 @@ def recorded(path: Path, node: Any, state: object, at: int, change: Callable[[An
     return path
 
 
+@pytest.mark.long
 @pytest.mark.ros
 @pytest.mark.repeated
 def test_the_first_diverging_event_is_the_planted_one(tmp_path: Path) -> None:
@@ -365,6 +367,7 @@ def test_the_first_diverging_event_is_the_planted_one(tmp_path: Path) -> None:
         assert "left its node in another state" in found.sentence
 
 
+@pytest.mark.few(1)
 @pytest.mark.ros
 @pytest.mark.parametrize(("path", "change"), CHANGES)
 def test_recorded_states_name_the_attribute(

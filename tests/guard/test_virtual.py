@@ -54,6 +54,7 @@ def with_default(clock: Callable[[], float] = time.monotonic) -> float:
     return clock()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "expression",
     [
@@ -93,6 +94,7 @@ def test_every_clock_shows_simulated_time(said: Said, expression: str) -> None:
     assert said(code) == [[0.5], [1.0]]
 
 
+@pytest.mark.long
 def test_broken_down_times_and_texts(said: Said) -> None:
     code = node_code(
         "self.say(time.gmtime()[:6], time.gmtime(None)[:6], time.gmtime(86400)[:3],\n"
@@ -127,6 +129,7 @@ def drawing() -> str:
     )
 
 
+@pytest.mark.long
 def test_chance_is_the_same_in_every_run_and_different_for_every_seed(said: Said) -> None:
     first = said(drawing())
     random.random()
@@ -140,6 +143,7 @@ def test_chance_is_the_same_in_every_run_and_different_for_every_seed(said: Said
             assert value != value_other
 
 
+@pytest.mark.long
 def test_one_more_node_does_not_disturb_the_others(said: Said) -> None:
     alone = said(drawing())
     extra = "nodes: [{node: 'm:N', name: first}, {node: 'm:N'}, {node: 'm:N', name: last}]"
@@ -148,6 +152,7 @@ def test_one_more_node_does_not_disturb_the_others(said: Said) -> None:
     assert together[0] != alone[0] != together[2]
 
 
+@pytest.mark.long
 def test_a_seed_of_the_nodes_own_is_its_own(said: Said) -> None:
     code = node_code(
         "self.say(random.random(), np.random.rand(), random.getstate()[1][0] > 0)",
@@ -159,6 +164,7 @@ def test_a_seed_of_the_nodes_own_is_its_own(said: Said) -> None:
     assert said(code, job="nodes: [{node: 'm:N', name: a}, {node: 'm:N'}]")[:2] == [expected] * 2
 
 
+@pytest.mark.long
 def test_busy_waiting_takes_simulated_time_and_ends(said: Said) -> None:
     code = node_code(
         "start = time.monotonic()\nwhile time.monotonic() - start < 0.02: pass\n"
@@ -168,6 +174,7 @@ def test_busy_waiting_takes_simulated_time_and_ends(said: Said) -> None:
     assert said(code) == [[True], [True]]
 
 
+@pytest.mark.long
 def test_directories_are_listed_in_the_order_of_names(said: Said, tmp_path: Path) -> None:
     folder = tmp_path / "many"
     folder.mkdir()
@@ -193,6 +200,7 @@ def test_guard_false_leaves_everything_alone(said: Said) -> None:
     assert first != second
 
 
+@pytest.mark.long
 def test_one_node_may_be_allowed_what_others_are_not(said: Said) -> None:
     code = node_code("self.say(time.time() > 1e9)", imports="import time")
     job = "nodes: [{node: 'm:N'}, {node: 'm:N', name: b, guard: {clock: allow}}]"
@@ -201,6 +209,7 @@ def test_one_node_may_be_allowed_what_others_are_not(said: Said) -> None:
     assert said(code, job=by_module)[0] == [True]
 
 
+@pytest.mark.long
 def test_a_main_may_be_allowed_what_others_are_not(said: Said) -> None:
     """Before it has made its node, in its callbacks and in its threads."""
     code = node_code(
@@ -220,6 +229,7 @@ def test_a_main_may_be_allowed_what_others_are_not(said: Said) -> None:
     assert found.count(["callback", True]) == found.count(["callback", False]) == 2
 
 
+@pytest.mark.long
 def test_nothing_is_left_after_a_run(said: Said) -> None:
     def state() -> list[object]:
         state = np.random.get_state()
@@ -266,6 +276,7 @@ def test_libraries_work_under_the_guard(said: Said) -> None:
     assert first[0][0] == "1970-01-01 00:00:00.500000"
 
 
+@pytest.mark.long
 def test_the_generator_that_libraries_take_from_random_is_the_nodes_too(said: Said) -> None:
     """As networkx does: ``random._inst`` where no seed is given."""
     code = node_code(
@@ -289,6 +300,7 @@ def test_opencv_counts_simulated_time(said: Said) -> None:
     assert said(code) == [[0.5], [1.0]]
 
 
+@pytest.mark.long
 def test_two_simulations_in_one_process_do_not_disturb_each_other(tmp_path: Path) -> None:
     import rsltrace
 
@@ -350,6 +362,7 @@ def _look(guard: Guard, frame: FrameType) -> int:
     return guard.clock_ns("a clock", USER, frame.f_globals)
 
 
+@pytest.mark.long
 @given(
     steps=st.lists(
         st.tuples(st.sampled_from("/a /b".split()), st.integers(0, 5_000) | st.just(10**9)),
@@ -376,6 +389,7 @@ def test_no_clock_shows_the_same_twice(steps: list[tuple[str, int]]) -> None:
     assert sorted(set(alone)) == alone
 
 
+@pytest.mark.long
 def test_a_clock_that_is_looked_at_for_ever_makes_time_pass(said: Callable[..., list[Any]]) -> None:
     """And what divides by a duration that took no simulated time works."""
     code = node_code(
@@ -450,6 +464,7 @@ self.say(
 """
 
 
+@pytest.mark.long
 def test_every_machine_has_as_many_processors(said: Said) -> None:
     before = os.sched_getaffinity(0)
     imports = "import multiprocessing, os\nfrom concurrent.futures import ThreadPoolExecutor"
@@ -463,6 +478,7 @@ def test_every_machine_has_as_many_processors(said: Said) -> None:
     assert said(real, job=job)[0] == [os.cpu_count(), len(before)]
 
 
+@pytest.mark.long
 def test_a_clock_that_is_given_something_refuses_it_as_ever(said: Said) -> None:
     code = node_code(
         "for call in (time.time, time.monotonic_ns, random.random):\n"

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from rsltrace.errors import JobError
 from rsltrace.job import Job, load_job
+from tests.tiers import cases
 
 GOOD = (Path(__file__).parent / "golden" / "good.yaml").read_text("utf-8")
 PIECES = [
@@ -71,7 +72,7 @@ edits = st.lists(
 
 
 @given(edits)
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=cases(25, 150), deadline=None, suppress_health_check=[HealthCheck.too_slow])
 def test_any_change_of_a_job(changes: list[tuple[int, int, str]]) -> None:
     text = GOOD
     for at, drop, new in changes:
@@ -87,6 +88,7 @@ paths = st.lists(keys | st.text(max_size=4), max_size=5).map(".".join)
 values = st.sampled_from(["", "1", "[", "{a: 1}", "null", "$(var x)", "~", "a: b", "!t x", "\n"])
 
 
+@pytest.mark.long
 @given(paths, st.sampled_from(["=", "", "==", ".="]), values | st.text(max_size=6))
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @example("", "=", "")

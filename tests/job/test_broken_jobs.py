@@ -233,6 +233,7 @@ def keys_of_good() -> list[tuple[int, str]]:
     return found
 
 
+@pytest.mark.few(30)
 @pytest.mark.parametrize(("line", "key"), keys_of_good())
 def test_a_typing_error_in_any_key_is_told_with_the_key_that_was_meant(line: int, key: str) -> None:
     for wrong in (key[:-1], key[0] + key, key[:1] + key[2] + key[1] + key[3:]):

@@ -17,6 +17,7 @@ from rsltrace.job import BagSpec, Job, NodeSpec, QosSpec, RecordSpec, StopSpec, 
 from rsltrace.job.documents.schema import job_schema
 from rsltrace.job.parts.clocks import ClockSpec, JumpSpec
 from rsltrace.job.parts.distribution import SamplesSpec, SeriesSpec
+from tests.tiers import cases
 
 SCHEMA = jsonschema.Draft202012Validator(job_schema())
 
@@ -168,7 +169,7 @@ jobs = st.fixed_dictionaries(
 
 
 @given(jobs)
-@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=40)
+@settings(suppress_health_check=[HealthCheck.too_slow], deadline=None, max_examples=cases(10, 40))
 @example({"nodes": [NodeSpec(node="m:N", arguments={"a": {"\x85": "\u2028 \ufeff\n"}})]})
 @example({"nodes": [NodeSpec(node="m:N", parameters={"a": "$(x) \\$(y) $($(", "b": ["$(z)"]})]})
 def test_a_job_written_as_yaml_loads_as_itself(fields: dict[str, Any]) -> None:

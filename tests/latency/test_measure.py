@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 import random
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -33,9 +32,10 @@ from rsltrace.trace.format import (
     TIMING,
     TOPIC_TIMINGS,
 )
+from tests.tiers import cases
 
 NODES, TOPICS = 3, 4
-RUNS = int(os.environ.get("RSLTRACE_RUNS", "15"))
+RUNS = cases(15, 100)
 
 
 @dataclass

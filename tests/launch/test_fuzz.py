@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from rsltrace.errors import JobError
 from rsltrace.launch.reader import read_launch_file
 from rsltrace.launch.specs import node_specs
+from tests.tiers import cases
 
 FILES = Path(__file__).parent / "files"
 PIECES = ["<", ">", "'", '"', "$(", ")", "\n", "- ", ": ", "{", "}", "[", "]", "&", "\0", "\\", "é",
@@ -30,7 +31,7 @@ def mistake_in(path: Path) -> str | None:
 
 
 @settings(
-    max_examples=250,
+    max_examples=cases(40, 250),
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
@@ -59,7 +60,7 @@ def test_broken_files(
 
 @given(st.binary(max_size=60))
 @settings(
-    max_examples=100,
+    max_examples=cases(15, 100),
     derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

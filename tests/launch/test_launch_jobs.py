@@ -75,6 +75,7 @@ def topics(path: Path) -> dict[str, int]:
     return {name: timers for name in names if name in ("/chat", "/chatter", "/other")}
 
 
+@pytest.mark.long
 def test_record_a_launch_file(rsltrace: Command) -> None:
     refused = rsltrace("record", "--launch", "demo.launch.xml", "--until", "2")
     assert refused.returncode == 2
@@ -103,6 +104,7 @@ def test_record_a_launch_file(rsltrace: Command) -> None:
     assert unknown.stderr.startswith(f"rsltrace: error: {deeper}: unknown launch argument 'wrd'")
 
 
+@pytest.mark.long
 def test_print_job_gives_a_job_that_does_the_same(rsltrace: Command, folder: Path) -> None:
     launch = ("--launch", "demo.launch.xml", "--skip-unsupported", "--until", "2")
     first = rsltrace("record", *launch)
@@ -194,6 +196,7 @@ def _write(path: Path, text: str) -> Path:
 # -- --ros-args ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_ros_arguments_have_the_last_word(rsltrace: Command, folder: Path) -> None:
     (folder / "sub").mkdir()
     (folder / "sub" / "p.yaml").write_text("talker: {ros__parameters: {word: filed, rate: 8.0}}\n")
@@ -283,6 +286,7 @@ EXECUTABLES = """<launch>
 """
 
 
+@pytest.mark.long
 def test_installed_executables_run_with_what_the_launch_file_gives_them(
     rsltrace: Command, prefix: Path, folder: Path
 ) -> None:

@@ -92,6 +92,7 @@ BODY = len(HEAD.splitlines()) + 1
 """The line that a body begins in."""
 
 
+@pytest.mark.long
 def test_everything(write: Callable[..., Path], prefix: Path) -> None:
     write(SUB, "sub.launch.xml")
     path = write((FILES / "everything.launch.py").read_text(), "a.launch.py")
@@ -140,6 +141,7 @@ def test_everything(write: Callable[..., Path], prefix: Path) -> None:
     ]
 
 
+@pytest.mark.few(30)
 @pytest.mark.parametrize(
     ("written", "value"),
     [
@@ -289,6 +291,7 @@ def test_mistakes_name_file_and_line(read: Any, body: str, message: str) -> None
     assert where == ("a.launch.py" if whole_file else f"a.launch.py:{BODY}")
 
 
+@pytest.mark.long
 def test_the_process_that_reads_is_another(
     write: Any, prefix: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -306,6 +309,7 @@ return LaunchDescription([])
     assert (Path.cwd(), os.environ.get("RSLTRACE_T")) == (tmp_path, None)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("body", "message"),
     [
@@ -460,6 +464,7 @@ def test_a_run_of_a_python_launch_file(
     assert not Path("ran").exists()
 
 
+@pytest.mark.long
 def test_the_command_line_is_that_of_ros2_launch(
     write: Any, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -15,6 +15,7 @@ from rsltrace.loop.policy import Candidate
 from rsltrace.loop.stop import Progress, Stop, stop_after_events, stop_at
 from rsltrace.loop.timer import TimerState
 from rsltrace.loop.timer_queue import CreationOrderQueue
+from tests.tiers import cases
 
 
 class Item:
@@ -195,7 +196,7 @@ def worlds(draw: st.DrawFn) -> tuple[list[tuple[int, list[int]]], list[tuple[int
     return timers, outside
 
 
-@settings(max_examples=200)
+@settings(max_examples=cases(30, 200))
 @given(worlds())
 def test_the_loop_runs_what_the_specification_says(
     world: tuple[list[tuple[int, list[int]]], list[tuple[int, int]]],

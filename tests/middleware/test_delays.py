@@ -111,6 +111,7 @@ def test_each_delay_is_in_the_trace_and_is_the_one_that_happened(run: Run) -> No
     assert checked >= 8
 
 
+@pytest.mark.long
 def test_the_seed_decides_and_another_topic_changes_nothing(run: Run) -> None:
     delay = {"default": {"normal": {"mean": "30ms", "sd": "10ms"}}}
     run(Talker, Listener, delay=delay)
@@ -177,6 +178,7 @@ def test_a_copy_of_what_an_outage_pushed_out_does_not_arrive_either(run: Run) ->
     assert [number for number, _ in run.heard] == [1, 1, 2, 2, 5, 5, 6, 6, 7, 7]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "model",
     [
@@ -196,6 +198,7 @@ def test_the_longest_tail_is_a_delay_and_nothing_else(run: Run, model: dict[str,
     assert len(said) == 30
 
 
+@pytest.mark.long
 def test_an_outage_of_a_node_cuts_topics_and_holds_what_is_reliable(run: Run) -> None:
     delay = {"outages": [{"node": "/talker", "from": "0.25s", "to": "0.65s"}]}
     run(lambda: Talker(2), Listener, delay=delay, start="100s", duration=0.85)
@@ -264,6 +267,7 @@ def test_services_take_their_time_both_ways(run: Run) -> None:
     assert answers[1:] == [("320", 340)]
 
 
+@pytest.mark.long
 def test_messages_under_way_survive_their_publisher_but_not_their_subscription(run: Run) -> None:
     class Leaver(Talker):
         def tick(self) -> None:
@@ -287,6 +291,7 @@ def test_messages_under_way_survive_their_publisher_but_not_their_subscription(r
     assert run.heard == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("loss", [0.0, 1e-9])  # a link that may lose messages has more to do
 def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
     run: Run, simulate: Callable[..., Any], tmp_path: Any, loss: float
@@ -309,6 +314,7 @@ def test_what_arrives_at_one_instant_arrives_in_the_order_of_sending(
     assert ears[0].heard == [(1, 200), (2, 200)]
 
 
+@pytest.mark.long
 def test_what_chance_decided_is_said_in_words(run: Run) -> None:
     from rsltrace.words.events import EventWords
 

@@ -18,6 +18,7 @@ from rsltrace.middleware.domain import Domain
 from rsltrace.middleware.faults import MessageFault, TopicFaults
 from rsltrace.middleware.interface import MessageType
 from rsltrace.middleware.links import Network
+from tests.tiers import cases
 
 INT = MessageType("std_msgs/msg/Int32")
 PERIOD, MESSAGES = 100, 6
@@ -66,7 +67,7 @@ def arrivals(faults: list[Any], delay: int | None) -> list[tuple[int, int]]:
     return found
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(10, 40))
 @given(
     st.lists(one_fault, max_size=5, unique_by=lambda fault: fault[1]),
     st.sampled_from([None, 0, 30, 130]),

@@ -151,6 +151,7 @@ def test_it_talks_with_rclpy_nodes_and_the_digest_is_the_same_each_time(
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_rclpy_nodes_see_it_in_the_graph(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
@@ -169,6 +170,7 @@ def test_rclpy_nodes_see_it_in_the_graph(tmp_path: Path) -> None:
     }
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_its_callbacks_are_traced_like_any_others(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
@@ -195,6 +197,7 @@ def test_its_callbacks_are_traced_like_any_others(tmp_path: Path) -> None:
         assert sent == [2 * count for count in range(1, 11)]
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_what_it_raises_ends_the_run_and_is_in_the_trace(tmp_path: Path) -> None:
     pytest.importorskip("rclpy")
@@ -244,6 +247,7 @@ print(sorted({"rclpy", "greenlet", "rosidl_parser"} & set(sys.modules)))
 """
 
 
+@pytest.mark.long
 def test_without_rclpy_it_lives_in_a_domain_of_its_own() -> None:
     done = subprocess.run(
         [sys.executable, "-c", ALONE], capture_output=True, text=True, timeout=120, check=False

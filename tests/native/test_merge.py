@@ -20,6 +20,7 @@ from rsltrace.native.apart.merge import Merge
 from rsltrace.native.apart.wire import SpanReader, SpanWriter
 from rsltrace.native.ledger import Failed, Ledger, Logged, Scheduled, Sent, Span, Taken, now_ns
 from rsltrace.native.things import Things
+from tests.tiers import cases
 
 TIMER, TASK = int(EventKind.TIMER), int(EventKind.TASK)
 
@@ -28,7 +29,7 @@ def span(start_ns: int) -> Span:
     return Span(TIMER, None, start_ns, 0, 1, None, end_ns=start_ns + 1)
 
 
-@settings(max_examples=40)
+@settings(max_examples=cases(10, 40))
 @given(st.lists(st.lists(st.integers(0, 200)), min_size=1, max_size=5), st.randoms())
 def test_all_is_in_order_and_nothing_is_lost(
     starts: list[list[int]], chance: random.Random

@@ -119,6 +119,7 @@ def _logs(path: Path) -> list[tuple[int, str]]:
         return [(stamp, record.msg) for stamp, record in decoded]  # type: ignore[attr-defined]
 
 
+@pytest.mark.long
 def test_callbacks_of_a_process_take_the_time_that_the_job_gives_them(
     counter: Path, tmp_path: Path
 ) -> None:
@@ -154,6 +155,7 @@ def test_a_c_program_and_a_node_of_this_process_are_in_one_run_and_each_run_is_t
         assert events[first.cause_event].kind is EventKind.SUBSCRIPTION  # echo's own callback
 
 
+@pytest.mark.long
 def test_an_isolated_script_says_what_it_says_in_this_process(
     counter: Path, tmp_path: Path
 ) -> None:

@@ -1,6 +1,6 @@
 """Nodes on rcl's C API, again and again on a busy machine: one digest.
 
-``RSLTRACE_RUNS`` sets how many runs there are in all: 100 with ``make test-long``.
+A hundred runs in all with ``--many-cases``, as in ``make test-all``.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from rsltrace.doors.processes import child
 from rsltrace.job import load_job
 from rsltrace.run.recording import run
 from rsltrace.trace.reader import Trace
+from tests.tiers import cases
 
 pytestmark = [pytest.mark.ros, pytest.mark.long]
 
-RUNS = int(os.environ.get("RSLTRACE_RUNS", "6"))
+RUNS = cases(6, 100)
 WAYS = 6
 HOGS = 3
 PROGRAMS = """

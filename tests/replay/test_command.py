@@ -47,6 +47,7 @@ def test_what_is_said(command: Callable[..., Any]) -> None:
         )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("until", "verified", "stamp"),
     [("0", 1, "0.000000000"), ("12", 13, "0.400000000"), ("0.4", 15, "0.4"), ("400ms", 15, "0.4")],
@@ -72,6 +73,7 @@ def test_positions_that_are_none(command: Callable[..., Any]) -> None:
     assert command("--until", "1000000").stdout.startswith("verified all ")
 
 
+@pytest.mark.long
 def test_log_records_begin_where_they_are_wanted(command: Callable[..., Any]) -> None:
     everything, late = command(), command("--from", "2.5")
     told = [line for line in late.stderr.splitlines() if "too fast" in line]
@@ -104,6 +106,7 @@ def test_a_divergence_is_told_as_by_diff(command: Callable[..., Any], tmp_path: 
     assert Path("other.mcap").exists()
 
 
+@pytest.mark.long
 def test_trouble_is_2(command: Callable[..., Any], tmp_path: Path) -> None:
     import subprocess
     import sys

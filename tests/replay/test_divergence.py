@@ -37,6 +37,7 @@ def test_there_is_something_to_change() -> None:
     assert len(MUTATIONS) >= 12
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("what", MUTATIONS)
 def test_a_changed_constant_is_found_where_diff_finds_it(
     recorded: Callable[..., Path], tmp_path: Path, what: str

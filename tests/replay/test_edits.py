@@ -114,6 +114,7 @@ def test_a_message_as_one_receives_it_or_as_it_is_published(folder: Path) -> Non
     assert values(folder / "branch.mcap", "/speed") == [*before[:10], -1.0, *before[11:]]
 
 
+@pytest.mark.long
 def test_attributes_and_parameters(folder: Path) -> None:
     result = branch(folder, '1.05s: node("/source").gain = 0')
     assert values(folder / "branch.mcap", "/speed")[9:12] == [20.25, 0.25, 0.25]
@@ -147,6 +148,7 @@ def test_what_is_dropped_and_what_comes_later(folder: Path) -> None:
     assert later.diff.verdict.value == "timing"
 
 
+@pytest.mark.long
 def test_the_order_of_two_that_are_ready(folder: Path) -> None:
     """At 0.5 s Source.tick and Pair.ask are due, in this order."""
     tick = events(folder / "run.mcap", EventKind.TIMER, "Source.tick")[4]
@@ -163,6 +165,7 @@ def test_the_order_of_two_that_are_ready(folder: Path) -> None:
     assert ask > tick
 
 
+@pytest.mark.long
 def test_a_coroutine_gets_another_message_or_none(folder: Path) -> None:
     with Trace.open(folder / "run.mcap") as trace:
         pair = next(one for one in trace.entities.values() if one.name == "/pair").id
@@ -180,6 +183,7 @@ def test_a_coroutine_gets_another_message_or_none(folder: Path) -> None:
     branch(folder, f"{at}: drop()")
 
 
+@pytest.mark.long
 def test_a_branch_of_a_branch(folder: Path) -> None:
     branch(folder, '1s: node("/source").gain = 5.0')
     (folder / "branch.mcap").rename(folder / "first.mcap")
@@ -192,6 +196,7 @@ def test_a_branch_of_a_branch(folder: Path) -> None:
     assert second == [*first[:20], *first[21:]]
 
 
+@pytest.mark.long
 def test_messages_of_a_bag(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "nodes_of_replay.py").write_text(NODES)
     export_bag(folder / "run.mcap", tmp_path / "bag")
@@ -210,6 +215,7 @@ def test_messages_of_a_bag(folder: Path, tmp_path: Path) -> None:
     assert values(tmp_path / "branch.mcap", "/speed") == [*speed[:4], *speed[5:]]
 
 
+@pytest.mark.long
 def test_edits_that_change_nothing(folder: Path) -> None:
     result = branch(folder, '1s: node("/pair").said = [1]')
     assert result.exit_code == 0
@@ -217,6 +223,7 @@ def test_edits_that_change_nothing(folder: Path) -> None:
     assert "change nothing" in result.sentence
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("edit", "said"),
     [
@@ -248,6 +255,7 @@ def test_what_cannot_be_edited_leaves_no_branch(folder: Path, edit: str, said: s
     assert [path for path in folder.iterdir() if "never" in path.name] == []
 
 
+@pytest.mark.long
 def test_what_cannot_be_edited_leaves_what_is_there(folder: Path) -> None:
     output = folder / "kept.mcap"
     recorded = (folder / "run.mcap").read_bytes()
@@ -293,6 +301,7 @@ def test_texts_that_are_no_edits(text: str, said: str, column: int | None) -> No
         assert caret.index("^") - 2 == column
 
 
+@pytest.mark.long
 def test_the_command_and_what_others_say_of_a_branch(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -334,6 +343,7 @@ def mixed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.repeated
 @settings(
     max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]

@@ -90,6 +90,7 @@ CASES = {
 USUAL = ("a goal", "a result", "no feedback")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "case", [one if one in USUAL else pytest.param(one, marks=pytest.mark.long) for one in CASES]
 )

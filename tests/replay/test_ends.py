@@ -51,6 +51,7 @@ def interrupted(job: Path, path: Path, stop: Stop) -> Any:
     return run(load_job(job), path, observer=Observer(interrupt=ends.append, progress=end))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [Stop("interrupted", 130), Stop("terminated", 143)])
 def test_an_interrupted_run(tmp_path: Path, stop: Stop) -> None:
     """Mains, threads and callbacks that wait are in the middle of something then."""
@@ -73,6 +74,7 @@ def main():
 """
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("job", "code"),
     [
@@ -99,6 +101,7 @@ def test_a_constructor_that_raised(recorded: Callable[..., Path]) -> None:
     assert "raised OSError: no" in str(result.error)
 
 
+@pytest.mark.long
 def test_a_simulation_that_somebody_drove(tmp_path: Path, recorded: Callable[..., Path]) -> None:
     """Where it was only stepped it replays to its end; what was done from outside cannot."""
     from std_msgs.msg import Float64

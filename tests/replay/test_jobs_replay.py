@@ -50,6 +50,7 @@ EXAMPLES = [
 ]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("job", "overrides"), EXAMPLES)
 def test_examples_and_samples(
     job: str, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -88,6 +89,7 @@ FEATURES = {
 }
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("feature", FEATURES)
 def test_mains_threads_and_calls_that_block(feature: str, tmp_path: Path) -> None:
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
@@ -98,6 +100,7 @@ def test_mains_threads_and_calls_that_block(feature: str, tmp_path: Path) -> Non
     replayed(tmp_path / "run.mcap")
 
 
+@pytest.mark.long
 def test_a_recorded_order_is_in_the_trace_itself(tmp_path: Path) -> None:
     """The recording whose order a run followed may be gone: the run's own trace has that order."""
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
@@ -111,6 +114,7 @@ def test_a_recorded_order_is_in_the_trace_itself(tmp_path: Path) -> None:
     assert result.is_whole
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("until", ["5", "20", None])
 def test_what_a_replay_has_not_come_to_is_no_note(
     recorded: Callable[..., Path], until: str | None
@@ -147,6 +151,7 @@ def test_actions_and_lifecycles(tmp_path: Path) -> None:
     replayed(tmp_path / "run.mcap")
 
 
+@pytest.mark.long
 def test_bags(recorded: Callable[..., Path], tmp_path: Path) -> None:
     export_bag(recorded(), tmp_path / "bag", topics=["/speed"])
     bag = recorded("nodes: [{node: nodes_of_replay:Filter}]\nbags: [bag]\n", name="from_bag.mcap")
@@ -158,6 +163,7 @@ def test_bags(recorded: Callable[..., Path], tmp_path: Path) -> None:
         rsltrace.replay(bag, trust=True)
 
 
+@pytest.mark.long
 def test_another_bag_is_seen_at_its_first_message(
     recorded: Callable[..., Path], tmp_path: Path
 ) -> None:

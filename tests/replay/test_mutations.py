@@ -149,6 +149,7 @@ def test_of_mains_threads_and_services(every: int, tmp_path: Path) -> None:
     assert campaign.changed > 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("module", "node", "every"),
     [

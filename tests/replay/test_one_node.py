@@ -81,6 +81,7 @@ def unchanged(
         assert once_more.compared == result.compared
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("job", "overrides"), some(EXAMPLES, SHORT))
 def test_each_node_of_the_examples(
     job: str, overrides: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -93,6 +94,7 @@ def test_each_node_of_the_examples(
     unchanged(tmp_path / "run.mcap", (ROOT / job).parent, without=("/monitor",))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("feature", some(["", *FEATURES], SHORT_FEATURES))
 def test_mains_threads_services_and_blocking_calls(feature: str, tmp_path: Path) -> None:
     (tmp_path / "nodes_under_test.py").write_text(TALKER + MIXED)
@@ -101,6 +103,7 @@ def test_mains_threads_services_and_blocking_calls(feature: str, tmp_path: Path)
     unchanged(tmp_path / "run.mcap", tmp_path, twice=not feature)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(importlib.util.find_spec("test_msgs") is None, reason="needs ROS 2's test_msgs")
 @pytest.mark.parametrize(
     "more", ["", "delay: {default: {uniform: {min: 1ms, max: 30ms}}}\n", "policy: permutation\n"]
@@ -139,6 +142,7 @@ def test_a_changed_node_is_seen_at_its_first_changed_output(
     assert rsltrace.replay(trace, node="filter", trust=True).same
 
 
+@pytest.mark.long
 def test_others_need_not_be_there(recorded: Callable[..., Path], tmp_path: Path) -> None:
     """The code of the other nodes may be gone, or broken: it is not imported."""
     job = """\
@@ -167,6 +171,7 @@ record: {exclude: [/speed]}
     assert rsltrace.replay(trace, node="source", trust=True).same
 
 
+@pytest.mark.long
 def test_wrong_names_and_whole_replays_of_a_part(
     recorded: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -178,6 +183,7 @@ def test_wrong_names_and_whole_replays_of_a_part(
         rsltrace.replay(tmp_path / "alone.mcap", trust=True)
 
 
+@pytest.mark.long
 def test_a_node_that_raises_as_recorded_is_the_same(recorded: Callable[..., Path]) -> None:
     code = """
 class Fragile(Watch):
@@ -198,6 +204,7 @@ stop: {duration: 3s}
     assert rsltrace.replay(trace, node="filter", trust=True).same
 
 
+@pytest.mark.long
 def test_traces_that_were_cut_off(recorded: Callable[..., Path], tmp_path: Path) -> None:
     trace = recorded(overrides=["record.segment_events=16"])
     data = trace.read_bytes()

@@ -45,6 +45,7 @@ def command(*words: str) -> Any:
     return CliRunner().invoke(cli, ["replay", *words])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("source", ["job.yaml", "run.mcap"])
 def test_fed_from_a_bag(robot: Path, source: str) -> None:
     result = rsltrace.replay(source, node="/filter", bag="bag", trust=True)
@@ -58,6 +59,7 @@ def test_fed_from_a_bag(robot: Path, source: str) -> None:
     assert result.first.fields[0].path == "data"
 
 
+@pytest.mark.long
 def test_a_run_with_a_bag_is_a_trace_to_compare_with(robot: Path) -> None:
     """With the recording of a robot that has none of the node's outputs, say."""
     export_bag(robot / "run.mcap", robot / "inputs", topics=["/speed"])
@@ -71,6 +73,7 @@ def test_a_run_with_a_bag_is_a_trace_to_compare_with(robot: Path) -> None:
     assert rsltrace.replay("golden.mcap", node="filter", trust=True).diverged
 
 
+@pytest.mark.long
 def test_messages_are_matched_by_the_stamps_in_their_headers(
     recorded: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -112,6 +115,7 @@ stop: {duration: 2s}
     )
 
 
+@pytest.mark.long
 def test_what_is_wrong_with_a_bag_is_said(robot: Path) -> None:
     export_bag(robot / "run.mcap", robot / "outputs", topics=["/smooth"])
     with pytest.raises(rsltrace.RsltraceError, match=r"subscribes to \(/speed\) is in there, only"):
@@ -145,6 +149,7 @@ def test_the_command(robot: Path) -> None:
     assert command("run.mcap", "--node", "/filter", "--abs", "data=100", "-q").exit_code == 0
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("words", "said"),
     [
@@ -160,6 +165,7 @@ def test_options_that_do_not_go_together(robot: Path, words: list[str], said: st
     assert said in done.stderr
 
 
+@pytest.mark.long
 def test_in_a_test(robot: Path) -> None:
     assert assert_node_unchanged("run.mcap", "/filter").compared > 30
     change(robot, "0.75 * self.state", "0.7 * self.state")
@@ -169,6 +175,7 @@ def test_in_a_test(robot: Path) -> None:
         assert_node_unchanged(Path("job.yaml"), "/filter", bag=Path("bag"))
 
 
+@pytest.mark.long
 def test_the_fixture(robot: Path) -> None:
     (robot / "test_nodes.py").write_text(
         "def test_same(rsltrace_node):\n"

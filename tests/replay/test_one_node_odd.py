@@ -230,6 +230,7 @@ def check(tmp_path: Path, feature: str, stop: str) -> None:
     unchanged(tmp_path / "run.mcap", tmp_path)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("feature", SHORT)
 def test_odd_nodes(feature: str, tmp_path: Path) -> None:
     check(tmp_path, feature, "duration: 400ms")
@@ -241,5 +242,6 @@ def test_odd_nodes_for_longer(feature: str, tmp_path: Path) -> None:
     check(tmp_path, feature, "duration: 3s")
 
 
+@pytest.mark.long
 def test_a_run_that_ends_in_the_middle_of_a_time_step(tmp_path: Path) -> None:
     check(tmp_path, "plain", "events: 333")

@@ -36,6 +36,7 @@ def test_the_job_of_the_present_folder_runs_unasked(here: Path) -> None:
     assert rsltrace.replay(here).is_whole
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("override", ["seed=5", "stop.duration=1s", "delay.default=1ms"])
 def test_a_trace_of_it_with_another_seed_or_end(
     here: Path, recorded: Callable[..., Path], override: str
@@ -48,6 +49,7 @@ def test_a_trace_of_it_with_another_seed_or_end(
         assert rsltrace.replay(here).is_whole
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("override", "key"),
     [
@@ -89,6 +91,7 @@ def write_hostile(path: Path, overrides: tuple[str, ...]) -> None:
         writer.close(result={})
 
 
+@pytest.mark.long
 def test_code_elsewhere(here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A trace, a job file and nodes that agree with each other, in a folder of downloads."""
     marker = tmp_path / "ran"
@@ -126,6 +129,7 @@ def test_looking_at_packages_imports_none(tmp_path: Path, monkeypatch: pytest.Mo
     assert not Path("ran").exists()
 
 
+@pytest.mark.long
 def test_answers_from_outside_may_be_forged(
     here: Path, recorded: Callable[..., Path], tmp_path: Path
 ) -> None:
@@ -160,6 +164,7 @@ def test_a_job_that_is_none(tmp_path: Path, resolved: str, monkeypatch: pytest.M
         rsltrace.replay("run.mcap", trust=True)
 
 
+@pytest.mark.long
 def test_on_a_terminal_one_is_asked(
     here: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -264,6 +264,7 @@ def test_two_runs_have_their_own_roots_and_the_divergence_is_marked(tmp_path: Pa
     assert any(f"#{diverged} " in step for step in chain)
 
 
+@pytest.mark.long
 def test_the_distance_between_two_runs_is_that_of_their_last_values(tmp_path: Path) -> None:
     gallery.write_gallery(tmp_path / "a.mcap", STEPS)
     gallery.write_gallery(tmp_path / "b.mcap", STEPS, differs_from=20)
@@ -275,6 +276,7 @@ def test_the_distance_between_two_runs_is_that_of_their_last_values(tmp_path: Pa
     assert both.static["/run_b/topics/odom/track"]["Points3D:labels"] == ["b"]
 
 
+@pytest.mark.long
 def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
     for name in ("a", "b"):
         gallery.write_gallery(tmp_path / f"{name}.mcap", 3)
@@ -288,6 +290,7 @@ def test_two_equal_runs_are_said_to_be_equal(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.long
 def test_an_interrupted_run_is_shown_as_far_as_it_goes(tmp_path: Path) -> None:
     trace_maker.write_run(tmp_path / "run.mcap", 15_000)
     data = (tmp_path / "run.mcap").read_bytes()
@@ -339,6 +342,7 @@ def test_what_was_there_stays_until_the_recording_is_whole(tmp_path: Path) -> No
     assert len(list(tmp_path.iterdir())) == 3
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("schema", "why"),
     [
@@ -451,6 +455,7 @@ def test_a_link_leads_to_the_recording_that_is_replaced(tmp_path: Path) -> None:
     assert (tmp_path / "real.rrd").stat().st_size == done.bytes > 100
 
 
+@pytest.mark.long
 def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:
     trace_maker.write_run(tmp_path / "run.mcap", 15_000)
     data = bytearray((tmp_path / "run.mcap").read_bytes())
@@ -461,6 +466,7 @@ def test_nothing_is_left_of_an_export_that_fails(tmp_path: Path) -> None:
     assert not (tmp_path / "run.rrd").exists()
 
 
+@pytest.mark.long
 def test_two_exports_of_a_run_hold_the_same(tmp_path: Path) -> None:
     from rsltrace_viewer.rerun_export.picture import fingerprint
 

@@ -18,6 +18,8 @@ pytest.importorskip("rerun")
 
 from rsltrace_viewer.rerun_export.moments import Moments
 
+from tests.tiers import cases
+
 TOPICS = ("/x", "/y")
 
 
@@ -31,7 +33,7 @@ TOPICS = ("/x", "/y")
     ),
     st.lists(st.integers(1, 7), min_size=1, max_size=10),
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=cases(10, 60), deadline=None)
 def test_each_message_finds_its_event(
     tmp_path_factory: pytest.TempPathFactory,
     run: list[tuple[int, list[int]]],

@@ -73,6 +73,7 @@ def yaml(node: str, clocks: str = "", until: str = "1s") -> str:
 LOOKER = "node: nodes_under_test:Looker"
 
 
+@pytest.mark.long
 def test_each_look_shows_a_nanosecond_more(record_job: Callable[..., Any]) -> None:
     code = IMPORTS + CODE
     assert ahead(record_job(yaml(LOOKER), code).path) == [0] * 20

@@ -20,6 +20,7 @@ stop: {duration: 20s}
 """
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("redirect", ["2>&-", ">&- 2>&-", "2>&1 >/dev/null | head -1"])
 def test_nobody_has_to_listen_to_the_nodes(
     job_file: Callable[..., Path], rsltrace: Any, tmp_path: Path, redirect: str

@@ -27,6 +27,7 @@ from rsltrace.job.parts.fault import FaultSpec  # noqa: E402
 from rsltrace.run import record  # noqa: E402
 from rsltrace.run.plans.changed_fields import UnfitError, changer  # noqa: E402
 from rsltrace.trace.reader import Trace  # noqa: E402
+from tests.tiers import cases  # noqa: E402
 
 BAG = Path(__file__).parents[2] / "campaigns/explore/bugs/bags/nan_poisons_average/drive"
 """Forty messages on /range, 2.0 - 0.04 n."""
@@ -155,7 +156,7 @@ def test_what_a_field_cannot_be_is_refused(
         changed(message, field, **what)
 
 
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=cases(10, 60))
 @given(st.integers(0, 2**64 - 1), st.sampled_from([-1, 0.5, 2, 3]), st.integers(-(10**6), 10**6))
 def test_numbers_stay_within_the_limits_of_their_type(old: int, scale: float, offset: int) -> None:
     most = 2**64 - 1

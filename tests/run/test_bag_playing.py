@@ -87,6 +87,7 @@ def play(tmp_path: Path) -> Any:
     return go
 
 
+@pytest.mark.long
 def test_rate_and_start(play: Any, tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(4))
     assert played(play("bags: [{path: a.mcap, rate: 2}]")) == [
@@ -107,6 +108,7 @@ def test_a_part_of_a_bag(play: Any, tmp_path: Path) -> None:
     assert result.stop_reason == "end of the bag"
 
 
+@pytest.mark.long
 def test_a_bag_plays_several_times_or_for_ever(play: Any, tmp_path: Path) -> None:
     write_mcap(tmp_path / "a.mcap", numbers(3))
     seconds = [10, 11, 12, 12, 13, 14]
@@ -140,6 +142,7 @@ def test_a_single_instant_cannot_loop(play: Any, tmp_path: Path) -> None:
     assert "all of its messages have one time, so it cannot loop" in str(result.error)
 
 
+@pytest.mark.long
 def test_other_names_and_qos(record_job: Any, tmp_path: Path) -> None:
     code = """
 from rclpy.qos import QoSProfile, DurabilityPolicy
@@ -180,6 +183,7 @@ def test_a_name_that_does_not_play_is_shown_in_the_job(play: Any, tmp_path: Path
         play(f"bags: [{{path: a.mcap, {key}}}]")
 
 
+@pytest.mark.long
 def test_bags_of_different_days_are_noted(play: Any, tmp_path: Path) -> None:
     day = 86_400 * S
     write_mcap(tmp_path / "a.mcap", numbers(2))
@@ -214,6 +218,7 @@ def test_bags_are_merged_by_time_and_then_by_their_order_in_the_job(
     assert [value for _, value in played(play("bags: [b.mcap, a.mcap]"))] == [3, 1, 4, 2]
 
 
+@pytest.mark.long
 def test_by_publish_time_and_by_header_stamp(play: Any, tmp_path: Path) -> None:
     point = bytes(2 + 24)  # padding, and three numbers
     samples = [
@@ -275,6 +280,7 @@ def test_what_is_whole_of_an_mcap_that_was_cut_off_plays(play: Any, tmp_path: Pa
     assert "bytes are whole" in note
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("chunks", [True, False])
 def test_an_mcap_without_index_plays_in_full_without_a_word(
     play: Any, tmp_path: Path, chunks: bool
@@ -328,6 +334,7 @@ def test_a_folder_without_metadata_plays_in_the_order_of_its_files(
     assert "no metadata.yaml: bag_0.db3, bag_2.db3, bag_10.db3 play" in play.notes[0]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("mode", ["file", "message"])
 def test_compressed_bags_play_as_plain_ones(
@@ -348,6 +355,7 @@ def test_compressed_bags_play_as_plain_ones(
     assert played(play("bags: [bag]")) == [((10 + i) * S, i) for i in range(5)]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("codec", ["NONE", "LZ4", "ZSTD"])
 def test_chunks_of_any_compression(play: Any, tmp_path: Path, codec: str) -> None:
     from mcap.writer import CompressionType

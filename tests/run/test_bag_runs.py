@@ -130,6 +130,7 @@ def test_a_message_that_is_not_of_its_type_is_named(record_job: Any, tmp_path: P
         assert trace.complete
 
 
+@pytest.mark.long
 def test_the_husky_bag_through_the_ekf_has_one_digest(tmp_path: Path) -> None:
     if not (DATA / "husky_outdoor").exists():
         pytest.skip("the recording is not part of the project (set RSLTRACE_DATA)")

@@ -150,6 +150,7 @@ def test_a_job_in_which_nothing_is_wrong(command: Any, job_file: Callable[..., P
     assert (link["name"], link["senders"][0]["node"]) == ("/numbers", "/talker")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("clocks", "problems"),
     [
@@ -194,6 +195,7 @@ def test_a_main_that_spins_waits_for_nothing(command: Any, job_file: Callable[..
     assert done.stderr == "next: rsltrace record job.yaml\n"
 
 
+@pytest.mark.long
 def test_a_topic_that_is_played_and_published(command: Any, job_file: Callable[..., Path]) -> None:
     job_file(FINE)
     done = command("record", "job.yaml", "--set", "stop.duration=3s", "--bag", "numbers")
@@ -266,6 +268,7 @@ class Waits(Node):
     assert waiting.startswith("constructing nodes_under_test:Waits waits for a time to come")
 
 
+@pytest.mark.long
 def test_the_picture_of_a_graph_is_the_same_every_time(job_file: Callable[..., Path]) -> None:
     pytest.importorskip("fast_sugiyama")
     from rsltrace.cli.output.graph_svg import graph_svg

@@ -8,7 +8,6 @@ offers which topic and service.
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from collections import defaultdict
@@ -20,6 +19,7 @@ import pytest
 
 import rsltrace
 from rsltrace.campaign.perturb import LOAD, Surroundings, record_in, surroundings
+from tests.tiers import cases
 
 pytestmark = [
     pytest.mark.ros,
@@ -28,7 +28,7 @@ pytestmark = [
     ),
 ]
 
-RUNS = min(int(os.environ.get("RSLTRACE_RUNS", "3")), 20)
+RUNS = cases(3, 20)
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,7 @@ def test_programs_do_what_they_do_over_dds(prefix: Path, tmp_path: Path) -> None
     assert "camera serves /camera/change_state lifecycle_msgs/srv/ChangeState" in ours["census"]
 
 
+@pytest.mark.long
 @pytest.mark.repeated
 def test_one_digest_whatever_surrounds_the_run(prefix: Path, tmp_path: Path) -> None:
     job = everybody(prefix, tmp_path)

@@ -1,13 +1,12 @@
 """One job, many machines' worth of differences, one digest.
 
 Each run is a process of its own with another hash seed, working directory, locale, time zone,
-address-space layout, heap and CPU load. ``RSLTRACE_RUNS`` sets how many: 100 in ``make test-long``.
+address-space layout, heap and CPU load. A hundred of them in ``make test-all``.
 """
 
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -15,11 +14,12 @@ from pathlib import Path
 import pytest
 
 from rsltrace.campaign.perturb import LOAD, Recorded, Surroundings, record_in, surroundings
+from tests.tiers import cases
 
 pytestmark = [pytest.mark.ros, pytest.mark.repeated]
 
 ROOT = Path(__file__).parents[2]
-RUNS = int(os.environ.get("RSLTRACE_RUNS", "4"))
+RUNS = cases(3, 100)
 RUNS_OF_A_POLICY = 2 if RUNS < 100 else 10
 JOB = """
 # All that a run may contain: topics, services, coroutines, parameters, logs, padding.
@@ -89,6 +89,7 @@ def test_one_digest_and_identical_files_whatever_surrounds_the_run(tmp_path: Pat
     assert len(files) == 1
 
 
+@pytest.mark.long
 def test_the_check_above_would_notice(tmp_path: Path) -> None:
     """The same check, sabotaged: a node that looks at the order of a set of strings."""
     (tmp_path / "extra.py").write_text(
@@ -133,6 +134,7 @@ def digests(tmp_path: Path, keys: str) -> dict[str, Path]:
     return {run.digest: run.path for run in done}
 
 
+@pytest.mark.long
 def test_one_digest_under_every_policy(tmp_path: Path) -> None:
     found = {}
     for name, keys in POLICIES.items():

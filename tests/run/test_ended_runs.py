@@ -134,6 +134,7 @@ def compared(folder: Path, parts: Any, stops: list[dict[str, Any]]) -> Diff:
     return rsltrace.diff(folder / "a.mcap", folder / "b.mcap")
 
 
+@pytest.mark.long
 @settings(max_examples=4, deadline=None)
 @given(
     parts=st.lists(PARTS, min_size=1, max_size=3),
@@ -185,6 +186,7 @@ def test_a_main_that_raises_in_one_run_is_no_early_end(tmp_path: Path) -> None:
     assert diff.verdict is Verdict.EXCEPTION, diff.sentence
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kept", ["a", "b"])
 def test_a_run_that_ended_since_its_last_timer_is_gone_tells_the_timer(
     tmp_path: Path, kept: str

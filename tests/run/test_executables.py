@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import textwrap
 from collections.abc import Callable
@@ -10,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+
+from tests.tiers import cases
 
 PACKAGE = """
 import argparse
@@ -207,6 +208,7 @@ def test_entries_of_one_program_are_told_apart_in_notes(record_yaml: Callable[[s
     assert result.notes == (f"my_demo/quitter {said}", f"my_demo/quitter #2 {said}")
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("target", "message"),
     [
@@ -236,6 +238,7 @@ def test_what_cannot_be_run_is_said_before_a_file_is_made(
     assert not (tmp_path / "run.mcap").exists()
 
 
+@pytest.mark.long
 @pytest.mark.repeated
 def test_mains_and_threads_give_one_digest_however_the_process_differs(
     rsltrace: Any, tmp_path: Path, workspace: Path
@@ -282,7 +285,7 @@ def test_mains_and_threads_give_one_digest_however_the_process_differs(
         "search_path: [., site]\nstop: {duration: 2s}\n"
     )
     digests = set()
-    for number in range(int(os.environ.get("RSLTRACE_RUNS", "9")) // 3):
+    for number in range(cases(3, 33)):
         environment = {
             "PYTHONHASHSEED": str(number),
             "TZ": ("UTC", "Asia/Tokyo")[number % 2],

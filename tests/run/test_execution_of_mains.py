@@ -58,6 +58,7 @@ def test_a_callback_keeps_the_thread_that_spins(
     assert [(int(number), int(at)) for number, at in heard] == list(enumerate(starts, start=1))
 
 
+@pytest.mark.long
 def test_an_executor_that_nobody_shuts_down_leaves_quietly(rsltrace: Any, job_file: Any) -> None:
     """It is collected when rclpy is the real one again, which knows nothing of it."""
     code = """

@@ -21,6 +21,7 @@ pytestmark = pytest.mark.ros
 TALKER = "nodes: [{node: nodes_under_test:Talker}]\n"
 
 
+@pytest.mark.long
 def test_a_timeout_is_a_failure(record_job: Any) -> None:
     result = record_job(TALKER + "start: 10s\nstop: {timeout: 2.5s, topic: /never}\n")
     assert (result.exit_code, result.end_ns) == (1, 12 * 10**9)
@@ -47,6 +48,7 @@ def test_rslcpps_error_code_ends_a_run(record_job: Any) -> None:
     assert (result.exit_code, result.end_ns) == (42, 2 * 10**9)
 
 
+@pytest.mark.long
 def test_what_a_node_makes_of_the_process_ends_with_the_run(
     record_job: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,6 +100,7 @@ def progress(path: Path) -> list[tuple[int, float]]:
         ]
 
 
+@pytest.mark.long
 def test_progress_of_a_bag(bag: Path, tmp_path: Path) -> None:
     job = Job(bags=[BagSpec(path=bag)], progress="/progress")
     result = rsltrace.record(job, tmp_path / "played.mcap")
@@ -111,6 +114,7 @@ def test_progress_of_a_bag(bag: Path, tmp_path: Path) -> None:
     assert plain.events == result.events - len(told)
 
 
+@pytest.mark.long
 def test_progress_of_bags_that_play_twice_or_slowly(bag: Path, tmp_path: Path) -> None:
     job = Job(
         bags=[BagSpec(path=bag, loop=2), BagSpec(path=bag, rate=0.5, start_offset="20s")],
@@ -125,6 +129,7 @@ def test_progress_of_bags_that_play_twice_or_slowly(bag: Path, tmp_path: Path) -
     assert abs(halfway - (told[0][0] + told[-1][0]) // 2) <= 10**9
 
 
+@pytest.mark.long
 def test_a_node_may_watch_the_progress(bag: Path, tmp_path: Path) -> None:
     from rclpy.node import Node
     from std_msgs.msg import Float32
@@ -144,6 +149,7 @@ def test_a_node_may_watch_the_progress(bag: Path, tmp_path: Path) -> None:
     assert (seen[0], seen[-1]) == (0.0, 1.0)
 
 
+@pytest.mark.long
 def test_progress_that_cannot_be(bag: Path) -> None:
     with pytest.raises(JobError, match="there are no bags"):
         Job(nodes=[NodeSpec(node="a:b")], progress="/p")
@@ -187,6 +193,7 @@ def test_hooks_around_the_construction(record_job: Any, tmp_path: Path) -> None:
     assert kinds.count("subscription") == 3  # the listener that the hook returned
 
 
+@pytest.mark.long
 def test_hooks_in_python_and_what_goes_wrong(record_job: Any) -> None:
     calls: list[str] = []
     job = Job(

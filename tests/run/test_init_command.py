@@ -116,6 +116,7 @@ def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
     assert job.nodes[0].parameters["deep.b"] == (1.0, 2.0)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sources", [[], ["--from", "a.db3"], ["--from", "robot.nodes:Hearer"]])
 def test_each_kind_of_first_job_loads(rsltrace: Any, folder: Path, sources: list[str]) -> None:
     done = rsltrace("init", "sub.yaml", *sources)
@@ -123,6 +124,7 @@ def test_each_kind_of_first_job_loads(rsltrace: Any, folder: Path, sources: list
     load_job(folder / "sub.yaml")
 
 
+@pytest.mark.long
 def test_a_file_that_exists_is_left_alone(rsltrace: Any, folder: Path) -> None:
     (folder / "job.yaml").write_text("mine")
     done = rsltrace("init")
@@ -131,6 +133,7 @@ def test_a_file_that_exists_is_left_alone(rsltrace: Any, folder: Path) -> None:
     assert (folder / "job.yaml").read_text() == "mine"
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("source", "expected"),
     [
@@ -150,6 +153,7 @@ def test_what_is_not_there(rsltrace: Any, folder: Path, source: str, expected: s
     assert not (folder / "job.yaml").exists()
 
 
+@pytest.mark.long
 def test_a_second_node_without_its_option_is_no_job_file(rsltrace: Any, folder: Path) -> None:
     done = rsltrace("init", "--from", "hearer:Hearer", "mains:One")
     assert done.returncode == 2
@@ -157,6 +161,7 @@ def test_a_second_node_without_its_option_is_no_job_file(rsltrace: Any, folder: 
     assert not list(folder.glob("*:*"))
 
 
+@pytest.mark.long
 def test_a_module_on_pythons_own_path(folder: Path) -> None:
     found = look_up("rclpy.node:Node", [folder])
     assert found.folder is None
@@ -165,6 +170,7 @@ def test_a_module_on_pythons_own_path(folder: Path) -> None:
         look_up("robot.nodes:Hearer", [folder / "src"])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at", [".", "src", "src/robot"])
 @pytest.mark.parametrize("chosen", ["", ":Hearer"])
 def test_a_node_named_by_its_file(rsltrace: Any, folder: Path, at: str, chosen: str) -> None:
@@ -186,6 +192,7 @@ def test_functions_are_mains_unless_they_return_a_node(folder: Path) -> None:
     assert not look_up("robot.mains:Two", [folder / "src"]).name, "it is told its name"
 
 
+@pytest.mark.long
 def test_a_job_of_a_main_runs(rsltrace: Any, folder: Path) -> None:
     done = rsltrace("init", "--from", "robot.mains:main")
     assert done.returncode == 0, done.stderr
@@ -194,6 +201,7 @@ def test_a_job_of_a_main_runs(rsltrace: Any, folder: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 def test_without_a_node_a_search_path_is_guessed_and_said(rsltrace: Any, folder: Path) -> None:
     done = rsltrace("init", "guessed.yaml")
     assert done.returncode == 0

@@ -23,6 +23,7 @@ def main():
 _JOB = "nodes: [{{{entry}}}]\nstop: {{time: 1s}}\n"
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("entry", "imports", "found"),
     [

@@ -105,6 +105,7 @@ def test_unittest_finds_its_tests_and_its_status_is_that_of_the_command(
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.long
 def test_programs_find_what_python_gives_them(programs: Path, rsltrace: Callable[..., Any]) -> None:
     (programs / "job.yaml").write_text(
         "nodes:\n"
@@ -125,6 +126,7 @@ def test_programs_find_what_python_gives_them(programs: Path, rsltrace: Callable
     assert "__file__" in found[0]["names"]
 
 
+@pytest.mark.long
 def test_the_files_are_in_the_trace_and_a_replay_names_them(
     programs: Path, rsltrace: Callable[..., Any]
 ) -> None:
@@ -144,6 +146,7 @@ def test_the_files_are_in_the_trace_and_a_replay_names_them(
     assert "nothing found in 4 files" in looked.stderr + looked.stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("entry", "said"),
     [

@@ -103,6 +103,7 @@ def written(done: subprocess.CompletedProcess[str]) -> str:
     return found[1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("evil", HARMLESS.values(), ids=HARMLESS)
 def test_the_trace_is_whole_in_spite_of_a_node_that(
     job_file: Callable[..., Path], rsltrace: Any, tmp_path: Path, evil: str
@@ -116,6 +117,7 @@ def test_the_trace_is_whole_in_spite_of_a_node_that(
         assert all(b"rsltrace" not in own.read_bytes() for own in tmp_path.glob("own*"))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("evil", "said"), HARMFUL.values(), ids=HARMFUL)
 def test_no_success_is_reported_of_a_trace_that_a_node(
     job_file: Callable[..., Path], rsltrace: Any, evil: str, said: str
@@ -130,6 +132,7 @@ def test_no_success_is_reported_of_a_trace_that_a_node(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("evil", "status"),
     [
@@ -167,6 +170,7 @@ def test_a_node_may_close_what_the_command_prints_to(
 # -- the trace that was there ---------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("code", "status", "complete"),
     [
@@ -204,6 +208,7 @@ def test_force_keeps_the_old_trace_if(
         assert "wrote run.unfinished.mcap (run.mcap is as it was): constructing" in done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("evil", "status"), [("pass", 0), ("raise ValueError", 3), ("os.kill(os.getpid(), 15)", 143)]
 )
@@ -222,6 +227,7 @@ def test_force_replaces_the_old_trace_by_one_that_is_whole(
 # -- nodes that are none --------------------------------------------------------------------------
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("body", "said"),
     [
@@ -245,6 +251,7 @@ def test_a_node_without_its_constructor(
         assert trace.complete
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "evil",
     [
@@ -294,6 +301,7 @@ def test_a_handler_that_raises_while_no_node_runs_ends_the_run(
         assert trace.complete
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ignored", [False, True])
 def test_a_hang_up_closes_the_trace_unless_it_is_ignored(
     job_file: Callable[..., Path], tmp_path: Path, ignored: bool
@@ -375,6 +383,7 @@ class Locks(Node):
 """
 
 
+@pytest.mark.long
 def test_locks_of_a_run_are_free_when_python_ends(
     rsltrace: Callable[..., Any], job_file: Callable[..., Path]
 ) -> None:

@@ -83,11 +83,13 @@ def test_a_node_that_cannot_be_made_ends_the_run_all_the_same(record_job: Any) -
     assert isinstance(result.error, NodeError)
 
 
+@pytest.mark.long
 def test_runs_with_exceptions_are_deterministic(record_job: Any) -> None:
     digests = {record_job(JOB % "log", FLAKY).digest for _ in range(3)}
     assert len(digests) == 1
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["stop", "log"])
 def test_system_exit_is_never_only_logged(record_job: Any, policy: str) -> None:
     code = FLAKY.replace("raise RuntimeError('third beat')", "raise SystemExit(7)")

@@ -15,6 +15,7 @@ from rsltrace.run import record
 TALK = "nodes: [{node: nodes_under_test:Talker}]\nstop: {duration: 2s}\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("more", "output", "what"),
     [

@@ -21,6 +21,7 @@ stop: {duration: 3s}   # written in flow style, as the effective job is not
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "given",
     [
@@ -43,6 +44,7 @@ def test_a_run_is_recorded_again(
     assert again.stdout == done.stdout, (words, again.stderr)
 
 
+@pytest.mark.long
 def test_where_the_jobs_differ_both_runs_are_to_be_looked_at(rsltrace: Any, job_file: Any) -> None:
     """A third run would say nothing: it is known that the two must differ."""
     job_file(JOB)
@@ -193,6 +195,7 @@ def test_a_job_of_no_file_is_not_recorded_again(name: str) -> None:
     assert _again(name) == ("", "")
 
 
+@pytest.mark.long
 def test_a_job_made_in_python_has_no_file_and_no_lines(tmp_path: Path) -> None:
     from rsltrace import Job, NodeSpec, StopSpec, diff, record
 
@@ -223,6 +226,7 @@ def _drawing_node() -> Any:
     return Drawing()
 
 
+@pytest.mark.long
 def test_which_run_an_exception_ended_is_told(rsltrace: Any, job_file: Any) -> None:
     """Where runs diverge by something else, that is what one wants to know of a run that failed."""
     code = """

@@ -33,6 +33,7 @@ BOTH = (
 LAST_LINE = re.compile(r"digest [0-9a-f]{16}  events \d+  sim \d+\.\d{9}")
 
 
+@pytest.mark.long
 def test_the_last_line_of_stdout_is_for_scripts(rsltrace: Any, job_file: Any) -> None:
     job_file(BOTH)
     done = rsltrace("record", "job.yaml", "-o", "out.mcap")
@@ -44,6 +45,7 @@ def test_the_last_line_of_stdout_is_for_scripts(rsltrace: Any, job_file: Any) ->
     assert "listener" not in quiet.stderr
 
 
+@pytest.mark.long
 def test_json_output(rsltrace: Any, job_file: Any, tmp_path: Path) -> None:
     job_file(BOTH)
     done = rsltrace("record", "job.yaml", "--json", "-o", "out.mcap")
@@ -74,6 +76,7 @@ def test_seed_and_until_replace_the_jobs_own(rsltrace: Any, job_file: Any) -> No
     assert lines["--until", "9s"].endswith("sim 9.000000000\n")
 
 
+@pytest.mark.long
 def test_an_existing_file_is_kept_without_force_and_what_is_no_trace_always(
     rsltrace: Any, job_file: Any, tmp_path: Path
 ) -> None:
@@ -93,6 +96,7 @@ def test_an_existing_file_is_kept_without_force_and_what_is_no_trace_always(
     assert out.read_text() == "precious"
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("yaml", "words"),
     [
@@ -114,6 +118,7 @@ def test_bad_jobs_are_explained(rsltrace: Any, job_file: Any, yaml: str, words: 
         assert word in done.stderr
 
 
+@pytest.mark.long
 def test_a_job_that_cannot_start_leaves_no_trace_behind(
     rsltrace: Any, job_file: Any, tmp_path: Path
 ) -> None:
@@ -122,12 +127,14 @@ def test_a_job_that_cannot_start_leaves_no_trace_behind(
     assert not (tmp_path / "out.mcap").exists()
 
 
+@pytest.mark.long
 def test_a_missing_job_says_so(rsltrace: Any) -> None:
     done = rsltrace("record", "nothing.yaml")
     assert done.returncode == 2
     assert "nothing.yaml" in done.stderr
 
 
+@pytest.mark.long
 def test_outputs_that_cannot_be_written(rsltrace: Any, job_file: Any, tmp_path: Path) -> None:
     job_file(BOTH)
     (tmp_path / "folder").mkdir()
@@ -138,6 +145,7 @@ def test_outputs_that_cannot_be_written(rsltrace: Any, job_file: Any, tmp_path: 
         assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_an_exception_shows_the_users_traceback_and_exits_3(
     rsltrace: Any, job_file: Any, tmp_path: Path
 ) -> None:
@@ -173,6 +181,7 @@ def test_an_interrupted_run_closes_its_file_and_says_so(
         assert trace.digest in stdout
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
 def test_a_run_that_is_ended_before_it_begins_has_the_status_of_its_signal(
     rsltrace: Any, job_file: Any, tmp_path: Path, name: str, code: int
@@ -184,6 +193,7 @@ def test_a_run_that_is_ended_before_it_begins_has_the_status_of_its_signal(
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.long
 def test_a_trace_is_closed_that_was_interrupted_while_it_was_opened(
     job_file: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,6 +228,7 @@ def test_a_killed_run_leaves_a_file_that_reads(job_file: Any, tmp_path: Path) ->
         assert trace.event(4095).index == 4095
 
 
+@pytest.mark.long
 def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
     job_file: Any, tmp_path: Path
 ) -> None:
@@ -239,6 +250,7 @@ def test_a_node_that_catches_signals_does_not_keep_a_run_from_ending(
         assert trace.complete
 
 
+@pytest.mark.long
 def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_path: Path) -> None:
     job_file(
         "nodes: [{node: nodes_under_test:Stuck}]\n",
@@ -261,6 +273,7 @@ def test_a_callback_that_hangs_is_left_by_a_second_interrupt(job_file: Any, tmp_
         assert trace.complete
 
 
+@pytest.mark.long
 def test_an_interrupt_in_the_middle_of_a_log_ends_the_run_properly(
     job_file: Any, tmp_path: Path
 ) -> None:
@@ -296,6 +309,7 @@ def _unread(pipe: Any) -> int:
     return waiting[0]
 
 
+@pytest.mark.long
 def test_a_full_disk_ends_the_run_with_a_readable_file(job_file: Any, tmp_path: Path) -> None:
     job_file(ENDLESS)
     code = (
@@ -339,6 +353,7 @@ def _wait_for_bytes(path: Path, size: int) -> None:
         time.sleep(0.05)
 
 
+@pytest.mark.long
 def test_the_trace_has_the_job_as_it_ran(rsltrace: Any, job_file: Any, tmp_path: Path) -> None:
     """What an override changed is in the trace's job, which loads as the job that ran."""
     job_file("nodes: [{node: nodes_under_test:Talker, name: a}]\nstop: {duration: 9s}\n")

@@ -88,6 +88,7 @@ record: {segment_events: 8}
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "policy",
     [
@@ -154,6 +155,7 @@ def followed(record_job: Callable[..., Any], tmp_path: Path) -> Callable[..., An
     return follow
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["fifo", "permutation"])
 @pytest.mark.parametrize(
     ("old", "new", "message"),
@@ -188,6 +190,7 @@ def test_the_first_event_that_is_another_ends_the_run(
         assert trace.result["stop_reason"] == "the recorded order cannot be followed"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("old", "new", "notes"),
     [
@@ -235,6 +238,7 @@ class Verbose(Talker):
     assert (result.error, result.notes) == (None, ())
 
 
+@pytest.mark.long
 def test_a_recording_that_was_cut_off(record_job: Callable[..., Any], tmp_path: Path) -> None:
     keys = "policy: permutation\nrecord: {segment_events: 5}\n"
     first = record_job(PAIR + keys)

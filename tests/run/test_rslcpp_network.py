@@ -47,6 +47,7 @@ GOLDEN = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", sorted(GOLDEN))
 def test_states_and_combined_hash_are_rslcpps(name: str, tmp_path: Path) -> None:
     from rsltrace import record

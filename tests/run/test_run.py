@@ -19,6 +19,7 @@ BOTH = "nodes: [{node: nodes_under_test:Talker}, {node: nodes_under_test:Listene
 TALKER = "nodes: [{node: nodes_under_test:Talker}]\n"
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("stop", "end_s", "reason"),
     [
@@ -61,6 +62,7 @@ TEXTS = [
 ]
 
 
+@pytest.mark.long
 def test_any_text_can_be_a_parameter(record_job: Any) -> None:
     code = (
         "class Told(Node):\n"
@@ -79,12 +81,14 @@ def test_any_text_can_be_a_parameter(record_job: Any) -> None:
         assert log.msg == repr([text, *TEXTS])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("value", ['"a\\0b"', '["a", "\\0"]'])
 def test_a_parameter_that_ros_would_cut_off_is_refused(record_job: Any, value: str) -> None:
     with pytest.raises(JobError, match=r"job\.yaml:1:.*NUL character"):
         record_job(f"nodes: [{{node: nodes_under_test:Talker, parameters: {{p: {value}}}}}]\n")
 
 
+@pytest.mark.long
 def test_a_trace_that_is_large_enough_ends_the_run(record_job: Any) -> None:
     code = "class Fast(Talker):\n    def __init__(self):\n        super().__init__(0.001)\n"
     result = record_job("nodes: [{node: nodes_under_test:Fast}]\nstop: {size: 200kB}\n", code)
@@ -111,6 +115,7 @@ def test_the_exit_code_may_come_from_a_message(record_job: Any) -> None:
     assert "without the field 'nothing'" in str(result.error)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("answer", "code"), [("True", 0), ("4", 4)])
 def test_a_stop_function_gives_the_exit_status(record_job: Any, answer: str, code: int) -> None:
     function = f"def enough(progress):\n    return {answer} if progress.events > 5 else None\n"
@@ -136,12 +141,14 @@ def test_quiescence_ends_a_run_in_which_nothing_is_said_any_more(record_job: Any
     assert result.end_ns == 5 * 10**9
 
 
+@pytest.mark.long
 def test_a_run_ends_when_nothing_is_left_to_do(record_job: Any) -> None:
     result = record_job("nodes: [{node: nodes_under_test:Listener}]\n")
     assert result.stop_reason == "nothing left to do"
     assert result.end_ns == 0
 
 
+@pytest.mark.long
 def test_an_exception_names_node_entity_and_time_and_the_trace_is_complete(
     record_job: Any, tmp_path: Path
 ) -> None:
@@ -175,6 +182,7 @@ def test_an_exception_names_node_entity_and_time_and_the_trace_is_complete(
         assert "three is too many" in trace.decode(topic, data).text
 
 
+@pytest.mark.long
 def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
     code = (
         "class Broken(Node):\n"
@@ -189,6 +197,7 @@ def test_a_constructor_that_raises_is_named(record_job: Any) -> None:
         assert trace.event_count == 1
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("target", "words"),
     [
@@ -210,6 +219,7 @@ def test_what_cannot_be_constructed_is_explained(
         assert word in message
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("line", "words"),
     [
@@ -231,6 +241,7 @@ def test_a_module_that_needs_another_one_says_which_and_what_to_do(
         assert word in str(caught.value)
 
 
+@pytest.mark.long
 def test_an_interface_that_a_callback_imports_in_vain_has_a_next_step(record_job: Any) -> None:
     code = (
         "class Late(Talker):\n"
@@ -242,6 +253,7 @@ def test_an_interface_that_a_callback_imports_in_vain_has_a_next_step(record_job
     assert "apt install ros-jazzy-nobodys-interfaces" in str(result.error)
 
 
+@pytest.mark.long
 def test_who_divides_by_a_time_that_did_not_pass_is_told_so(record_job: Any) -> None:
     code = (
         "class Rated(Talker):\n"
@@ -254,6 +266,7 @@ def test_who_divides_by_a_time_that_did_not_pass_is_told_so(record_job: Any) -> 
     assert "computing takes no simulated time" in str(result.error)
 
 
+@pytest.mark.long
 def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:
     code = (
         "class Echo(Node):\n"
@@ -277,12 +290,14 @@ def test_a_cycle_without_time_is_named_not_hung_on(record_job: Any) -> None:
         assert trace.complete
 
 
+@pytest.mark.long
 def test_system_exit_in_a_callback_is_the_exit_status(record_job: Any) -> None:
     code = "class Leaver(Talker):\n    def tick(self):\n        raise SystemExit(5)\n"
     result = record_job("nodes: [{node: nodes_under_test:Leaver}]\n", code)
     assert (result.exit_code, result.error) == (5, None)
 
 
+@pytest.mark.long
 def test_payloads_may_be_left_out_without_changing_the_digest(record_job: Any) -> None:
     stop = "stop: {duration: 3s}\n"
     everything = record_job(BOTH + stop)
@@ -295,6 +310,7 @@ def test_payloads_may_be_left_out_without_changing_the_digest(record_job: Any) -
             assert "/numbers" not in {channel.topic for channel in trace.channels.values()}
 
 
+@pytest.mark.long
 def test_recording_does_not_change_what_the_nodes_do(record_job: Any) -> None:
     a = record_job(f"{BOTH}stop: {{duration: 5s}}\n")
     b = record_job(f"{BOTH}stop: {{duration: 5s}}\n", output=None)
@@ -302,6 +318,7 @@ def test_recording_does_not_change_what_the_nodes_do(record_job: Any) -> None:
     assert b.digest == ""
 
 
+@pytest.mark.long
 def test_runs_in_one_process_do_not_disturb_each_other(record_job: Any, tmp_path: Path) -> None:
     code = (
         "RUNS = []\nclass Counting(Talker):\n    def __init__(self):\n        RUNS.append(1)\n"
@@ -322,6 +339,7 @@ def test_runs_in_one_process_do_not_disturb_each_other(record_job: Any, tmp_path
     assert not rclpy.ok()
 
 
+@pytest.mark.long
 def test_real_rclpy_works_after_a_simulation(record_job: Any) -> None:
     assert record_job(f"{BOTH}stop: {{duration: 2s}}\n").error is None
     import rclpy
@@ -376,6 +394,7 @@ def test_a_failing_stop_function_is_an_error_of_the_run(record_job: Any) -> None
     assert "nodes_under_test:enough" in str(result.error)
 
 
+@pytest.mark.long
 def test_a_virtual_environment_in_the_search_path_is_not_the_users_code(
     record_job: Any, tmp_path: Path
 ) -> None:

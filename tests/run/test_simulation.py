@@ -128,6 +128,7 @@ def drive_by(sim: Simulation, pieces: list[Any]) -> None:
             sim.run_for(f"{piece}ms")
 
 
+@pytest.mark.long
 @settings(
     max_examples=15,
     deadline=None,
@@ -175,6 +176,7 @@ def test_leaving_between_two_steps_is_stopping_there(simulate: Any, tmp_path: Pa
     assert sim.result.stop_reason == "left by the driver of the simulation"
 
 
+@pytest.mark.long
 def test_a_job_without_an_end_ends_when_nothing_is_left(simulate: Any) -> None:
     with simulate("nodes: [{node: nodes_under_test:Echo}]\n") as sim:
         assert not sim.step()
@@ -240,6 +242,7 @@ def test_the_driver_can_end_the_run(simulate: Any) -> None:
     assert (sim.result.stop_reason, sim.result.exit_code) == ("goal reached", 5)
 
 
+@pytest.mark.long
 def test_a_graph_that_waits_for_the_outside_is_no_deadlock(simulate: Any) -> None:
     code = "nodes: [{node: nodes_under_test:Sleeper}]\n"
     with simulate(code) as sim:
@@ -270,6 +273,7 @@ def test_taps_keep_what_was_published(simulate: Any) -> None:
         assert tap.count == 3
 
 
+@pytest.mark.long
 def test_who_listens_may_answer_at_once(simulate: Any) -> None:
     from std_msgs.msg import UInt64
 
@@ -332,6 +336,7 @@ def test_the_same_driver_gives_the_same_trace(simulate: Any, tmp_path: Path) -> 
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("second", "said"),
     [
@@ -375,6 +380,7 @@ def test_what_is_done_to_a_node_directly_is_an_event_from_outside(
         assert (event.stamp_ns, event.outputs) == (10**9, 1)
 
 
+@pytest.mark.long
 def test_a_call_from_outside_can_wait(simulate: Any) -> None:
     from std_srvs.srv import Trigger
 
@@ -395,6 +401,7 @@ def test_a_call_from_outside_can_wait(simulate: Any) -> None:
 # -- what goes wrong -------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_node_that_raises_raises_in_the_step(simulate: Any, tmp_path: Path) -> None:
     with simulate("nodes: [{node: nodes_under_test:Echo}]\n", tmp_path / "t.mcap") as sim:
         sim.publish("numbers", _number(13))
@@ -425,6 +432,7 @@ def test_an_error_of_the_driver_closes_the_trace(simulate: Any, tmp_path: Path) 
         assert trace.digest == sim.result.digest
 
 
+@pytest.mark.long
 def test_a_constructor_that_raises(job_file: Any) -> None:
     broken = "class Broken(Node):\n    def __init__(self):\n        raise OSError('no device')\n"
     job = job_file("nodes: [{node: nodes_under_test:Broken}]\n", broken)
@@ -469,6 +477,7 @@ def test_clear_errors(simulate: Any, tmp_path: Path) -> None:
         pass
 
 
+@pytest.mark.long
 def test_a_node_cannot_drive_its_own_simulation(job_file: Any) -> None:
     from rclpy.node import Node
 

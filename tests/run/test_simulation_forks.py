@@ -63,6 +63,7 @@ def adding(number: int) -> Any:
     return drive
 
 
+@pytest.mark.long
 def test_a_process_that_has_closed_its_output_forks_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Python has None in its place."""
     monkeypatch.setattr(sys, "stdout", None)
@@ -96,6 +97,7 @@ def test_each_fork_is_the_run_from_the_beginning_and_the_original_stays(tmp_path
     assert not list(tmp_path.glob("*unfinished*"))
 
 
+@pytest.mark.long
 def test_faults_of_a_fork_are_those_of_a_job_that_has_them(tmp_path: Path) -> None:
     faults = [{"drop": "/count", "message": 7}]
     with Simulation(job(), forks=True) as sim:
@@ -109,6 +111,7 @@ def test_faults_of_a_fork_are_those_of_a_job_that_has_them(tmp_path: Path) -> No
     assert (tmp_path / "forked.mcap").read_bytes() == (tmp_path / "whole.mcap").read_bytes()
 
 
+@pytest.mark.long
 def test_what_goes_wrong_in_a_fork_is_raised_and_the_original_goes_on(tmp_path: Path) -> None:
     there = tmp_path / "there.mcap"
     there.write_bytes(b"mine")
@@ -134,6 +137,7 @@ def test_what_goes_wrong_in_a_fork_is_raised_and_the_original_goes_on(tmp_path: 
         assert trace.complete
 
 
+@pytest.mark.long
 def test_who_cannot_fork_says_why(tmp_path: Path) -> None:
     with Simulation(job()) as sim, pytest.raises(RunError, match="made with forks=True"):
         sim.fork(lambda sim: None)

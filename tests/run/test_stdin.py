@@ -273,6 +273,7 @@ def test_a_main_that_looks_now_and_then_finds_keys_when_they_come(recorded: Any)
     assert logs(result.path)[1:] == [(600, "b'x' after 6 looks")]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("what", "call"),
     [

@@ -35,6 +35,7 @@ def told(record_job: Callable[..., Any], node: str, more: str, error: type = Job
     return str(caught.value)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("code", "said", "line"),
     [
@@ -111,6 +112,7 @@ def test_an_integer_for_a_parameter_with_a_decimal_point(record_job: Callable[..
     assert lines[-1].endswith("job.yaml:4:24")
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("field", "message"),
     [

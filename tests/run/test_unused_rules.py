@@ -89,6 +89,7 @@ def test_rules_that_have_something_to_do_are_not_named(record_job: Callable[...,
     assert result.notes == ()
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
@@ -153,6 +154,7 @@ def main():
     assert note.endswith("did you mean 'start_type_description_service'?")
 
 
+@pytest.mark.long
 def test_check_names_them_and_a_run_that_failed_does_not(
     command: Any, job_file: Callable[..., Path], record_job: Callable[..., Any]
 ) -> None:
@@ -250,6 +252,7 @@ stop: {duration: 1s}
 TABLE = "topic,kind,delay,skew\n/nums,FIXED,5,\n/later,FIXED,1.5,\n"
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
@@ -290,6 +293,7 @@ def test_remappings_kept_topics_and_rows_of_a_delay_file(
     assert told.startswith(message)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("clock", "column", "shown"),
     [
@@ -311,6 +315,7 @@ def test_a_clock_that_would_show_times_before_0_is_named(
     assert record_job(yaml + "start: 100s\n", output=None).notes == ()
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("word", "message"),
     [
@@ -332,6 +337,7 @@ def test_parameters_of_ros_arguments(
         assert f"job.yaml:8:21: {message}" in note
 
 
+@pytest.mark.long
 def test_topics_to_keep_in_a_file_that_jobs_share_are_not_named(
     record_job: Callable[..., Any], tmp_path: Path
 ) -> None:

@@ -124,6 +124,7 @@ for _ in range(9):
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["torchvision", "my_own_package"])
 def test_the_import_of_a_library_may_take_its_time(
     busy: Looks,
@@ -150,6 +151,7 @@ def test_the_import_of_a_library_may_take_its_time(
     assert said.count("rsltrace: note:") == (name == "my_own_package"), said
 
 
+@pytest.mark.long
 def test_there_is_at_most_one_note_in_a_minute(
     busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -165,6 +167,7 @@ def test_there_is_at_most_one_note_in_a_minute(
     ]
 
 
+@pytest.mark.long
 def test_the_trace_is_that_of_a_run_without_a_busy_loop(busy: Looks, tmp_path: Path) -> None:
     slow = record(lambda count: busy(6), tmp_path / "a.mcap")
     busy._over = False
@@ -172,6 +175,7 @@ def test_the_trace_is_that_of_a_run_without_a_busy_loop(busy: Looks, tmp_path: P
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
 
+@pytest.mark.long
 def test_a_simulation_that_its_driver_leaves_standing_is_no_alarm(
     busy: Looks, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -189,6 +193,7 @@ def test_a_simulation_that_its_driver_leaves_standing_is_no_alarm(
         assert "/quiet: timer" in capsys.readouterr().err, "within the run it is one"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("told_of", "went_on"), [(True, []), (False, [1, 2, 3])])
 def test_one_interrupt_ends_what_was_told_of(
     busy: Looks, tmp_path: Path, told_of: bool, went_on: list[int]
@@ -216,6 +221,7 @@ def test_one_interrupt_ends_what_was_told_of(
     assert seen == went_on
 
 
+@pytest.mark.long
 def test_a_debugger_is_no_alarm(
     busy: Looks, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -225,6 +231,7 @@ def test_a_debugger_is_no_alarm(
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.long
 def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
     def threads() -> int:
         return len(os.listdir("/proc/self/task"))
@@ -248,6 +255,7 @@ def test_it_is_gone_after_the_run(tmp_path: Path) -> None:
     assert threads() == before
 
 
+@pytest.mark.long
 def test_ctrl_c_twice_ends_a_busy_loop_with_a_whole_trace(tmp_path: Path) -> None:
     (tmp_path / "busy_node.py").write_text(
         "from rclpy.node import Node\n"

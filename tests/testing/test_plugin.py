@@ -114,6 +114,7 @@ def test_a_run_that_was_not_recorded_cannot_be_compared() -> None:
         assert_matches_golden(result, A)
 
 
+@pytest.mark.long
 def test_loading_the_plugin_loads_nothing_heavy() -> None:
     heavy = ("rclpy", "numpy", "pydantic", "ruamel", "rosbags", "mcap", "rich", "click")
     probe = (
@@ -157,6 +158,7 @@ def test_pytest_finds_the_plugin_by_itself() -> None:
     assert {entry.value for entry in found} == {"rsltrace.testing.plugin"}
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_the_fixture_makes_compares_and_updates_golden_traces(team: Run, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
@@ -196,6 +198,7 @@ def test_the_fixture_makes_compares_and_updates_golden_traces(team: Run, tmp_pat
     assert team().returncode == 1
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_a_job_that_cannot_be_used_is_one_line(team: Run, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
@@ -209,6 +212,7 @@ def test_a_job_that_cannot_be_used_is_one_line(team: Run, tmp_path: Path) -> Non
     assert "Error" not in done.stdout, "a traceback of rsltrace's own code"
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_jobs_and_results_in_one_test(team: Run, tmp_path: Path) -> None:
     pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
@@ -268,6 +272,7 @@ def test_the_option_holds_without_the_fixture(team: Run, tmp_path: Path) -> None
     assert team(STEP="2").returncode == 1
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_tests_are_no_code_of_the_job(team: Run, tmp_path: Path) -> None:
     """Another test beside it is no reason why a run is another one; a node in a test is."""

@@ -97,6 +97,7 @@ def test_without_a_trace_the_job_is_run_and_may_be_drawn(
     assert picture.read_text().startswith("<?xml")
 
 
+@pytest.mark.few(30)
 @pytest.mark.parametrize(
     ("words", "change", "error", "message"),
     [

@@ -17,6 +17,7 @@ from rsltrace.trace.format import METADATA_RESULT
 from rsltrace.trace.pieces import metadata_checksum
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
+from tests.tiers import cases
 
 CHUNK = 0x06
 EVENTS_PER_SEGMENT = 200
@@ -86,6 +87,7 @@ def test_cut_at_every_record_reads_up_to_the_last_whole_segment(
         assert events == total, f"cut before record {cut}"
 
 
+@pytest.mark.long
 def test_cut_anywhere_reads_up_to_the_last_whole_segment(
     tmp_path: Path, large: tuple[bytes, Feeder]
 ) -> None:
@@ -173,7 +175,9 @@ def test_a_corrupted_chunk_is_named_with_its_place(
 
 
 @settings(
-    max_examples=400, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=cases(50, 400),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255), cut=st.booleans())
 def test_a_corrupted_byte_gives_an_error_or_the_truth(
@@ -185,6 +189,7 @@ def test_a_corrupted_byte_gives_an_error_or_the_truth(
     open_and_check(tmp_path / "damaged.mcap", bytes(damaged), feeder)
 
 
+@pytest.mark.long
 def test_every_corrupted_byte_is_found_by_check(
     tmp_path: Path, small: tuple[bytes, Feeder]
 ) -> None:

@@ -50,6 +50,7 @@ def zeros(store: Any, name: str) -> Any:
     return store.types[name](*(value(*field) for _, field in store.fielddefs[name][1]))
 
 
+@pytest.mark.long
 def test_every_message_type_of_ros_can_be_decoded(jazzy: Any) -> None:
     for name in jazzy.fielddefs:
         text, _ = jazzy.generate_msgdef(name, ros_version=2)

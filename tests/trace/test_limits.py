@@ -50,6 +50,7 @@ def bomb(size: int) -> bytes:
     return b"".join(compressor.compress(block) for _ in range(size >> 20)) + compressor.flush()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("complete", [True, False])
 def test_a_chunk_that_unpacks_to_gigabytes_is_refused(tmp_path: Path, complete: bool) -> None:
     """As large as it says, so that only a limit helps: 70 kB for 2 GB."""

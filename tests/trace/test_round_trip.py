@@ -14,6 +14,7 @@ from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, EventFlag, EventKind, OutputKind
 from rsltrace.trace import writer as writer_module
 from rsltrace.trace.reader import Trace
+from tests.tiers import cases
 
 U64 = st.integers(0, 2**64 - 1)
 PAYLOAD = st.binary(max_size=40)
@@ -32,7 +33,7 @@ EVENT = st.fixed_dictionaries(
 )
 
 
-@settings(max_examples=120, deadline=None)
+@settings(max_examples=cases(20, 120), deadline=None)
 @given(
     events=st.lists(EVENT, max_size=30),
     per_segment=st.integers(1, 7),

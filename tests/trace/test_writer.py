@@ -97,6 +97,7 @@ def test_an_unknown_compression_is_refused_before_anything_is_made(tmp_path: Pat
 # -- the bytes ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("compression", ["zstd", ""])
 def test_the_same_calls_give_the_same_bytes_under_any_name(
     tmp_path: Path, compression: str
@@ -458,6 +459,7 @@ def test_a_recorder_that_miscounts_is_stopped(tmp_path: Path) -> None:
             writer.close(result={})
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_run(tmp_path: Path) -> None:
     """Per segment, 88 bytes of table and some 300 of indexes may stay; per event, nothing."""
     rest_of = EVENT_REST.pack

@@ -42,6 +42,7 @@ def test_there_are_classes_enough() -> None:
     assert set(faults.FAMILIES.values()) == set(FAMILIES)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "part", [0, *(pytest.param(part, marks=pytest.mark.long) for part in range(1, PARTS))]
 )
@@ -96,6 +97,7 @@ def test_what_is_known_names_classes() -> None:
         assert fnmatch.filter(NAMES, key.rpartition(": ")[0]), key
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "seed"),
     [

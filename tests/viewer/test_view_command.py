@@ -30,6 +30,7 @@ def view(*arguments: object) -> Result:
     return CliRunner().invoke(cli, ["view", *map(str, arguments)])
 
 
+@pytest.mark.long
 def test_a_screen_as_text_and_as_a_picture(made: Path, tmp_path: Path) -> None:
     text, picture = tmp_path / "screen.txt", tmp_path / "screen.svg"
     assert view(made, "--export", text, "--size", "100x30", "--at", 3).exit_code == 0
@@ -46,6 +47,7 @@ def test_a_screen_as_text_and_as_a_picture(made: Path, tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_pictures_are_reproducible(made: Path, tmp_path: Path) -> None:
     one, other = tmp_path / "one.svg", tmp_path / "other.svg"
     assert view(made, "--export", one).exit_code == 0
@@ -129,6 +131,7 @@ def test_the_traces_of_a_folder(
     assert asyncio.run(choose("q")) is None
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux")
 def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
     server = f"rsltrace-test-{os.getpid()}"
@@ -170,6 +173,7 @@ def test_in_a_real_terminal(made: Path, tmp_path: Path) -> None:
         tmux("kill-server")
 
 
+@pytest.mark.long
 def test_in_a_browser_on_this_machine_only(made: Path) -> None:
     pytest.importorskip("textual_serve")
     with socket.socket() as probe:

@@ -49,6 +49,7 @@ def test_stepping_and_edges(made: Path, run: Run, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_the_inspector_follows_an_event_that_gets_another_place(
     pair: tuple[Path, Path], drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -71,6 +72,7 @@ def test_the_inspector_follows_an_event_that_gets_another_place(
     drive(pair, steps)
 
 
+@pytest.mark.long
 def test_the_cursor_is_always_in_sight(long: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         timeline = viewer.app.timeline
@@ -88,6 +90,7 @@ def test_the_cursor_is_always_in_sight(long: Path, drive: Drive) -> None:
     drive(long, steps)
 
 
+@pytest.mark.long
 def test_same_node_entity_and_topic(made: Path, run: Run, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("i")
@@ -112,6 +115,7 @@ def test_same_node_entity_and_topic(made: Path, run: Run, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_cause_effects_and_the_way_back(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("j", "j", "e")
@@ -130,6 +134,7 @@ def test_cause_effects_and_the_way_back(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_exceptions_logs_warnings_and_findings(made: Path, run: Run, drive: Drive) -> None:
     logs = [i for i in find(run, ANY_LOG, -1, 1) if i is not None]
 
@@ -154,6 +159,7 @@ def test_exceptions_logs_warnings_and_findings(made: Path, run: Run, drive: Driv
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_an_event_is_shown_on_a_machine_that_is_late(
     made: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -169,6 +175,7 @@ def test_an_event_is_shown_on_a_machine_that_is_late(
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_marks(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("j", "m", "j", "j", "m", "home", "apostrophe")
@@ -184,6 +191,7 @@ def test_marks(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_going_to_a_time_and_an_index(made: Path, run: Run, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("t")
@@ -202,6 +210,7 @@ def test_going_to_a_time_and_an_index(made: Path, run: Run, drive: Drive) -> Non
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_searching(made: Path, run: Run, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("n")
@@ -222,6 +231,7 @@ def test_searching(made: Path, run: Run, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_typing_fast_goes_into_the_question(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         names = {"/": "slash", ":": "colon", "\r": "enter", "\t": "tab", "\x1b": "escape"}
@@ -267,6 +277,7 @@ def test_filtering(made: Path, run: Run, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_a_wrong_filter_says_where(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("F")
@@ -279,6 +290,7 @@ def test_a_wrong_filter_says_where(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_tab_completes(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("F", "n", "tab")
@@ -290,6 +302,7 @@ def test_tab_completes(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_the_inspector_opens_closes_and_follows(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         app = viewer.app
@@ -312,6 +325,7 @@ def test_the_inspector_opens_closes_and_follows(made: Path, drive: Drive) -> Non
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_panes_zoom_and_maximise(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         app = viewer.app
@@ -338,6 +352,7 @@ def test_panes_zoom_and_maximise(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_help_lists_every_key_and_any_of_its_keys_closes_it(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         for key in ("question_mark", "escape", "q", "enter"):
@@ -352,6 +367,7 @@ def test_help_lists_every_key_and_any_of_its_keys_closes_it(made: Path, drive: D
     drive(made, steps, size=(140, 60))
 
 
+@pytest.mark.long
 def test_themes(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         before = viewer.app.export_screenshot()
@@ -364,6 +380,7 @@ def test_themes(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_plots(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("p")
@@ -382,6 +399,7 @@ def test_plots(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_the_mouse(made: Path, run: Run, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.click("#timeline", 10, 5)
@@ -396,6 +414,7 @@ def test_the_mouse(made: Path, run: Run, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_a_click_follows_a_link(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("j", "j")
@@ -408,6 +427,7 @@ def test_a_click_follows_a_link(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_the_command_palette_offers_the_keys(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("ctrl+p")
@@ -418,6 +438,7 @@ def test_the_command_palette_offers_the_keys(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("size", [(20, 5), (40, 12), (80, 24), (200, 60)])
 def test_every_size(made: Path, drive: Drive, size: tuple[int, int]) -> None:
     async def steps(viewer: Any) -> None:
@@ -429,6 +450,7 @@ def test_every_size(made: Path, drive: Drive, size: tuple[int, int]) -> None:
     drive(made, steps, size=size)
 
 
+@pytest.mark.long
 def test_resizing(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         await viewer.press("end")
@@ -442,6 +464,7 @@ def test_resizing(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_starting_at_an_event_with_a_filter(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         assert viewer.app.session.rows.count < viewer.app.session.a.count
@@ -476,6 +499,7 @@ def test_two_traces_open_at_their_divergence(pair: tuple[Path, Path], drive: Dri
     drive(pair, steps)
 
 
+@pytest.mark.long
 def test_two_traces_inspected_one_by_one(pair: tuple[Path, Path], drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         session = viewer.app.session
@@ -492,6 +516,7 @@ def test_two_traces_inspected_one_by_one(pair: tuple[Path, Path], drive: Drive) 
     drive(pair, steps)
 
 
+@pytest.mark.long
 def test_what_both_runs_share_is_shown_once_with_its_effects(
     pair: tuple[Path, Path], drive: Drive
 ) -> None:
@@ -504,6 +529,7 @@ def test_what_both_runs_share_is_shown_once_with_its_effects(
     drive(pair, steps, size=(80, 40))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["schedule", "delayed_input", "missing_event"])
 def test_every_sample_can_be_walked_through(drive: Drive, name: str) -> None:
     folder = Path(__file__).parents[2] / "sample_traces" / name
@@ -529,6 +555,7 @@ def test_every_sample_can_be_walked_through(drive: Drive, name: str) -> None:
     drive((folder / "a.mcap", folder / "b.mcap"), steps)
 
 
+@pytest.mark.long
 def test_identical_traces_say_so(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         assert "identical: all 603 events" in viewer.text or "= identical" in viewer.text

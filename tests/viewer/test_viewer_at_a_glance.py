@@ -96,6 +96,7 @@ def test_the_overview_says_how_long_callbacks_took_and_what_was_lost(tmp_path: P
     run.close()
 
 
+@pytest.mark.long
 def test_one_trace_opens_with_the_overview(made: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         app = viewer.app
@@ -128,6 +129,7 @@ def test_the_viewer_can_be_left_from_its_first_screen(made: Path, drive: Drive) 
     drive(made, steps, overview=True)
 
 
+@pytest.mark.long
 def test_the_overview_says_which_checks_are_violated(tmp_path: Path, drive: Drive) -> None:
     from trace_maker import write_run
 
@@ -170,6 +172,7 @@ def test_the_overview_leads_to_events(made: Path, drive: Drive) -> None:
     drive(made, steps)
 
 
+@pytest.mark.long
 def test_the_log_leads_to_events_and_levels_can_be_left_out(drive: Drive) -> None:
     folder = SAMPLES / "missing_event"
 
@@ -214,6 +217,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_the_source_of_a_callback_and_that_it_has_changed(
     recorded: Path, tmp_path: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch

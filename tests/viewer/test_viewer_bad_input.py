@@ -24,6 +24,7 @@ EVERY_KEY = (
 ).split()
 
 
+@pytest.mark.long
 def test_an_empty_trace(tmp_path: Path, drive: Drive) -> None:
     path = tmp_path / "empty.mcap"
     with Opened(path) as feeder:
@@ -42,6 +43,7 @@ def test_an_empty_trace(tmp_path: Path, drive: Drive) -> None:
     drive(path, steps)
 
 
+@pytest.mark.long
 def test_one_event(tmp_path: Path, drive: Drive) -> None:
     path = tmp_path / "one.mcap"
     with Opened(path) as feeder:
@@ -60,6 +62,7 @@ def test_one_event(tmp_path: Path, drive: Drive) -> None:
     drive(path, steps)
 
 
+@pytest.mark.long
 def test_a_trace_that_was_cut_off(tmp_path: Path, drive: Drive) -> None:
     path = tmp_path / "cut.mcap"
     write_run(path, 9000, close=False)
@@ -76,6 +79,7 @@ def test_a_trace_that_was_cut_off(tmp_path: Path, drive: Drive) -> None:
     drive(path, steps)
 
 
+@pytest.mark.long
 def test_a_damaged_chunk_is_shown_where_it_is(tmp_path: Path, drive: Drive) -> None:
     path = tmp_path / "damaged.mcap"
     write_run(path, 9000)
@@ -105,6 +109,7 @@ def test_a_damaged_chunk_is_shown_where_it_is(tmp_path: Path, drive: Drive) -> N
     drive(path, steps)
 
 
+@pytest.mark.long
 def test_odd_things_are_shown_as_what_they_are(odd: Path, drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         seen = viewer.text
@@ -145,6 +150,7 @@ def test_a_search_for_text_in_odd_messages(odd: Path, drive: Drive) -> None:
     drive(odd, steps)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("size", [(1, 1), (5, 2), (10, 4)])
 def test_a_terminal_that_is_far_too_small(made: Path, drive: Drive, size: tuple[int, int]) -> None:
     async def steps(viewer: Any) -> None:
@@ -180,6 +186,7 @@ def test_a_growing_file_is_followed(tmp_path: Path, drive: Drive) -> None:
     drive(growing, steps, follow=True)
 
 
+@pytest.mark.long
 def test_the_end_of_a_recording_is_shown_at_once(
     tmp_path: Path, drive: Drive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

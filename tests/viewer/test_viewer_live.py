@@ -179,6 +179,7 @@ def test_stepping_executes_and_shows_what_changed(live: Any, folder: Path) -> No
         run.close()
 
 
+@pytest.mark.long
 def test_what_a_fast_hand_skips_is_not_shown_for_another_event(live: Any) -> None:
     async def steps(viewer: Live) -> None:
         for _ in range(15):
@@ -190,6 +191,7 @@ def test_what_a_fast_hand_skips_is_not_shown_for_another_event(live: Any) -> Non
     live(steps)
 
 
+@pytest.mark.long
 def test_breakpoints_stop_the_run_forwards_and_back(live: Any) -> None:
     async def steps(viewer: Live) -> None:
         panel = viewer.app.query_one(BreakpointsPanel)
@@ -226,6 +228,7 @@ def test_breakpoints_stop_the_run_forwards_and_back(live: Any) -> None:
     live(steps)
 
 
+@pytest.mark.long
 def test_questions_to_the_run(live: Any) -> None:
     async def steps(viewer: Live) -> None:
         await viewer.press("end")
@@ -249,6 +252,7 @@ def test_questions_to_the_run(live: Any) -> None:
     live(steps)
 
 
+@pytest.mark.long
 def test_what_is_wrong_is_said_and_the_run_goes_on(live: Any) -> None:
     async def steps(viewer: Live) -> None:
         await viewer.press("down", "down")
@@ -265,6 +269,7 @@ def test_what_is_wrong_is_said_and_the_run_goes_on(live: Any) -> None:
     live(steps)
 
 
+@pytest.mark.long
 def test_panes_and_help(live: Any) -> None:
     async def steps(viewer: Live) -> None:
         await viewer.press("down")
@@ -281,6 +286,7 @@ def test_panes_and_help(live: Any) -> None:
     live(steps, size=(140, 70))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("size", [(80, 24), (40, 10)])
 def test_any_size(live: Any, size: tuple[int, int]) -> None:
     async def steps(viewer: Live) -> None:
@@ -296,6 +302,7 @@ def test_any_size(live: Any, size: tuple[int, int]) -> None:
     live(steps, size=size)
 
 
+@pytest.mark.long
 def test_a_run_that_is_not_the_recorded_one(folder: Path, tmp_path: Path) -> None:
     for name in ("job.yaml", "run.mcap"):
         shutil.copy(folder / name, tmp_path)
@@ -310,6 +317,7 @@ def test_a_run_that_is_not_the_recorded_one(folder: Path, tmp_path: Path) -> Non
     assert "state of" not in text
 
 
+@pytest.mark.long
 def test_what_is_not_trusted_does_not_run(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -338,6 +346,7 @@ def test_how_it_is_called(folder: Path) -> None:
     assert "are for --live" in done.output
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("tmux") is None, reason="needs tmux")
 def test_in_a_real_terminal(folder: Path) -> None:
     server = f"rsltrace-live-{os.getpid()}"

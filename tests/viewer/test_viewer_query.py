@@ -14,6 +14,8 @@ from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.events import outputs_text
 
+from tests.tiers import cases
+
 
 def found(run: Run, text: str) -> list[int]:
     condition = parse(text, run)
@@ -132,7 +134,7 @@ _PIECES = ["kind:", "timer", "(", ")", "or", "not", "-", "node:/talker", "time:1
 _PIECES += ["index:>3", ",", "\\", "text:", "and", "9" * 30]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=cases(50, 300), deadline=None)
 @given(
     st.one_of(
         st.text(max_size=30),

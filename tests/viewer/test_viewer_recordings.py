@@ -100,6 +100,7 @@ def test_pairs_have_every_message_once_and_in_order(a: list[int], b: list[int]) 
     assert all(pairs.differs[one] and (one == 0 or not pairs.differs[one - 1]) for one in firsts)
 
 
+@pytest.mark.long
 def test_a_bag(bags: tuple[Path, Path]) -> None:
     async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
         text = await press("down")
@@ -163,6 +164,7 @@ def _chosen(session: RecordingSession, text: str) -> set[tuple[str, int]]:
     return chosen
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kept", [1 << 28, 4000], ids=["in memory", "read again"])
 def test_filters_mean_the_messages_that_they_say(
     bags: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, kept: int
@@ -199,6 +201,7 @@ def test_filters_mean_the_messages_that_they_say(
             session.set_filter(text)
 
 
+@pytest.mark.long
 def test_filters_and_searches_on_the_screen(bags: tuple[Path, Path]) -> None:
     async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
         session = app.session
@@ -228,6 +231,7 @@ def test_filters_and_searches_on_the_screen(bags: tuple[Path, Path]) -> None:
     drive(bags[:1], steps)
 
 
+@pytest.mark.long
 def test_a_filter_of_two_recordings_keeps_what_either_has(bags: tuple[Path, Path]) -> None:
     async def steps(app: RecordingApp, press: Callable[..., Awaitable[str]]) -> None:
         session = app.session
@@ -241,6 +245,7 @@ def test_a_filter_of_two_recordings_keeps_what_either_has(bags: tuple[Path, Path
     drive(bags, steps, filter_text="topic:/pose index:140..150")
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("at", "expected"),
     [("1.445s", ("/pose", 144)), ("0", ("", 0)), ("99999", ("", -1)), ("99s", ("", -1))],

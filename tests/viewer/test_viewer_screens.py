@@ -60,6 +60,7 @@ def shown(
     return show
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("name", "size"), SIZED, ids=SIZE_IDS)
 def test_text_of_larger_screens(
     shown: Callable[..., None], golden: Golden, name: str, size: tuple[int, int]
@@ -70,6 +71,7 @@ def test_text_of_larger_screens(
     shown(name, check, size, light=False)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("name", "light"), THEMED, ids=THEME_IDS)
 def test_text_and_styles_of_screens(
     shown: Callable[..., None], golden: Golden, name: str, light: bool

@@ -74,6 +74,7 @@ def test_a_state_is_shown_as_it_was_after_the_event(tmp_path: Path) -> None:
         assert not any(line.path == "state" for line in inspect(Run(trace), 3, Openness()))
 
 
+@pytest.mark.long
 def test_two_runs_differ_in_a_state_before_they_differ_in_a_message(tmp_path: Path) -> None:
     a, b = (record(tmp_path, "record", gain, f"{gain}.mcap") for gain in ("1", "2"))
     text = screen(a, b, "--size", "100x40", "--export", tmp_path / "screen.txt")
@@ -86,6 +87,7 @@ def test_two_runs_differ_in_a_state_before_they_differ_in_a_message(tmp_path: Pa
     assert rows[at + 2 : at + 4] == ["a '1'", "b '2'"]
 
 
+@pytest.mark.long
 def test_of_hashes_the_screen_says_how_to_see_more(tmp_path: Path) -> None:
     a, b = (record(tmp_path, "true", gain, f"{gain}.mcap") for gain in ("1", "2"))
     text = screen(a, b, "--size", "100x40", "--export", tmp_path / "screen.txt")
@@ -103,6 +105,7 @@ def test_rerun_tells_them_too(tmp_path: Path) -> None:
     assert text[at:].splitlines()[1:3] == ["      a '1'", "      b '2'"]
 
 
+@pytest.mark.long
 def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
     """Also where the runs diverge by something else, and where run a went on."""
     a = record(tmp_path, "false", "1", "a.mcap")

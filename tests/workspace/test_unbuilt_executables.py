@@ -112,6 +112,7 @@ def _write(folder: Path, files: dict[str, str]) -> None:
         path.write_text(text)
 
 
+@pytest.mark.long
 @pytest.mark.ros
 def test_a_checkout_runs_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
@@ -174,6 +175,7 @@ def test_processes_of_a_checkout_find_its_modules_and_shares(
     assert heard == ["from cmake"] * 8
 
 
+@pytest.mark.long
 def test_verify_leaves_shares_where_they_are(
     command: Callable[..., subprocess.CompletedProcess[str]], tmp_path: Path
 ) -> None:
