@@ -107,15 +107,13 @@ def view(
             raise click.UsageError("--follow, --live and --rerun need traces; these are recordings")
         _show(_recordings(chosen, at, filter_text, light=light), export, size, keys)
         return
-    from rsltrace_viewer.model.query.parser import parse
-
     with ExitStack() as stack:
         session, made = _opened(stack, chosen, live=live, job_folder=job_folder, trust=trust)
         app = made(
             start=None if at is None else _place(session, at),
             light=light,
             follow=follow,
-            filter_text=_checked_filter(filter_text, lambda text: parse(text, session.a)),
+            filter_text=_checked_filter(filter_text, session.parse),
             rerun=_follower(stack, chosen) if rerun else None,
             overview=len(chosen) == 1 and at is None and not (filter_text or follow or live),
         )

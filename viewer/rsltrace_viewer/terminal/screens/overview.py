@@ -50,8 +50,8 @@ _FIRST = "↓↑ Enter shows the events of a line   Esc all events   ? keys   q 
 _LATER = "↓↑ Enter shows the events of a line   Esc closes"
 _OWN_KEYS = ("help", "theme", "overview", "escape", "quit", "enter", "yank")
 Choice = tuple[str, str]
-"""What was chosen: ``filter`` with its text, ``event`` with a number, ``key`` with the action that
-a key has among the events, ``more`` with the table to be shown whole."""
+"""What was chosen: ``filter`` with its text, ``event`` with its run and number (``b 12``), ``key``
+with the action that a key has among the events, ``more`` with the table to be shown whole."""
 _Line = tuple[Pieces, Choice | None]
 _Row = Sequence[Part | None]
 """The same node, topic or callback in each run."""
@@ -177,9 +177,9 @@ class OverviewScreen(Screen[Choice | None]):
                 yield _trouble(what, [known.get(what) for known in found])
         for name, one in checks.items():
             for text, style, event in _of_checks(one, f" of run {name}" if len(runs) > 1 else ""):
-                goes_there = event is not None and name == "a"
+                choice = None if event is None else ("event", f"{name} {event}")
                 for line in wrap(text, max(self.app.size.width - 4, 20)):
-                    yield ((line, style),), ("event", str(event)) if goes_there else None
+                    yield ((line, style),), choice
         for name, (run, _) in zip("ab", runs, strict=False):
             yield (_ending(run, f"run {name}" if len(runs) > 1 else "the run"), None)
         unheard = list(dict.fromkeys(filter(None, (unheard_of(run) for run, _ in runs))))
@@ -208,7 +208,8 @@ class OverviewScreen(Screen[Choice | None]):
             yield ((_UNTIMED, "muted"),), None
 
     def _chains(self) -> Iterator[_Line]:
-        """Yield the chains with their latencies; a line leads to the slowest one of run a."""
+        """Yield the chains with their latencies; a line leads to the slowest one of the first run
+        that has one."""
         known = [
             {(one.hops, one.via): one for one in self._session.chains.get(name, ())}
             for name in self._session.runs
@@ -230,8 +231,12 @@ class OverviewScreen(Screen[Choice | None]):
             name = next(printable(one.name) for one in row if one is not None)
             pieces = [(fit(name, names), "plain")]
             pieces += [(f"{_latency(one):>{_CHAIN}}", "muted") for one in row]
-            slowest = row[0].slowest if row[0] is not None else None
-            yield pieces, None if slowest is None else ("event", str(slowest))
+            slowest = [
+                f"{name} {one.slowest}"
+                for name, one in zip("ab", row, strict=False)
+                if one is not None and one.slowest is not None
+            ]
+            yield pieces, ("event", slowest[0]) if slowest else None
         if len(keys) > most:
             more = f"… and {len(keys) - most} more: Enter shows them"
             yield ((more, "muted"),), ("more", "chain")
@@ -290,8 +295,12 @@ def _trouble(what: str, found: Sequence[Trouble | None]) -> _Line:
     pieces.append((f"   {some.key} goes from one to the next" if some.key else "", "muted"))
     if some.filter:
         return pieces, ("filter", some.filter)
-    first = some.first
-    return pieces, ("event", str(first)) if first is not None else None
+    firsts = [
+        f"{name} {one.first}"
+        for name, one in zip("ab", found, strict=False)
+        if one is not None and one.first is not None
+    ]
+    return pieces, ("event", firsts[0]) if firsts else None
 
 
 def _of_checks(checks: Checks, of_run: str) -> Iterator[tuple[str, str, int | None]]:
