@@ -168,11 +168,15 @@ def _opened(
     from rsltrace_viewer.live.state import LiveSession
     from rsltrace_viewer.model.run import Run
 
+    from rsltrace.cli.replay import agree
     from rsltrace.debug.client import DebugSession
+    from rsltrace.replay.preparation import prepared
 
+    with prepared(traces[0], job_folder) as plan:
+        agree(plan, trust=trust)
     run = Run.open(traces[0])
     stack.callback(run.close)
-    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=trust))
+    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
     shown = LiveSession(run)
     return shown, partial(LiveApp, shown, Execution(debugged, run))
 
