@@ -55,6 +55,8 @@ with the action that a key has among the events, ``more`` with the table to be s
 _Line = tuple[Pieces, Choice | None]
 _Row = Sequence[Part | None]
 """The same node, topic or callback in each run."""
+_Column = tuple[str, Callable[[_Row], str]]
+"""The head of a column, and its texts."""
 
 
 class OverviewScreen(Screen[Choice | None]):
@@ -200,8 +202,11 @@ class OverviewScreen(Screen[Choice | None]):
             keys = dict.fromkeys(key for one in known for key in one)
             tables.append((title, field, [[one.get(key) for one in known] for key in keys]))
         names = max((cells(_name(row, f)) for _, f, rows in tables for row in rows), default=0)
-        for title, field, rows in tables:
-            yield from self._table(title, field, rows, max(names, _NAMES_LEAST))
+        # Columns stand below each other: the table with the most of them has the least for names.
+        columns = [self._columns(rows) for _, _, rows in tables]
+        names = min(max(names, _NAMES_LEAST), *(room for room, _ in columns))
+        for (title, field, rows), (_, times) in zip(tables, columns, strict=True):
+            yield from self._table(title, field, rows, names, times)
             yield (), None
         simulated = not is_native(self._session.a.trace)
         if simulated and not timed and all(overview.share >= 1 for _, overview in runs):
@@ -217,8 +222,7 @@ class OverviewScreen(Screen[Choice | None]):
         keys = list(dict.fromkeys(key for one in known for key in one))
         if not keys:
             return
-        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
-        names = max(width - _CHAIN * len(known), _NAMES_LEAST)
+        names = max(self._width - _CHAIN * len(known), _NAMES_LEAST)
         yield (), None
         heads = [(fit(f"chains  {len(keys)}", names), "title")]
         for name in "ab"[: len(known)]:
@@ -241,14 +245,26 @@ class OverviewScreen(Screen[Choice | None]):
             more = f"… and {len(keys) - most} more: Enter shows them"
             yield ((more, "muted"),), ("more", "chain")
 
-    def _table(self, title: str, field: str, rows: Sequence[_Row], names: int) -> Iterator[_Line]:
-        runs = 1 if self._session.b is None else 2
-        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
-        bars = _BAR if width >= 100 else _BAR // 3
-        room = width - bars - 2 - _NUMBERS * runs
+    @property
+    def _width(self) -> int:
+        return max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
+
+    @property
+    def _bars(self) -> int:
+        return _BAR if self._width >= 100 else _BAR // 3
+
+    def _columns(self, rows: Sequence[_Row]) -> tuple[int, list[_Column]]:
+        """Return the room for names, and the columns of durations that fit beside them."""
+        runs = len(self._session.runs)
+        room = self._width - self._bars - 2 - _NUMBERS * runs
         columns = list(_times_of(rows, runs))
         columns = columns[: max(room - _NAMES_LEAST, 0) // _TIMES]
-        names = min(names, room - _TIMES * len(columns))
+        return room - _TIMES * len(columns), columns
+
+    def _table(
+        self, title: str, field: str, rows: Sequence[_Row], names: int, columns: list[_Column]
+    ) -> Iterator[_Line]:
+        runs, bars = len(self._session.runs), self._bars
         heads = [(fit(f"{title}  {len(rows)}", names + bars + 2), "title")]
         what = "sent" if field == "topic" else "events"
         for name in ("a", "b") if runs > 1 else ("",):
@@ -344,7 +360,7 @@ _TIMES_OF: dict[str, Callable[[Part], Times | None]] = {
 }
 
 
-def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[tuple[str, Callable[[_Row], str]]]:
+def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[_Column]:
     """Yield the columns of durations that there is something for: their heads, and their texts."""
     what = "mean, max" if runs == 1 else "means a, b"
     for words, of in _TIMES_OF.items():
