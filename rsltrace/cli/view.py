@@ -107,15 +107,13 @@ def view(
             raise click.UsageError("--follow, --live and --rerun need traces; these are recordings")
         _show(_recordings(chosen, at, filter_text, light=light), export, size, keys)
         return
-    from rsltrace_viewer.model.query.parser import parse
-
     with ExitStack() as stack:
         session, made = _opened(stack, chosen, live=live, job_folder=job_folder, trust=trust)
         app = made(
             start=None if at is None else _place(session, at),
             light=light,
             follow=follow,
-            filter_text=_checked_filter(filter_text, lambda text: parse(text, session.a)),
+            filter_text=_checked_filter(filter_text, session.parse),
             rerun=_follower(stack, chosen) if rerun else None,
             overview=len(chosen) == 1 and at is None and not (filter_text or follow or live),
         )
@@ -170,11 +168,15 @@ def _opened(
     from rsltrace_viewer.live.state import LiveSession
     from rsltrace_viewer.model.run import Run
 
+    from rsltrace.cli.replay import agree
     from rsltrace.debug.client import DebugSession
+    from rsltrace.replay.preparation import prepared
 
+    with prepared(traces[0], job_folder) as plan:
+        agree(plan, trust=trust)
     run = Run.open(traces[0])
     stack.callback(run.close)
-    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=trust))
+    debugged = stack.enter_context(DebugSession(traces[0], job_folder=job_folder, trust=True))
     shown = LiveSession(run)
     return shown, partial(LiveApp, shown, Execution(debugged, run))
 

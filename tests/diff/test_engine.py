@@ -14,11 +14,11 @@ import pytest
 from diff_simulator import MS, Fault, NodePlan, Plan, Publication, Simulation, Storage
 from rsltrace_viewer.model.comparison import Comparison
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.model.view import Sign
 
 import rsltrace
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.diff.result.traces import Diff
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.diff.traces.comparison import DIVERGENCES_MAX
@@ -498,8 +498,8 @@ def test_a_node_that_starts_late_stands_where_it_starts(tmp_path: Path) -> None:
     paths = tmp_path / "a.mcap", tmp_path / "b.mcap"
     with closing(Run.open(paths[0])) as run_a, closing(Run.open(paths[1])) as run_b:
         view = Comparison(run_a, run_b)
-        while not view.done:
-            view.advance()
+        while not view.runs.done:
+            view.runs.take(view.runs.fetch())
         constructed = step(51, 0)
         assert run_a.trace.event(constructed).kind is EventKind.CONSTRUCT
         assert [view.a(place) for place in range(view.count)] == list(range(run_a.count))

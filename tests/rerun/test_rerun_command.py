@@ -3,8 +3,14 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
+import re
+import signal
+import socket
 import subprocess
 import sys
+import urllib.parse
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -67,11 +73,34 @@ def test_a_display_is_known_when_there_is_one(
     assert show.has_display(environ, platform) is found
 
 
-@pytest.mark.parametrize("how", list(show.How))
-def test_a_viewer_is_bound_to_this_machine_only(how: show.How) -> None:
-    line = show.command(Path("run.rrd"), how)
+@pytest.mark.parametrize("ports", [None, (9001, 9002)])
+def test_a_viewer_is_bound_to_this_machine_only(ports: tuple[int, int] | None) -> None:
+    line = show.command(Path("run.rrd"), ports)
     assert line[line.index("--bind") + 1] == "127.0.0.1"
-    assert ("--web-viewer" in line) is (how is show.How.BROWSER)
+    assert ("--web-viewer" in line) is (ports is not None)
+
+
+def test_a_web_viewer_says_at_which_address_it_is(trace: Path) -> None:
+    """Before it blocks: the page is there, and so is the recording that the address names."""
+    command = [sys.executable, "-m", "rsltrace", "rerun", str(trace), "--web"]
+    environ = {**os.environ, "BROWSER": "true"}
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environ, start_new_session=True
+    ) as process:
+        try:
+            assert process.stdout is not None
+            line = process.stdout.readline()
+            found = re.match(r"open (http://127\.0\.0\.1:\d+/\?url=(\S+)) in a browser", line)
+            assert found is not None
+            with urllib.request.urlopen(found[1], timeout=60) as page:
+                assert page.status == 200
+                assert b"<html" in page.read().lower()
+            data = urllib.parse.urlsplit(urllib.parse.unquote(found[2]))
+            assert (data.scheme, data.path) == ("rerun+http", "/proxy")
+            socket.create_connection((str(data.hostname), int(data.port or 0)), timeout=60).close()
+        finally:
+            os.killpg(process.pid, signal.SIGINT)  # as Ctrl-C does, to the viewer as well
+            process.wait(60)
 
 
 def test_what_is_opened_is_a_temporary_recording(

@@ -480,7 +480,7 @@ def test_starting_at_an_event_with_a_filter(made: Path, drive: Drive) -> None:
 def test_two_traces_open_at_their_divergence(pair: tuple[Path, Path], drive: Drive) -> None:
     async def steps(viewer: Any) -> None:
         comparison = viewer.app.session.comparison
-        assert viewer.place == comparison.first_place == comparison.agreeing
+        assert viewer.place == comparison.first_place == comparison.rows.agreeing
         text = viewer.text
         assert "same-input-different-output" in text
         assert "≠ output" in text
@@ -537,7 +537,7 @@ def test_every_sample_can_be_walked_through(drive: Drive, name: str) -> None:
     async def steps(viewer: Any) -> None:
         session = viewer.app.session
         assert session.comparison.diff is not None
-        assert session.comparison.done
+        assert session.comparison.runs.done
         covered_a = [session.view.a(place) for place in range(session.view.count)]
         covered_b = [session.view.b(place) for place in range(session.view.count)]
         # Every event of both runs is at exactly one place, and found there.

@@ -16,7 +16,7 @@ from rsltrace_viewer.model.lane_window import LaneWindow
 from rsltrace_viewer.model.lanes import Lanes, drawn
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.steady import ends_of, spread
-from rsltrace_viewer.model.view import SingleView
+from rsltrace_viewer.model.view import OneRun
 from rsltrace_viewer.model.windows import Window, step_below, step_from
 
 from rsltrace.model.stamp import format_seconds
@@ -116,7 +116,7 @@ def test_a_steady_run_is_drawn_steadily_at_every_zoom(steady: Run, columns: int)
     maker = lanes.makers[0]
     for number in maker.order():
         maker.summarise(number)
-    view = SingleView(steady.count)
+    view = OneRun(steady.count)
     middle = steady.count // 2
     seen = set()
     while not lanes.window.order:

@@ -21,7 +21,7 @@ from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import layout
 from rsltrace_viewer.model.timeline.events import EventTexts
 from rsltrace_viewer.model.timeline.short_names import ShortNames
-from rsltrace_viewer.model.view import SingleView
+from rsltrace_viewer.model.view import OneRun
 from rsltrace_viewer.model.windows import Window
 from rsltrace_viewer.terminal.screens.help import help_text
 
@@ -131,7 +131,8 @@ def test_find_goes_both_ways_and_leaves_out_where_it_starts(long_run: Run) -> No
 
 def test_filtered_rows_map_both_ways(long_run: Run) -> None:
     run = long_run
-    rows = FilteredRows(run, conditions.OfEntities(conditions.ids([4])), SingleView(run.count))
+    condition = conditions.OfEntities(conditions.ids([4]))
+    rows = FilteredRows([(run, condition, False)], OneRun(run.count))
     assert rows.count == 0
     while not rows.done:
         rows.advance()
@@ -150,7 +151,7 @@ def test_lanes_show_every_event_whatever_the_window(long_run: Run) -> None:
     for number in maker.order():
         maker.summarise(number)
     assert sorted(maker.order()) == list(range(len(run.segments)))
-    made = lanes.lanes(SingleView(run.count), 0, (0, 0), 60)
+    made = lanes.lanes(OneRun(run.count), 0, (0, 0), 60)
     assert made.known == 1.0
     assert [lane.label for lane in made.lanes] == ["/talker", "/listener", "(run)"]
     assert all(any(lane.levels) for lane in made.lanes)
@@ -170,7 +171,7 @@ def test_zooming_in_ends_at_single_events_and_out_at_the_whole_run(long_run: Run
     for _ in range(60):
         lanes.zoom(1, (0, 15_000), 80)
     assert lanes.window.order
-    made = lanes.lanes(SingleView(run.count), 15_000, (0, 15_000), 80)
+    made = lanes.lanes(OneRun(run.count), 15_000, (0, 15_000), 80)
     column = made.window.column(15_000, 80)
     assert sum(lane.letters[column] != " " for lane in made.lanes) == 1
     for _ in range(60):
@@ -188,23 +189,24 @@ def test_columns_and_positions_of_a_window_agree(columns: int, length: int) -> N
 
 def test_history_goes_back_and_forward() -> None:
     history = History()
-    history.leave(1)
-    history.leave(5)
-    assert history.back(9) == 5
-    assert history.back(5) == 1
-    assert history.back(1) is None
-    assert history.forward(1) == 5
-    history.leave(5)
-    assert history.forward(7) is None
+    first, second = (False, 1), (True, 5)
+    history.leave(first)
+    history.leave(second)
+    assert history.back((False, 9)) == second
+    assert history.back(second) == first
+    assert history.back(first) is None
+    assert history.forward(first) == second
+    history.leave(second)
+    assert history.forward((False, 7)) is None
 
 
-def test_marks_are_found_in_order() -> None:
+def test_a_mark_is_that_of_all_events_in_a_row() -> None:
     marks = Marks()
-    for place in (30, 10, 20):
-        assert marks.toggle(place)
-    assert (marks.next(10, 1), marks.next(10, -1), marks.next(15, -1)) == (20, None, 10)
-    assert not marks.toggle(20)
-    assert marks.next(10, 1) == 30
+    row = [(False, 3), (True, 4)]
+    assert marks.toggle(row)
+    assert [marks.of([event]) for event in [*row, (True, 3)]] == [True, True, False]
+    assert not marks.toggle(row[1:])
+    assert marks.of(row[:1])
 
 
 def test_the_inspector_decodes_input_and_outputs(run: Run) -> None:

@@ -22,7 +22,6 @@ from rsltrace_viewer.model.recordings.pairs import Pairs
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
 from rsltrace_viewer.model.recordings.recording import Topic
 from rsltrace_viewer.model.recordings.session import RecordingSession
-from rsltrace_viewer.model.view import Sign
 from rsltrace_viewer.terminal.choose import ChooseApp
 from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 from rsltrace_viewer.terminal.screens.help import KeysScreen
@@ -32,6 +31,7 @@ from rsltrace_viewer.terminal.screenshot import settle, text_of
 from trace_maker import uint64_message
 
 from rsltrace.cli.main import cli
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.trace.decode import to_plain
 from rsltrace.words.times import parse_stamp
 

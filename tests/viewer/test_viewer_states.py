@@ -78,7 +78,7 @@ def test_a_state_is_shown_as_it_was_after_the_event(tmp_path: Path) -> None:
 def test_two_runs_differ_in_a_state_before_they_differ_in_a_message(tmp_path: Path) -> None:
     a, b = (record(tmp_path, "record", gain, f"{gain}.mcap") for gain in ("1", "2"))
     text = screen(a, b, "--size", "100x40", "--export", tmp_path / "screen.txt")
-    assert ">≠       1" in text, "an event that leaves another state is not the same"
+    assert ">≠     1   1" in text, "an event that leaves another state is not the same"
     assert "the same, at another time" not in text
     rows = [row.strip() for row in text.splitlines()]
     at = rows.index("▼ ≠ state  of /filter after it")
@@ -119,8 +119,8 @@ def test_a_run_that_an_exception_ended_says_so(tmp_path: Path) -> None:
     assert (
         "! b ended by an exception: /filter: timer Filter.tick raised ValueError, event 7" in text
     )
-    (row,) = [row for row in text.splitlines() if row.startswith(" ≠ !     7 ")]
-    assert "b: /x, exception ValueError" in row
+    (row,) = [row for row in text.splitlines() if row.startswith(" ≠ !   7   7 ")]
+    assert "b: /x 14, exception ValueError" in row
 
 
 def test_a_trace_that_has_no_segment_yet(tmp_path: Path) -> None:

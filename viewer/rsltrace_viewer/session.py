@@ -5,11 +5,12 @@ The app changes this object and draws what it says; tests drive it directly.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING
 
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.errors import TraceError
 from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
@@ -17,7 +18,7 @@ from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
-from rsltrace_viewer.model.history import History, Marks
+from rsltrace_viewer.model.history import Event, History, Marks
 from rsltrace_viewer.model.inspector.effects import Effects
 from rsltrace_viewer.model.inspector.event import inspect
 from rsltrace_viewer.model.inspector.lines import Line, Openness
@@ -28,17 +29,19 @@ from rsltrace_viewer.model.overview import Overview, read_overview
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.parser import parse
+from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.rows import AllRows, FilteredRows, Rows
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.timeline.columns import Columns, layout
 from rsltrace_viewer.model.timeline.events import EventText, EventTexts, node_of
-from rsltrace_viewer.model.timeline.message_values import both_values
+from rsltrace_viewer.model.timeline.pair_values import PairValues
 from rsltrace_viewer.model.timeline.row_values import RowValues
 from rsltrace_viewer.model.timeline.short_names import ShortNames
-from rsltrace_viewer.model.view import Sign, SingleView, View
+from rsltrace_viewer.model.view import OneRun, View
 
 if TYPE_CHECKING:
-    from rsltrace.diff.alignment.blocks import AlignedBlock
+    from rsltrace.diff.alignment.aligned_rows import AlignedRow
+    from rsltrace.diff.traces.aligned_runs import Block
     from rsltrace_viewer.model.comparison import Comparison
     from rsltrace_viewer.model.plots.runs import RunPlots
 
@@ -50,6 +53,12 @@ SEEK: dict[str, tuple[Condition, str]] = {
 }
 """What one can jump to by a key: the condition, and what it is called."""
 
+BOTH, RUN_A, RUN_B = "diff", "a", "b"
+"""What is shown of two runs."""
+
+Sought = Mapping[str, Condition]
+"""By run, what its events have to fulfil: entities have numbers of their own in each."""
+
 
 class Session:
     """One run, or two that are compared. ``place`` is the selected row of the whole timeline."""
@@ -58,8 +67,8 @@ class Session:
         self.a = a
         self.b = b
         self.comparison: Comparison | None = None
-        self.side = "diff" if b is not None else "a"
-        self.view: View = SingleView(a.count)
+        self.side = BOTH if b is not None else RUN_A
+        self.view: View = OneRun(a.count)
         if b is not None:
             for run in (a, b):
                 refuse_native(run.trace, "its events are at times of their own (see rsltrace diff)")
@@ -68,7 +77,7 @@ class Session:
             self.view = self.comparison = Comparison(a, b)
         self.rows: Rows = AllRows(self.view.count)
         self.filter_text = ""
-        self.search: Condition | None = None
+        self.search: Sought | None = None
         self.search_text = ""
         self.place = 0
         if self.comparison is not None:
@@ -82,6 +91,7 @@ class Session:
         runs = self.runs
         self._texts = {name: EventTexts(run, self.base_ns) for name, run in runs.items()}
         self.values = {name: RowValues(run) for name, run in runs.items()}
+        self._pair_values = PairValues(self.comparison.runs) if self.comparison else None
         self._names = self._short_names()
         self.lane_window = LaneWindow([run for run in (a, b) if run is not None])
         self.logs: dict[str, Logs] = {}
@@ -104,19 +114,22 @@ class Session:
         if self.b is not None:
             self.b.close()
 
-    def take_block(self, block: AlignedBlock | None) -> None:
-        """Show another block of two runs; the selected event stays selected."""
+    @property
+    def shown(self) -> dict[str, Run]:
+        """The runs whose events are rows, by their names."""
+        return {name: run for name, run in self.runs.items() if self.view.has(other=name == RUN_B)}
+
+    def take_block(self, block: Block | None) -> None:
+        """Align another block of two runs; the selected event stays selected."""
         comparison = self.comparison
         if comparison is None:
             return
-        a, b = comparison.a(self.place), comparison.b(self.place)
-        comparison.take(block)
-        if a is not None:
-            self.place = comparison.place_of(a)
-        elif b is not None:
-            self.place = comparison.place_of(b, other=True)
+        selected = self._events(self.place)
+        comparison.runs.take(block)
+        for other, index in selected[:1]:
+            self.place = self.view.place_of(index, other=other)
         if not self.filter_text:
-            self.rows = AllRows(comparison.count)
+            self.rows = AllRows(self.view.count)
 
     def replace_run(self, run: Run) -> None:
         """Show a newer state of the same recording. The old file is closed."""
@@ -124,7 +137,7 @@ class Session:
         self._texts["a"] = EventTexts(run, self.base_ns)
         self.values["a"] = RowValues(run)
         self._names = self._short_names()
-        self.view = SingleView(run.count)
+        self.view = OneRun(run.count)
         self.rows = AllRows(run.count)
         self.lane_window.replace_run(run)
         self.logs.clear()
@@ -136,11 +149,35 @@ class Session:
         old.close()
 
     def next_side(self) -> str:
-        """Inspect the differences, run a or run b; return which it is now."""
-        if self.b is not None:
-            sides = ("diff", "a", "b")
-            self.side = sides[(sides.index(self.side) + 1) % 3]
+        """Show both runs, run a alone or run b alone; return which it is now. The selected event
+        stays selected, or the same event in the run that is shown. A filter has to be set anew."""
+        if self.comparison is not None:
+            sides = (BOTH, RUN_A, RUN_B)
+            self._show_side(sides[(sides.index(self.side) + 1) % 3])
         return self.side
+
+    def _show_side(self, side: str) -> None:
+        comparison = self.comparison
+        assert comparison is not None  # one run has one side
+        selected = self._events(self.place)
+        self.side = side
+        if side == BOTH:
+            self.view = comparison
+        else:
+            other = side == RUN_B
+            self.view = OneRun(self.runs[side].count, other=other, aligned=comparison.rows)
+        self.rows = AllRows(self.view.count)
+        own = [event for event in selected if self.view.has(other=event[0])]
+        for event_other, index in (own or selected)[:1]:
+            self.place = self.view.place_of(index, other=event_other)
+        self.effects = None
+
+    def show_event(self, index: int, *, other: bool) -> int:
+        """Return the place of an event of run a (``other``: of run b); show both runs if its own
+        is not shown."""
+        if not self.view.has(other=other):
+            self._show_side(BOTH)
+        return self.view.place_of(index, other=other)
 
     # What is selected.
 
@@ -156,14 +193,21 @@ class Session:
             return "no events in this trace"
         return "no events yet: a run writes some four thousand at a time"
 
+    def _events(self, place: int) -> list[Event]:
+        """Return the events at a place, run a's first."""
+        if not 0 <= place < self.view.count:
+            return []
+        found = ((False, self.view.a(place)), (True, self.view.b(place)))
+        return [(other, index) for other, index in found if index is not None]
+
     def current(self) -> tuple[Run, int] | None:
-        """Return the run and the index of the selected event; None if there is no event."""
-        if self.empty:
-            return None
-        index_a, index_b = self.view.a(self.place), self.view.b(self.place)
-        if self.b is not None and index_b is not None and (index_a is None or self.side == "b"):
-            return self.b, index_b
-        return (self.a, index_a) if index_a is not None else None
+        """Return the run and the index of the selected event (where both runs have it, of run a);
+        None if there is no event."""
+        for other, index in self._events(self.place):
+            run = self.b if other else self.a
+            assert run is not None  # it has an event
+            return run, index
+        return None
 
     def stamp(self) -> int:
         """Return the time of the selected event (0: none)."""
@@ -178,15 +222,17 @@ class Session:
 
     def columns(self, width: int) -> Columns:
         """Return the columns for a timeline of ``width`` cells."""
-        texts = self._texts["a"]
+        texts = [self._texts[name] for name in self.shown]
+        two = len(texts) > 1
         return layout(
             width,
-            index_width=max(t.index_width for t in self._texts.values()),
-            time_width=max(t.time_width for t in self._texts.values()),
-            node_width=texts.node_width,
+            index_width=_numbers_width(self.shown.values()) if two else texts[0].index_width,
+            time_width=max(t.time_width for t in texts),
+            node_width=max(t.node_width for t in texts),
             names=self._names,
             signs=self.b is not None,
-            deltas=self.comparison is not None and self.comparison.shifted,
+            two=two,
+            deltas=two and self.comparison is not None and self.comparison.rows.shifted,
             relative=bool(self.base_ns),
         )
 
@@ -199,43 +245,87 @@ class Session:
     def row(self, row: int) -> tuple[EventText, Sign | None, bool, str]:
         """Return the event of a row in words, its sign, whether it is marked, its relation."""
         place = self.rows.at(row)
-        index, index_b = self.view.a(place), self.view.b(place)
-        if index is not None:
-            event = self._with_values("a", index)
-            if index_b is not None:
-                event = self._with_other(event, place, index, index_b)
-        else:
-            assert index_b is not None  # a place stands for something
-            event = self._with_values("b", index_b)
-        return event, self.view.sign(place), place in self.marks, self._relation(place)
+        events = self._events(place)
+        other, index = events[0]
+        event = self._with_values(RUN_B if other else RUN_A, index)
+        if self.view is self.comparison:
+            event = self._of_two(event, self.comparison.row(place), place)
+        return event, self.view.sign(place), self.marks.of(events), self._relation(place)
 
     def _with_values(self, name: str, index: int) -> EventText:
         return self.values[name].known(self._texts[name].of(index))
 
-    def _with_other(self, event: EventText, place: int, index: int, index_b: int) -> EventText:
-        """Return an event of run a with what is to be said of that of run b beside it."""
-        assert self.b is not None  # there is an event of it
-        if not event.raised:
-            other = self._texts["b"].of(index_b)
-            if other.raised:  # what run a did here is not what one looks for
-                outputs = f"b: {other.outputs}; a: {event.outputs or 'nothing'}"
-                event = replace(event, raised=True, outputs=outputs)
-            elif self.view.sign(place) is Sign.DIFFERS:
-                values = self._with_values("b", index_b).outputs
-                event = replace(event, outputs=both_values(event.outputs, values))
-        later_ns = self.b.stamp(index_b) - self.a.stamp(index)
-        return replace(event, delta=_short_duration(later_ns)) if later_ns else event
+    def _of_two(self, event: EventText, row: AlignedRow, place: int) -> EventText:
+        """Return the event of an aligned row with what is to be said of the other run."""
+        assert self.comparison is not None
+        assert self.b is not None
+        a, b = row.pair
+        text, short, raised = event.outputs, "", event.raised
+        if a is not None and b is not None and row.sign is Sign.DIFFERS:
+            text, short, raised = self._differing(a, b)
+        elif row.sign in (Sign.ONLY_A, Sign.ONLY_B):
+            text = f"only in {'a' if row.b is None else 'b'}{text and ': '}{text}"
+        delta = ""
+        if a is not None and b is not None and (later_ns := self.b.stamp(b) - self.a.stamp(a)):
+            delta = _short_duration(later_ns)
+        if row.elsewhere is not None:
+            there = self.comparison.place_of(row.elsewhere, other=row.b is None)
+            mark = (
+                f"{'↓' if there > place else '↑'} {'b' if row.b is None else 'a'} {row.elsewhere}"
+            )
+            text, short = f"{mark} {text}".rstrip(), f"{mark} {short}" if short else ""
+        numbers = ("" if row.a is None else str(row.a), "" if row.b is None else str(row.b))
+        return replace(
+            event, outputs=text, short=short, raised=raised, delta=delta, numbers=numbers
+        )
+
+    def _differing(self, a: int, b: int) -> tuple[str, str, bool]:
+        """Return in what two events differ, the same in short, and whether one ended with an
+        exception."""
+        events = self._with_values(RUN_A, a), self._with_values(RUN_B, b)
+        texts = [event.outputs or "nothing" for event in events]
+        either = texts[0]
+        if texts[0] != texts[1]:  # what ended with an exception comes first
+            named = [f"a: {texts[0]}", f"b: {texts[1]}"]
+            either = " | ".join(reversed(named) if events[1].raised > events[0].raised else named)
+        raised = any(event.raised for event in events)
+        if events[0].raised != events[1].raised:
+            return either, "", raised
+        assert self._pair_values is not None  # there are two runs
+        known = self._pair_values.known((a, b))
+        if known is None or not known[0]:
+            return either, "", raised
+        return *known, raised
 
     def read_values(self, rows: Sequence[int]) -> Iterator[int]:
         """Read the values of some rows, a row at a time."""
         places = [self.rows.at(row) for row in rows if row < self.rows.count]
-        found = [(self.view.a(place), self.view.b(place)) for place in places]
-        yield from self.values["a"].read([a for a, _ in found if a is not None])
-        if self.b is not None:
-            differs = {place for place in places if self.view.sign(place) is Sign.DIFFERS}
-            pairs = zip(places, found, strict=True)
-            of_b = [b for place, (a, b) in pairs if a is None or place in differs]
-            yield from self.values["b"].read([b for b in of_b if b is not None])
+        own: dict[str, list[int]] = {RUN_A: [], RUN_B: []}
+        pairs = []
+        for place in places:
+            other, index = self._events(place)[0]
+            pair = self._pair(place)
+            if pair is None:
+                own[RUN_B if other else RUN_A].append(index)
+            else:
+                pairs.append(pair)
+        for name, indexes in own.items():
+            if indexes:
+                yield from self.values[name].read(indexes)
+        if self._pair_values is not None:
+            for name, side in zip((RUN_A, RUN_B), zip(*pairs, strict=True), strict=False):
+                yield from self.values[name].read(side)
+            yield from self._pair_values.read(pairs)
+
+    def _pair(self, place: int) -> tuple[int, int] | None:
+        """Return the two events that differ at a place, wherever they stand."""
+        if self.view is not self.comparison:
+            return None
+        row = self.comparison.row(place)
+        a, b = row.pair
+        if row.sign is not Sign.DIFFERS or a is None or b is None:
+            return None
+        return a, b
 
     def _relation(self, place: int) -> str:
         """Return ``cause`` or ``effect`` if that is what the event is to the selected one."""
@@ -257,7 +347,7 @@ class Session:
         here = self.current()
         if here is None:
             return []
-        if self.comparison is not None and self.side == "diff":
+        if self.comparison is not None and self.side == BOTH:
             from rsltrace_viewer.model.inspector.differences import pair_lines
 
             return pair_lines(self.comparison, self.place, self.openness, self.effects)
@@ -331,7 +421,7 @@ class Session:
 
     # Finding.
 
-    def same(self, what: str) -> tuple[Condition, str] | None:
+    def same(self, what: str) -> tuple[Sought, str] | None:
         """Return the condition of ``node``, ``entity`` or ``topic`` being that of the selected
         event, and its name; None if it has none."""
         here = self.current()
@@ -349,48 +439,122 @@ class Session:
         if entity is None:
             return None
         if what == "node":
-            return conditions.of_nodes(run, frozenset((entity.node,))), run.node_name(entity.id)
+            name = run.node_name(entity.id)
+            return {
+                key: conditions.of_nodes(
+                    one,
+                    frozenset(e.node for e in one.entities.values() if one.node_name(e.id) == name),
+                )
+                for key, one in self.runs.items()
+            }, name
         if what == "entity":
-            return conditions.OfEntities(conditions.ids([entity.id])), run.entity_name(entity.id)
+            return {
+                key: conditions.OfEntities(conditions.ids(self._ids_in(one, run, entity.id)))
+                for key, one in self.runs.items()
+            }, run.entity_name(entity.id)
         topic = entity.name if entity.kind in WITH_TOPIC else ""
         if not topic:
             sent = next((o for o in outputs if o.kind is OutputKind.MESSAGE), None)
             topic = run.entity_name(sent.entity) if sent is not None else ""
         if not topic:
             return None
-        return conditions.OfEntities(conditions.ids(run.ids_on(topic)), outputs=True), topic
+        return {
+            key: conditions.OfEntities(conditions.ids(one.ids_on(topic)), outputs=True)
+            for key, one in self.runs.items()
+        }, topic
 
-    def seek(self, condition: Condition, step: int, *, wrap: bool = False) -> Iterator[int | None]:
+    def _ids_in(self, run: Run, own: Run, entity: int) -> list[int]:
+        """Return the id in a run of an entity of run ``own``, if it is there."""
+        if run is own or self.comparison is None:
+            return [entity]
+        matching = self.comparison.runs.matching
+        tables = matching.numbers_a, matching.numbers_b
+        mine, theirs = tables if own is self.a else tables[::-1]
+        return [int(one) for one in (theirs == mine[entity]).nonzero()[0]]
+
+    def seek(self, sought: Sought, step: int, *, wrap: bool = False) -> Iterator[int | None]:
         """Yield None while looking and the places of matches from the selected one on."""
-        here = self.current()
-        if here is None:
+        if self.empty:
             return
-        run, index = here
-        other = run is self.b
-        for found in conditions.find(run, condition, index, step):
-            yield None if found is None else self.view.place_of(found, other=other)
+        yield from self._seek_from(self.place, sought, step)
         if wrap:
-            start = -1 if step > 0 else run.count
-            for found in conditions.find(run, condition, start, step):
-                yield None if found is None else self.view.place_of(found, other=other)
+            yield from self._seek_from(-1 if step > 0 else self.view.count, sought, step)
+
+    def _seek_from(self, start: int, sought: Sought, step: int) -> Iterator[int | None]:
+        """Yield what ``seek`` does, from a place on that does not count."""
+        walks: list[Iterator[int | None]] = []
+        for name, run in self.shown.items():
+            if name in sought:
+                other = name == RUN_B
+                first = self.view.before(start + (step > 0), other=other) - (step > 0)
+                found = conditions.find(run, sought[name], first, step)
+                walks.append(self._places_of(found, other=other))
+        nearest: list[int | None] = [None] * len(walks)
+        last = None
+        while True:
+            for number, walk in enumerate(walks):
+                while nearest[number] is None:
+                    place = next(walk, -1)
+                    if place is None:
+                        yield None
+                    nearest[number] = place
+            there = [place for place in nearest if place is not None and place >= 0]
+            if not there:
+                return
+            best = min(there) if step > 0 else max(there)
+            nearest = [None if place == best else place for place in nearest]
+            if best != last:  # a row with events of both that match is one match
+                yield best
+            last = best
+
+    def _places_of(self, found: Iterator[int | None], *, other: bool) -> Iterator[int | None]:
+        for index in found:
+            yield None if index is None else self.view.place_of(index, other=other)
+
+    @property
+    def segments(self) -> int:
+        """How many segments there are to look at."""
+        return sum(len(run.segments) for run in self.shown.values())
+
+    def parse(self, text: str) -> Sought | None:
+        """Return what a filter or search stands for in each run; None if it is empty.
+
+        Raises QueryError, unless it means something in one of two runs.
+        """
+        found, errors = {}, []
+        for name, run in self.runs.items():
+            try:
+                condition = parse(text, run)
+            except QueryError as error:
+                errors.append(error)
+                continue
+            if condition is None:
+                return None
+            found[name] = condition
+        if not found:
+            raise errors[0]
+        return found
 
     def set_filter(self, text: str) -> FilteredRows | None:
-        """Show only events that fulfil a filter (empty: all). Raises QueryError.
+        """Show only events that fulfil a filter (empty: all), of two runs the rows of events that
+        do. Raises QueryError.
 
         Returns the rows to be found by ``advance``; None if there is no filter.
         """
-        condition = parse(text, self.a)
+        sought = self.parse(text)
         self.filter_text = text.strip()
-        if condition is None:
+        if sought is None:
             self.rows = AllRows(self.view.count)
             return None
-        rows = FilteredRows(self.a, condition, self.view)
-        self.rows = rows
+        shown = [
+            (run, sought[name], name == RUN_B) for name, run in self.shown.items() if name in sought
+        ]
+        self.rows = rows = FilteredRows(shown, self.view)
         return rows
 
     def set_search(self, text: str) -> None:
         """Set what ``n`` looks for (empty: nothing). Raises QueryError."""
-        self.search = parse(text, self.a)
+        self.search = self.parse(text)
         self.search_text = text.strip()
 
     # Going somewhere.
@@ -398,13 +562,40 @@ class Session:
     def go(self, place: int, *, remember: bool = True) -> None:
         """Select a place, and remember where one was."""
         if remember and place != self.place:
-            self.history.leave(self.place)
+            for event in self._events(self.place)[:1]:
+                self.history.leave(event)
         self.place = max(min(place, self.view.count - 1), 0)
         self.effects = None
 
+    def travel(self, step: int) -> int | None:
+        """Return the place one came from (-1), or came back from (1); None if there is none."""
+        for event in self._events(self.place)[:1]:
+            move = self.history.forward if step > 0 else self.history.back
+            found = move(event)
+            return None if found is None else self.view.place_of(found[1], other=found[0])
+        return None
+
+    def toggle_mark(self) -> None:
+        """Mark the selected row, or remove its mark."""
+        self.marks.toggle(self._events(self.place))
+
+    def next_mark(self, step: int) -> int | None:
+        """Return the place of the next (or previous) mark; None if there is none."""
+        places = {
+            self.view.place_of(i, other=o) for o, i in self.marks.events if self.view.has(other=o)
+        }
+        beyond = [place for place in places if (place - self.place) * step > 0]
+        return min(beyond, key=lambda place: abs(place - self.place), default=None)
+
     def place_at_time(self, stamp_ns: int) -> int:
-        """Return the place of the first event at a time or later."""
-        return self.view.place_of(self.a.index_at(stamp_ns))
+        """Return the place of the first event at a time or later; of the last one if none is."""
+        found = [
+            (run.end_ns < stamp_ns, self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B))
+            for name, run in self.shown.items()
+            if run.count
+        ]
+        over, place = min(found)
+        return max(place for _, place in found) if over else place
 
     # Words.
 
@@ -414,12 +605,14 @@ class Session:
 
         found = self.same("topic")
         return RunPlots(
-            [run for run in (self.a, self.b) if run is not None],
-            self.title(),
+            list(self.shown.values()),
+            " ↔ ".join(run.name for run in self.shown.values()),
             topic=found[1] if found is not None else "",
             stamp_ns=None if self.empty else self.stamp(),
             base_ns=self.base_ns,
-            diff=self.comparison.diff if self.comparison is not None else None,
+            diff=self.comparison.diff
+            if self.comparison is not None and self.side == BOTH
+            else None,
             chains=[one.name for found in self.chains.values() for one in found],
         )
 
@@ -437,27 +630,33 @@ class Session:
 
     def facts(self) -> str:
         """Return a line of facts about it."""
-        trace = self.a.trace
-        parts = [f"{self.a.count:,} event{'' if self.a.count == 1 else 's'}"]
-        if self.b is not None and self.b.count != self.a.count:
-            parts[0] = f"{self.a.count:,} and {self.b.count:,} events"
+        runs = list(self.shown.values())
+        run = runs[0]
+        trace = run.trace
+        parts = [f"{run.count:,} event{'' if run.count == 1 else 's'}"]
+        if len(runs) > 1 and runs[1].count != run.count:
+            parts[0] = f"{run.count:,} and {runs[1].count:,} events"
         # What is wrong comes early: little fits into a narrow terminal.
-        unfinished = [r.name for r in (self.a, self.b) if r is not None and not r.trace.complete]
+        unfinished = [one.name for one in runs if not one.trace.complete]
         if unfinished:
-            parts.append("not finished" if self.b is None else f"{unfinished[0]} is not finished")
+            parts.append("not finished" if len(runs) == 1 else f"{unfinished[0]} is not finished")
         reason = trace.result.get("exit_code", "0")
-        if self.b is None and reason != "0":
+        if len(runs) == 1 and reason != "0":
             parts.append(f"exit code {reason}")
         how = "of real time" if is_native(trace) else "simulated"
-        parts.append(f"{format_duration(self.a.end_ns - self.a.start_ns)} {how}")
+        parts.append(f"{format_duration(run.end_ns - run.start_ns)} {how}")
         if self.base_ns:
             began = datetime.fromtimestamp(self.base_ns // NS_PER_S, tz=timezone.utc)
             parts.append(f"from {began:%Y-%m-%d %H:%M:%S} UTC")
-        nodes = sum(1 for e in self.a.entities.values() if e.kind is EntityKind.NODE)
+        nodes = sum(1 for e in run.entities.values() if e.kind is EntityKind.NODE)
         parts.append(f"{nodes} node{'' if nodes == 1 else 's'}")
-        if self.b is None:
+        if len(runs) == 1:
             parts.append("native" if is_native(trace) else f"digest {trace.digest}")
         return "  ".join(parts)
+
+
+def _numbers_width(runs: Iterable[Run]) -> int:
+    return max(3, *(len(str(max(run.count - 1, 0))) for run in runs))
 
 
 def _short_duration(duration_ns: int) -> str:

@@ -20,9 +20,11 @@ def axis_text(
     """
     window, columns = lanes.window, lanes.columns
     if window.order:
-        left, right = f"event {max(window.start, 0)}", f"{window.end - 1}"
+        # The rows of two runs have other numbers than the events in them.
+        what = "row" if len({lane.run for lane in lanes.lanes}) > 1 else "event"
+        left, right = f"{what} {max(window.start, 0)}", f"{window.end - 1}"
         here = f"▲ {position}"
-        scale = "one column is one event"
+        scale = f"one column is one {what}"
     else:
         left = f"{format_seconds(window.start - base_ns)[:-6]} s"
         right = f"{format_seconds(window.end - base_ns)[:-6]} s"

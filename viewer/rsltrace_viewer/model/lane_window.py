@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from rsltrace_viewer.model.lane_maker import LaneMaker
 from rsltrace_viewer.model.lanes import Lanes, drawn, lettered
@@ -30,11 +30,21 @@ class LaneWindow:
             maker.whole = self.whole
         self._made: tuple[tuple[object, ...], Lanes] | None = None
 
-    @property
-    def labels(self) -> list[str]:
-        """The name of each lane: the nodes of a run, each twice if both runs have it."""
-        names = dict.fromkeys(label for maker in self.makers for label in maker.labels)
-        return [name for name in names for maker in self.makers if name in maker.labels]
+    def labels(self, view: View) -> list[str]:
+        """Return the name of each lane: the nodes of a run, each twice if both runs are shown and
+        have it."""
+        makers = [maker for _, maker in self._shown(view)]
+        names = dict.fromkeys(label for maker in makers for label in maker.labels)
+        return [name for name in names for maker in makers if name in maker.labels]
+
+    def _shown(self, view: View) -> list[tuple[str, LaneMaker]]:
+        """Return the runs whose events have places, by name (empty with one trace)."""
+        names = ("a", "b") if len(self.makers) > 1 else ("",)
+        return [
+            (name, maker)
+            for name, maker in zip(names, self.makers, strict=True)
+            if view.has(other=name == "b")
+        ]
 
     def replace_run(self, run: Run) -> None:
         """Show a newer state of the recording; the whole of it, if that was shown."""
@@ -53,7 +63,8 @@ class LaneWindow:
             maker = self.makers[selected[0]]
             self.window = maker.centred(self.window, selected[1], columns)
         known = tuple(maker.summaries for maker in self.makers)
-        key = (self.window, columns, known, place if self.window.order else -1)
+        shown = [view.has(other=other) for other in (False, True)]
+        key = (self.window, columns, known, shown, place if self.window.order else -1)
         if self._made is None or self._made[0] != key:
             make = self._by_place if self.window.order else self._by_time
             self._made = key, make(view, selected, columns)
@@ -67,13 +78,10 @@ class LaneWindow:
             maker = self.makers[selected[0]]
             self.window = maker.zoomed(self.window, step, selected[1], columns)
 
-    def _names(self) -> tuple[str, ...]:
-        return ("a", "b") if len(self.makers) > 1 else ("",)
-
     def _by_time(self, view: View, selected: tuple[int, int] | None, columns: int) -> Lanes:
         window = self.window.fitted(columns)
-        counted = [maker.count(window, columns) for maker in self.makers]
-        return drawn(window, columns, list(zip(self._names(), counted, strict=True)))
+        counted = [(name, maker.count(window, columns)) for name, maker in self._shown(view)]
+        return drawn(window, columns, counted)
 
     def _by_place(self, view: View, selected: tuple[int, int] | None, columns: int) -> Lanes:
         cause = None
@@ -81,13 +89,13 @@ class LaneWindow:
             found = int(self._runs[selected[0]].row(selected[1])["cause_event"])
             if found < self._runs[selected[0]].count:
                 cause = view.place_of(found, other=bool(selected[0]))
-        ways: tuple[Callable[[int], int | None], ...] = (view.a, view.b)
         last = min(self.window.end, view.count)
-        made = [
-            maker.letters(columns, [way(p) for p in range(self.window.start, last)])
-            for maker, way in zip(self.makers, ways, strict=False)
-        ]
-        return lettered(self.window, columns, list(zip(self._names(), made, strict=True)), cause)
+        made = []
+        for name, maker in self._shown(view):
+            index = view.b if name == "b" else view.a
+            indexes = [index(place) for place in range(self.window.start, last)]
+            made.append((name, maker.letters(columns, indexes)))
+        return lettered(self.window, columns, made, cause)
 
 
 def _around(window: Window, place: int, columns: int, count: int) -> Window:

@@ -80,7 +80,7 @@ def controlled(*arguments: str, pause: Callable[[float], None] = time.sleep) -> 
     require()
     from rerun.experimental import ViewerClient
 
-    port = _free_port()
+    port = free_port()
     with (
         tempfile.TemporaryDirectory(prefix="rsltrace-") as folder,  # for what it leaves behind
         tempfile.TemporaryFile() as complaints,
@@ -133,7 +133,8 @@ def _wait_for(
     )
 
 
-def _free_port() -> int:
+def free_port() -> int:
+    """Return a port of this machine's own address that nobody listens at."""
     with socket.socket() as probe:
         probe.bind((LOOPBACK, 0))
         return int(probe.getsockname()[1])

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
+from urllib.parse import quote
 
 from rsltrace.errors import SetupError
+from rsltrace.terminal import say
+from rsltrace_viewer.rerun_export.control import free_port
 from rsltrace_viewer.rerun_export.sdk import LOOPBACK, viewer
 
 
@@ -51,13 +56,25 @@ def has_display(environ: Mapping[str, str], platform: str) -> bool:
     return bool(environ.get("DISPLAY") or environ.get("WAYLAND_DISPLAY"))
 
 
-def command(recording: Path, how: How) -> list[str]:
-    """Return the command line that opens a recording, bound to this machine either way."""
-    line = [str(viewer()), "--bind", LOOPBACK, "--new", str(recording)]
-    if how is How.BROWSER:
-        # The server holds the recording for the browser; over 1 GB it would drop the beginning.
-        return [*line, "--web-viewer", "--web-viewer-port", "0", "--server-memory-limit", "50%"]
-    return line
+def command(recording: Path, ports: tuple[int, int] | None) -> list[str]:
+    """Return the command line that opens a recording, bound to this machine either way: in a
+    window, or for a browser, with the recording served at the first of two ``ports`` and the page
+    at the second."""
+    line = [str(viewer()), "--bind", LOOPBACK, str(recording)]
+    if ports is None:
+        return [*line, "--new"]
+    data, page = map(str, ports)
+    # The server holds the recording for the browser; over 1 GB it would drop the beginning.
+    held = ("--server-memory-limit", "50%")
+    return [*line, "--port", data, "--web-viewer", "--web-viewer-port", page, *held]
+
+
+def address(ports: tuple[int, int]) -> str:
+    """Return what a browser opens: the page, which is told where the recording is."""
+    data, page = ports
+    return (
+        f"http://{LOOPBACK}:{page}/?url={quote(f'rerun+http://{LOOPBACK}:{data}/proxy', safe='')}"
+    )
 
 
 @contextmanager
@@ -68,12 +85,16 @@ def temporary_recording() -> Iterator[Path]:
 
 
 def open_viewer(recording: Path, how: How) -> None:
-    """Show a recording and wait until the viewer is closed (Ctrl-C closes a web viewer).
+    """Show a recording and wait until the viewer is closed (Ctrl-C closes a web viewer). Rerun
+    opens a browser where it finds one, and does not say at which address: this does.
 
     Raises SetupError if the viewer fails.
     """
-    process = subprocess.Popen(command(recording, how))
+    ports = (free_port(), free_port()) if how is How.BROWSER else None
+    process = subprocess.Popen(command(recording, ports))
     try:
+        if ports is not None and _answers(process, ports[1]):
+            say(f"open {address(ports)} in a browser on this machine; Ctrl-C ends it")
         status = process.wait()
     except KeyboardInterrupt:
         # The terminal sent it to the viewer as well; give it a moment to end by itself.
@@ -81,3 +102,15 @@ def open_viewer(recording: Path, how: How) -> None:
         return
     if status:
         raise SetupError(f"Rerun's viewer ended with status {status}; see its message above")
+
+
+def _answers(process: subprocess.Popen[bytes], port: int) -> bool:
+    """Wait until the viewer serves its page; return False if it ends before."""
+    while process.poll() is None:
+        try:
+            socket.create_connection((LOOPBACK, port), timeout=1).close()
+        except OSError:
+            time.sleep(0.05)
+        else:
+            return True
+    return False

@@ -16,10 +16,11 @@ from textual.widget import Widget
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable, shortened
 from rsltrace.words.times import parse_stamp
+from rsltrace_viewer.model.history import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
 from rsltrace_viewer.model.source import place_of_output, source_of
-from rsltrace_viewer.session import Session
+from rsltrace_viewer.session import BOTH, RUN_A, RUN_B, Session
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.editor import edit
 from rsltrace_viewer.terminal.follow import Follow
@@ -124,8 +125,9 @@ class ViewerApp(Stepping):
                 stamp_ns += self.session.base_ns if stamp_ns < self.session.base_ns else 0
                 self.go(self.session.place_at_time(stamp_ns), centre=True)
             else:
-                index = min(parse_index(event.text), self.session.a.count - 1)
-                self.go(self.session.view.place_of(index), centre=True)
+                name, index = parse_index(event.text)
+                run = self.session.runs.get(name) or next(iter(self.session.shown.values()))
+                self._go_to_event(min(index, run.count - 1), other=run is self.session.b)
 
     def _filter(self, text: str) -> None:
         rows = self.session.set_filter(text)
@@ -282,7 +284,8 @@ class ViewerApp(Stepping):
                 return
             what, text = choice
             if what == "event":
-                self.go(self.session.view.place_of(int(text)), centre=True)
+                name, index = parse_index(text)
+                self._go_to_event(index, other=name == RUN_B)
             elif what == "key":
                 self.call_next(self.run_action, text)
             else:
@@ -297,9 +300,9 @@ class ViewerApp(Stepping):
         """Show all log records."""
         from rsltrace_viewer.terminal.screens.logs import LogScreen
 
-        def chosen(place: int | None) -> None:
-            if place is not None:
-                self.go(place, centre=True)
+        def chosen(event: Event | None) -> None:
+            if event is not None:
+                self._go_to_event(event[1], other=event[0])
 
         self.push_screen(LogScreen(self.session), chosen)
 
@@ -347,7 +350,8 @@ class ViewerApp(Stepping):
             text = f"{line.label} {line.value}".strip()
         elif self.session.rows.count:
             event = self.session.row(self.session.row_of_place())[0]
-            parts = (str(event.index), event.time, event.node, event.kind, event.entity)
+            numbers = " / ".join(filter(None, event.numbers)) or str(event.index)
+            parts = (numbers, event.time, event.node, event.kind, event.entity)
             text = " ".join((*parts, event.outputs)).strip()
         else:
             return
@@ -382,12 +386,14 @@ class ViewerApp(Stepping):
             self.push_screen(ReportScreen(comparison.diff))
 
     def action_other(self) -> None:
-        """Inspect the differences, run a, run b in turn."""
-        side = self.session.next_side()
-        self._show_header()
-        self._show_rows()
-        self._show_inspector()
-        self._say({"diff": "the differences", "a": "run a only", "b": "run b only"}[side])
+        """Show both runs, run a alone, run b alone in turn."""
+        session = self.session
+        side = session.next_side()
+        if session.filter_text:
+            self._filter(session.filter_text)
+        self.side_changed()
+        self.go(session.place, remember=False, centre=True)
+        self._say({BOTH: "both runs", RUN_A: "run a only", RUN_B: "run b only"}[side])
 
     def action_follow(self) -> None:
         """Follow a file that is still being recorded, or stop that."""

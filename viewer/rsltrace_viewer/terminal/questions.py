@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from itertools import chain
+
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.query.completion import completions
-from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.widgets.prompt import Question
 
@@ -13,10 +14,11 @@ def question_of(kind: str, session: Session) -> Question:
     """Return the question of a kind: ``search``, ``filter``, ``time`` or ``index``."""
 
     def check_query(text: str) -> object:
-        return parse(text, session.a)
+        return session.parse(text)
 
     def complete(text: str) -> list[str]:
-        return completions(text, session.a)
+        found = (completions(text, run) for run in session.runs.values())
+        return list(dict.fromkeys(chain.from_iterable(found)))
 
     questions = {
         "search": Question(
@@ -36,16 +38,25 @@ def question_of(kind: str, session: Session) -> Question:
             complete,
         ),
         "time": Question("time", "go to time", "seconds, or 20ms, 3us, 500ns", "", parse_stamp),
-        "index": Question(
-            "index", "go to event", f"0 to {max(session.a.count - 1, 0)}", "", parse_index
-        ),
+        "index": Question("index", "go to event", _numbers(session), "", parse_index),
     }
     return questions[kind]
 
 
-def parse_index(text: str) -> int:
-    """Return the number of an event. Raises ValueError."""
+def _numbers(session: Session) -> str:
+    """Return which events there are: ``0 to 99``, of two runs ``a 0 to 99, b 0 to 98``."""
+    shown = session.shown.items()
+    return ", ".join(
+        f"{name + ' ' if len(shown) > 1 else ''}0 to {max(run.count - 1, 0)}" for name, run in shown
+    )
+
+
+def parse_index(text: str) -> tuple[str, int]:
+    """Return the run (``a``, ``b``; empty: not said) and the number of an event. Raises
+    ValueError."""
     cleaned = text.strip().replace(",", "").replace("_", "").lstrip("#")
-    if not cleaned.isdecimal():
+    name = cleaned[:1].lower() if cleaned[:1].lower() in ("a", "b") else ""
+    number = cleaned[len(name) :].strip()
+    if not number.isdecimal():
         raise ValueError(f"{text!r} is no whole number")
-    return int(cleaned)
+    return name, int(number)

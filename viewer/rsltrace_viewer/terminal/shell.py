@@ -171,15 +171,15 @@ class Shell(App[None]):
         if not worker.is_cancelled:
             self.call_from_thread(self._explained)
         shown = perf_counter()
-        while not comparison.done and not worker.is_cancelled:
+        while not comparison.runs.done and not worker.is_cancelled:
             try:
-                block = comparison.fetch()
+                block = comparison.runs.fetch()
             except RsltraceError as error:
                 self.call_from_thread(self.notify, str(error), severity="error")
                 return
             # On the app's thread: the view must not change while a screen is drawn from it.
             self.call_from_thread(self.session.take_block, block)
-            if comparison.done or perf_counter() - shown > _REPORT_S:
+            if comparison.runs.done or perf_counter() - shown > _REPORT_S:
                 self.call_from_thread(self._show_rows)
                 shown = perf_counter()
 
@@ -218,7 +218,7 @@ class Shell(App[None]):
         screen.set_class(width >= WIDE, "wide")
         screen.set_class(height < 16, "low")
         screen.set_class(height < 11 or (width < WIDE and height < 14), "lowest")
-        labels = self.session.lane_window.labels
+        labels = self.session.lane_window.labels(self.session.view)
         self.lanes.fit_labels(labels, width, two=self.session.b is not None)
         rows = min(len(labels), max(4, height // 5))
         self._more_lanes = max(1 - rows, min(self._more_lanes, len(labels) - rows))
@@ -277,7 +277,7 @@ class Shell(App[None]):
         made, position = session.lanes(lanes.columns)
         first, divergences = None, frozenset[int]()
         if session.comparison is not None:
-            found = session.comparison.divergences_in(made.window, made.columns)
+            found = session.comparison.divergences_in(session.view, made.window, made.columns)
             first, divergences = found
         lanes.base_ns = session.base_ns
         lanes.show(

@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 from rsltrace_viewer.model.inspector.effects import Effects, effects_of
 from rsltrace_viewer.model.inspector.event import summary_line
-from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.run import Run
-from rsltrace_viewer.session import SEEK
+from rsltrace_viewer.session import SEEK, Sought
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.screens.pick import PickScreen
 from rsltrace_viewer.terminal.shell import Shell
@@ -63,13 +62,13 @@ class Stepping(Shell):
         if found is None:
             self._say(f"this event has no {what}")
             return
-        condition, name = found
-        self._seek(condition, step, f"event of {name}" if what != "topic" else f"event on {name}")
+        sought, name = found
+        self._seek(sought, step, f"event of {name}" if what != "topic" else f"event on {name}")
 
     def action_seek(self, what: str, step: int) -> None:
         """Go to the next exception, log record, warning or finding."""
         condition, name = SEEK[what]
-        self._seek(condition, step, name)
+        self._seek(dict.fromkeys(self.session.runs, condition), step, name)
 
     def action_next_match(self, step: int) -> None:
         """Go to the next match of the search; without one, to the next divergence."""
@@ -77,7 +76,7 @@ class Stepping(Shell):
         if session.search is not None:
             self._seek(session.search, step, f"match of {session.search_text}", wrap=True)
         elif session.comparison is not None:
-            place = session.comparison.next_divergence(session.place, step)
+            place = session.comparison.next_divergence(session.view, session.place, step)
             if place is None:
                 self._say(f"no {'later' if step > 0 else 'earlier'} divergence")
             else:
@@ -85,12 +84,13 @@ class Stepping(Shell):
         else:
             self._say("nothing is searched: / searches")
 
-    def _seek(self, condition: Condition, step: int, name: str, *, wrap: bool = False) -> None:
-        """Go to the nearest place where a condition holds, looking for it in the background."""
+    def _seek(self, sought: Sought, step: int, name: str, *, wrap: bool = False) -> None:
+        """Go to the nearest place with an event that fulfils its run's condition. It is looked
+        for in the background."""
         which = "next" if step > 0 else "previous"
 
         def steps() -> Iterator[int | None]:
-            looked = enumerate(self.session.seek(condition, step, wrap=wrap), start=1)
+            looked = enumerate(self.session.seek(sought, step, wrap=wrap), start=1)
             for count, place in looked:
                 if place is not None:
                     yield place
@@ -103,7 +103,7 @@ class Stepping(Shell):
             elif done:
                 self._say(f"no {'later' if step > 0 else 'earlier'} {name}")
             elif found is not None:
-                share = min(-found / max(len(self.session.a.segments), 1), 1)
+                share = min(-found / max(self.session.segments, 1), 1)
                 self._say(f"looking for the {which} {name} … {share:.0%}, Esc stops")
 
         walk(self, "seek", steps(), arrive)
@@ -152,15 +152,25 @@ class Stepping(Shell):
         self.push_screen(PickScreen(f"event {effects.event} caused", choices), chosen)
 
     def _go_to_event(self, index: int, *, other: bool) -> None:
-        self.go(self.session.view.place_of(index, other=other))
+        session = self.session
+        side, place = session.side, session.show_event(index, other=other)
+        if session.side != side:
+            self.side_changed()
+        self.go(place, centre=session.side != side)
+
+    def side_changed(self) -> None:
+        """Draw everything anew: another run is shown than before, or both."""
+        self._fit(self.size.width, self.size.height)
+        self._show_header()
+        self._redraw()
 
     def action_go_back(self) -> None:
         """Go back to where one was."""
-        self._travel(self.session.history.back(self.session.place), "the start of your way")
+        self._travel(self.session.travel(-1), "the start of your way")
 
     def action_go_forward(self) -> None:
         """Go forward again."""
-        self._travel(self.session.history.forward(self.session.place), "where you came from last")
+        self._travel(self.session.travel(1), "where you came from last")
 
     def _travel(self, place: int | None, what: str) -> None:
         if place is None:
@@ -171,12 +181,12 @@ class Stepping(Shell):
     def action_mark(self) -> None:
         """Mark the place, or remove its mark."""
         if not self.session.empty:
-            self.session.marks.toggle(self.session.place)
+            self.session.toggle_mark()
             self.timeline.redraw()
 
     def action_next_mark(self, step: int) -> None:
         """Go to the next mark."""
-        place = self.session.marks.next(self.session.place, step)
+        place = self.session.next_mark(step)
         if place is None:
             self._say("no mark there; m sets one")
         else:

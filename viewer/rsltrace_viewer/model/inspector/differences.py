@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rsltrace.diff.causes.event_views import EventViews
-from rsltrace.diff.causes.message_differences import message_differences
-from rsltrace.diff.options import DiffOptions
+from rsltrace.diff.alignment.aligned_rows import AlignedRow
 from rsltrace.diff.report.differences import distance_text
 from rsltrace.diff.result.divergence import Divergence, MessageDifference
-from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.fields import FieldDifference
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.diff.result.verdicts import ENDED_BY_EXCEPTION
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
@@ -25,7 +23,6 @@ from rsltrace_viewer.model.inspector.state_differences import (
     differing_call_lines,
     differing_state_lines,
 )
-from rsltrace_viewer.model.view import Sign
 
 _SAYS = {
     Sign.MATCH: "the same in both runs",
@@ -43,9 +40,9 @@ def pair_lines(
 ) -> list[Line]:
     """Return the lines of the inspector for a place of two runs. ``effects`` are those of the
     event in run a, or in run b if it is there only."""
-    a, b = comparison.a(place), comparison.b(place)
-    sign = comparison.sign(place)
-    lines = list(_title(comparison, place, a, b, sign))
+    row = comparison.row(place)
+    (a, b), sign = row.pair, row.sign
+    lines = list(_title(comparison, place, row))
     try:
         first = place == comparison.first_place
         if first:  # the reason comes first: in a small terminal little else fits
@@ -85,10 +82,13 @@ def _of_run(line: Line, *, other: bool) -> Line:
     )
 
 
-def _title(
-    comparison: Comparison, place: int, a: int | None, b: int | None, sign: Sign
-) -> Iterator[Line]:
-    view = _view(comparison, a, b)
+def _title(comparison: Comparison, place: int, row: AlignedRow) -> Iterator[Line]:
+    (a, b), sign = row.pair, row.sign
+    view = (
+        comparison.runs.view(b or 0, of_b=True)
+        if a is None
+        else comparison.runs.view(a, of_b=False)
+    )
     entity = f"{view.entity.node or RUN_NAME}  {view.kind.label} {view.entity.name}"
     number = str(a if a is not None else b)
     if a is not None and b is not None and a != b:
@@ -96,6 +96,13 @@ def _title(
     yield Line(0, f"event {number}", printable(entity), Role.SECTION, "event")
     role = Role.SAME if sign in (Sign.MATCH, Sign.UNKNOWN) else Role.DIFFERENCE
     yield Line(1, sign.value, _SAYS[sign], role, "event.sign")
+    if row.elsewhere is not None:
+        other, there = row.b is None, comparison.place_of(row.elsewhere, other=row.b is None)
+        mark, name = "↓" if there > place else "↑", "b" if other else "a"
+        words = f"in run {name} it stands {'below' if there > place else 'above'}: {row.elsewhere}"
+        yield Line(
+            1, mark, words, Role.LINK, "event.elsewhere", link=row.elsewhere, other_run=other
+        )
     stamps = [
         run.stamp(index)
         for run, index in ((comparison.run_a, a), (comparison.run_b, b))
@@ -110,13 +117,6 @@ def _title(
             f"{format_seconds(stamps[0])} s / {format_seconds(stamps[1])} s (b is {later} {which})"
         )
         yield Line(1, "at", text, Role.DIFFERENCE, "event.at")
-
-
-def _view(comparison: Comparison, a: int | None, b: int | None) -> EventView:
-    if a is not None:
-        return EventViews(comparison.diff_run_a).view(a)
-    assert b is not None  # a place stands for something
-    return EventViews(comparison.diff_run_b).view(b)
 
 
 def _why(comparison: Comparison) -> Iterator[Line]:
@@ -162,12 +162,14 @@ def chain_lines(comparison: Comparison, divergence: Divergence) -> Iterator[Line
 def _difference_lines(
     comparison: Comparison, a: int | None, b: int | None, openness: Openness, *, first: bool
 ) -> Iterator[Line]:
-    runs = comparison.diff_run_a, comparison.diff_run_b
-    view_a = EventViews(runs[0]).view(a) if a is not None else None
-    view_b = EventViews(runs[1]).view(b) if b is not None else None
-    found = message_differences(*runs, view_a, view_b, DiffOptions())
+    runs = comparison.runs
+    view_a = runs.view(a, of_b=False) if a is not None else None
+    view_b = runs.view(b, of_b=True) if b is not None else None
+    found = runs.differences(a, b)
     known = comparison.diff.shown if first and comparison.diff is not None else None
-    beside = list(differing_state_lines(runs, (view_a, view_b), known, openness))
+    beside = list(
+        differing_state_lines((runs.run_a, runs.run_b), (view_a, view_b), known, openness)
+    )
     if known is not None:
         beside += differing_call_lines(known.calls)
     if not found and not beside:

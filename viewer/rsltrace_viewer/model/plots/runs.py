@@ -20,6 +20,8 @@ from rsltrace_viewer.model.plots.series import (
 )
 from rsltrace_viewer.model.run import Run
 
+_NOTHING = Series(np.zeros(0), np.zeros(0), "")
+
 
 class RunPlots:
     """What can be plotted of ``runs``. ``topic`` is that of the selected event, or empty;
@@ -49,18 +51,21 @@ class RunPlots:
         return self._title
 
     def topics(self) -> list[str]:
-        """Return the topics with messages of run a."""
-        return topics_with_messages(self._runs[0])
+        """Return the topics with messages."""
+        return list(dict.fromkeys(t for run in self._runs for t in topics_with_messages(run)))
 
     def others(self) -> list[Source]:
         """Return rates, latencies, and what is known of chains."""
         kinds = (CHAIN_LATENCY, CHAIN_AGE)
         chains = [Source(kind, name) for name in self._chains for kind in kinds]
-        return [*sources_of(self._runs[0]), *chains]
+        return [*dict.fromkeys(s for run in self._runs for s in sources_of(run)), *chains]
 
     def fields(self, topic: str) -> list[Source]:
         """Return the numeric fields of a topic. Raises TraceError."""
-        return fields_of(self._runs[0], topic)
+        of_runs = (
+            fields_of(run, topic) for run in self._runs if topic in topics_with_messages(run)
+        )
+        return list(dict.fromkeys(field for fields in of_runs for field in fields))
 
     def first(self) -> tuple[str, str]:
         """Return the field that differs first; otherwise the topic of the selected event."""
@@ -90,8 +95,7 @@ class RunPlots:
             latest = None
             for latest in series_of(run, source):
                 yield [*done, self._since_base(latest)]
-            if latest is not None:
-                done.append(self._since_base(latest))
+            done.append(self._since_base(latest) if latest is not None else _NOTHING)
         yield done
 
     def _since_base(self, one: Series) -> Series:

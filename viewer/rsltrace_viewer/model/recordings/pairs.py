@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rsltrace.diff.bags.sequences import gaps_by_order
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace_viewer.model.recordings.recording import Topic
-from rsltrace_viewer.model.view import Sign
 
 _NONE = -1
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
@@ -20,7 +21,6 @@ from rsltrace_viewer.model.recordings.matches import Key, Matches
 from rsltrace_viewer.model.recordings.pairs import Pairs
 from rsltrace_viewer.model.recordings.recording import Recording, Topic
 from rsltrace_viewer.model.timeline.message_values import differing_values, message_values
-from rsltrace_viewer.model.view import Sign
 
 _PREVIEW_BYTES = 1 << 16
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.timeline.events import EventText
 from rsltrace_viewer.model.timeline.short_names import ShortNames
 
@@ -51,6 +51,8 @@ class Columns:
             "sign": sign,
             "mark": mark,
             "index": str(event.index),
+            "a": event.numbers[0],
+            "b": event.numbers[1],
             "time": event.time[:-3] if self.micros else event.time,
             "delta": event.delta,
             "node": event.node,
@@ -60,7 +62,15 @@ class Columns:
             "output": event.output_hash,
             "outputs": event.outputs,
         }
-        return [(c.name, self._fit(values[c.name], c)) for c in self.columns]
+        return [(c.name, self._fit(self._text(c, values, event), c)) for c in self.columns]
+
+    def _text(self, column: Column, values: Mapping[str, str], event: EventText) -> str:
+        text = values[column.name]
+        if column.name != "outputs":
+            return text
+        if event.delta and not any(one.name == "delta" for one in self.columns):
+            text = f"{event.delta}  {text}"
+        return event.short if event.short and cells(text) > column.width else text
 
     def _fit(self, text: str, column: Column) -> str:
         if column.name in self.names:
@@ -89,28 +99,35 @@ def layout(
     node_width: int,
     names: Mapping[str, ShortNames],
     signs: bool = False,
+    two: bool = False,
     deltas: bool = False,
     relative: bool = False,
 ) -> Columns:
-    """Return the columns for a timeline of ``width`` cells. Narrow ones lose the least needed."""
+    """Return the columns for a timeline of ``width`` cells. Narrow ones lose the least needed.
+
+    ``signs``: how rows compare; ``two``: the numbers of both runs."""
     wanted = [Column("sign", 1)] if signs else []
-    wanted += [Column("mark", 1), Column("index", index_width, right=True)]
+    wanted += [Column("mark", 1)]
+    wanted += [
+        Column(name, index_width, right=True) for name in (("a", "b") if two else ("index",))
+    ]
     spare = width - sum(c.width + GAP for c in wanted) - GAP
     micros = width < 90
     time = max(time_width - 3 if micros else time_width, 11 if relative else 6)
-    node = min(node_width, max(8, width // 6))
+    share = 8 if two and micros else 6
+    node = min(node_width, max(8, width // share))
     for column, least in (
         (Column("time", time, right=True), 0),
-        *(((Column("delta", _DELTA, right=True), 0),) if deltas else ()),
+        *(((Column("delta", _DELTA, right=True), 0),) if deltas and not micros else ()),
         (Column("node", node), 0),
         (Column("kind", 6), 6),
-        (Column("entity", max(10, min(22, width // 6))), 0),
+        (Column("entity", max(10, min(22, width // share))), 0),
     ):
         if spare - column.width - GAP < least:
             break
         wanted.append(column)
         spare -= column.width + GAP
-    if spare >= 14 + 44:
+    if spare >= 14 + 44 and not two:  # in which two may differ
         wanted += [Column("input", 6), Column("output", 6)]
         spare -= 14
     if spare > 3:

@@ -39,6 +39,10 @@ class EventText:
     """Whether it logged a warning or worse."""
     delta: str = ""
     """How much later it happened in run b, if not at the same time."""
+    short: str = ""
+    """Of two runs, what to say instead of ``outputs`` where there is no room for that."""
+    numbers: tuple[str, str] = ("", "")
+    """Of two runs, its number in a and in b, as far as it stands in the row."""
 
 
 class EventTexts:

@@ -47,24 +47,16 @@ def differing_values(a: object, b: object) -> tuple[str, str]:
     return texts[0], texts[1]
 
 
-def both_values(a: str, b: str) -> str:
-    """Return what two events did in one text, where only values differ: ``/odom x=0.31→0.35``."""
-    words = list(zip(a.split(" "), b.split(" "), strict=False))
-    if a.count(" ") != b.count(" ") or not all(_are_alike(*both) for both in words):
-        return a
-    return " ".join(one if one == other else _both(one, other) for one, other in words)
-
-
-def _are_alike(a: str, b: str) -> bool:
-    """Whether two words may stand for the same thing: values of a field, of a whole message."""
-    name, equals, _ = a.partition("=")
-    alike = b.startswith(f"{name}=") if equals else not (a.startswith("/") or "=" in b)
-    return a == b or (alike and not b.startswith("/") and a.endswith(",") == b.endswith(","))
-
-
-def _both(a: str, b: str) -> str:
-    value = b.partition("=")[2] or b
-    return f"{a.removesuffix(',')}→{value}"
+def field_name(path: str, *, whole: bool = False) -> str:
+    """Return how a row calls a field: ``x``, of an angular velocity ``ω``; ``whole``: with the
+    field it is in. A message that has nothing but ``data`` needs no name."""
+    names = path.split(".")
+    name = names[-1].rstrip("_")
+    if "angular" in names[:-1]:
+        name = _TURNS.get(name, name)
+    if path == "data":
+        return ""
+    return ".".join([*names[-2:-1], name]) if whole else name
 
 
 def _leaves(value: Any, path: str, in_full: bool = False) -> Iterator[tuple[str, str]]:
@@ -110,7 +102,7 @@ def _yaw(x: float, y: float, z: float, w: float) -> float:
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
-def number(value: float) -> str:
-    """Return a number in three digits behind the first: ``0.31``, ``1.234e+06``."""
-    text = f"{value:.4g}"
+def number(value: float, digits: int = 4) -> str:
+    """Return a number in so many digits: ``0.31``, ``1.234e+06``."""
+    text = f"{value:.{digits}g}"
     return "0" if text == "-0" else text

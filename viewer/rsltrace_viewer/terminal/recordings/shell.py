@@ -10,11 +10,11 @@ from textual.containers import Container
 from textual.content import Content
 from textual.widgets import Static
 
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace.model.printable import printable
 from rsltrace_viewer.model.cells import cells, fit
 from rsltrace_viewer.model.inspector.lines import Line
 from rsltrace_viewer.model.recordings.session import RecordingSession
-from rsltrace_viewer.model.view import Sign
 from rsltrace_viewer.terminal.background import walk
 from rsltrace_viewer.terminal.recordings.keys import recording_keys
 from rsltrace_viewer.terminal.widgets.bars import HeaderBar, verdict_lines

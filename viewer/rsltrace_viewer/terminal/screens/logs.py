@@ -14,8 +14,9 @@ from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace_viewer.model.cells import fit
+from rsltrace_viewer.model.history import Event
 from rsltrace_viewer.model.logs import LogLine, event_of
-from rsltrace_viewer.session import Session
+from rsltrace_viewer.session import RUN_B, Session
 from rsltrace_viewer.terminal.widgets.list_view import ListView, Pieces
 
 _LEVELS = ((0, "all"), (30, "warnings and worse"), (40, "errors"))
@@ -23,8 +24,8 @@ _NAME = 20
 _AGAIN_S = 0.3
 
 
-class LogScreen(Screen[int | None]):
-    """Gives the place of the event that logged what was chosen, or None."""
+class LogScreen(Screen[Event | None]):
+    """Gives the event that logged what was chosen, or None. Lists the records of what is shown."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,q,g", "dismiss(None)", "close"),
@@ -62,6 +63,7 @@ class LogScreen(Screen[int | None]):
         self._lines = [
             (run, line)
             for run, logs in self._session.logs.items()
+            if run in self._session.shown
             for line in logs.lines
             if line.record.level >= least
         ]
@@ -75,7 +77,8 @@ class LogScreen(Screen[int | None]):
         view.show(self._row, len(self._lines))
         view.call_after_refresh(view.go, view.cursor)
         runs = 1 if self._session.b is None else 2
-        more = sum(logs.more for logs in self._session.logs.values())
+        known = self._session.logs.items()
+        more = sum(logs.more for run, logs in known if run in self._session.shown)
         state = "" if self._known == runs else "  reading …"
         state += f"  and {more:,} more that are not kept" if more else ""
         text = f"log  {self._session.title()}  {len(self._lines):,} records  {words}{state}"
@@ -111,7 +114,7 @@ class LogScreen(Screen[int | None]):
         """Go to the event that logged it."""
         name, line = self._lines[event.line]
         session = self._session
-        run = session.b if name == "b" and session.b is not None else session.a
+        run = session.b if name == RUN_B and session.b is not None else session.a
         try:
             index = event_of(run, line)
         except TraceError as error:
@@ -120,4 +123,4 @@ class LogScreen(Screen[int | None]):
         if index is None:
             self.app.notify("the event that logged this is not in the trace")
         else:
-            self.dismiss(session.view.place_of(index, other=run is session.b))
+            self.dismiss((name == RUN_B, index))

@@ -50,11 +50,13 @@ _FIRST = "↓↑ Enter shows the events of a line   Esc all events   ? keys   q 
 _LATER = "↓↑ Enter shows the events of a line   Esc closes"
 _OWN_KEYS = ("help", "theme", "overview", "escape", "quit", "enter", "yank")
 Choice = tuple[str, str]
-"""What was chosen: ``filter`` with its text, ``event`` with a number, ``key`` with the action that
-a key has among the events, ``more`` with the table to be shown whole."""
+"""What was chosen: ``filter`` with its text, ``event`` with its run and number (``b 12``), ``key``
+with the action that a key has among the events, ``more`` with the table to be shown whole."""
 _Line = tuple[Pieces, Choice | None]
 _Row = Sequence[Part | None]
 """The same node, topic or callback in each run."""
+_Column = tuple[str, Callable[[_Row], str]]
+"""The head of a column, and its texts."""
 
 
 class OverviewScreen(Screen[Choice | None]):
@@ -177,9 +179,9 @@ class OverviewScreen(Screen[Choice | None]):
                 yield _trouble(what, [known.get(what) for known in found])
         for name, one in checks.items():
             for text, style, event in _of_checks(one, f" of run {name}" if len(runs) > 1 else ""):
-                goes_there = event is not None and name == "a"
+                choice = None if event is None else ("event", f"{name} {event}")
                 for line in wrap(text, max(self.app.size.width - 4, 20)):
-                    yield ((line, style),), ("event", str(event)) if goes_there else None
+                    yield ((line, style),), choice
         for name, (run, _) in zip("ab", runs, strict=False):
             yield (_ending(run, f"run {name}" if len(runs) > 1 else "the run"), None)
         unheard = list(dict.fromkeys(filter(None, (unheard_of(run) for run, _ in runs))))
@@ -200,15 +202,19 @@ class OverviewScreen(Screen[Choice | None]):
             keys = dict.fromkeys(key for one in known for key in one)
             tables.append((title, field, [[one.get(key) for one in known] for key in keys]))
         names = max((cells(_name(row, f)) for _, f, rows in tables for row in rows), default=0)
-        for title, field, rows in tables:
-            yield from self._table(title, field, rows, max(names, _NAMES_LEAST))
+        # Columns stand below each other: the table with the most of them has the least for names.
+        columns = [self._columns(rows) for _, _, rows in tables]
+        names = min(max(names, _NAMES_LEAST), *(room for room, _ in columns))
+        for (title, field, rows), (_, times) in zip(tables, columns, strict=True):
+            yield from self._table(title, field, rows, names, times)
             yield (), None
         simulated = not is_native(self._session.a.trace)
         if simulated and not timed and all(overview.share >= 1 for _, overview in runs):
             yield ((_UNTIMED, "muted"),), None
 
     def _chains(self) -> Iterator[_Line]:
-        """Yield the chains with their latencies; a line leads to the slowest one of run a."""
+        """Yield the chains with their latencies; a line leads to the slowest one of the first run
+        that has one."""
         known = [
             {(one.hops, one.via): one for one in self._session.chains.get(name, ())}
             for name in self._session.runs
@@ -216,8 +222,7 @@ class OverviewScreen(Screen[Choice | None]):
         keys = list(dict.fromkeys(key for one in known for key in one))
         if not keys:
             return
-        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
-        names = max(width - _CHAIN * len(known), _NAMES_LEAST)
+        names = max(self._width - _CHAIN * len(known), _NAMES_LEAST)
         yield (), None
         heads = [(fit(f"chains  {len(keys)}", names), "title")]
         for name in "ab"[: len(known)]:
@@ -230,20 +235,36 @@ class OverviewScreen(Screen[Choice | None]):
             name = next(printable(one.name) for one in row if one is not None)
             pieces = [(fit(name, names), "plain")]
             pieces += [(f"{_latency(one):>{_CHAIN}}", "muted") for one in row]
-            slowest = row[0].slowest if row[0] is not None else None
-            yield pieces, None if slowest is None else ("event", str(slowest))
+            slowest = [
+                f"{name} {one.slowest}"
+                for name, one in zip("ab", row, strict=False)
+                if one is not None and one.slowest is not None
+            ]
+            yield pieces, ("event", slowest[0]) if slowest else None
         if len(keys) > most:
             more = f"… and {len(keys) - most} more: Enter shows them"
             yield ((more, "muted"),), ("more", "chain")
 
-    def _table(self, title: str, field: str, rows: Sequence[_Row], names: int) -> Iterator[_Line]:
-        runs = 1 if self._session.b is None else 2
-        width = max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
-        bars = _BAR if width >= 100 else _BAR // 3
-        room = width - bars - 2 - _NUMBERS * runs
+    @property
+    def _width(self) -> int:
+        return max(min(self.app.size.width - 4, _WIDTH_MAX), 40)
+
+    @property
+    def _bars(self) -> int:
+        return _BAR if self._width >= 100 else _BAR // 3
+
+    def _columns(self, rows: Sequence[_Row]) -> tuple[int, list[_Column]]:
+        """Return the room for names, and the columns of durations that fit beside them."""
+        runs = len(self._session.runs)
+        room = self._width - self._bars - 2 - _NUMBERS * runs
         columns = list(_times_of(rows, runs))
         columns = columns[: max(room - _NAMES_LEAST, 0) // _TIMES]
-        names = min(names, room - _TIMES * len(columns))
+        return room - _TIMES * len(columns), columns
+
+    def _table(
+        self, title: str, field: str, rows: Sequence[_Row], names: int, columns: list[_Column]
+    ) -> Iterator[_Line]:
+        runs, bars = len(self._session.runs), self._bars
         heads = [(fit(f"{title}  {len(rows)}", names + bars + 2), "title")]
         what = "sent" if field == "topic" else "events"
         for name in ("a", "b") if runs > 1 else ("",):
@@ -290,8 +311,12 @@ def _trouble(what: str, found: Sequence[Trouble | None]) -> _Line:
     pieces.append((f"   {some.key} goes from one to the next" if some.key else "", "muted"))
     if some.filter:
         return pieces, ("filter", some.filter)
-    first = some.first
-    return pieces, ("event", str(first)) if first is not None else None
+    firsts = [
+        f"{name} {one.first}"
+        for name, one in zip("ab", found, strict=False)
+        if one is not None and one.first is not None
+    ]
+    return pieces, ("event", firsts[0]) if firsts else None
 
 
 def _of_checks(checks: Checks, of_run: str) -> Iterator[tuple[str, str, int | None]]:
@@ -335,7 +360,7 @@ _TIMES_OF: dict[str, Callable[[Part], Times | None]] = {
 }
 
 
-def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[tuple[str, Callable[[_Row], str]]]:
+def _times_of(rows: Sequence[_Row], runs: int) -> Iterator[_Column]:
     """Yield the columns of durations that there is something for: their heads, and their texts."""
     what = "mean, max" if runs == 1 else "means a, b"
     for words, of in _TIMES_OF.items():

@@ -14,10 +14,10 @@ from textual.message import Message
 from textual.scroll_view import ScrollView
 from textual.strip import Strip
 
+from rsltrace.diff.result.row_sign import Sign
 from rsltrace_viewer.model.cells import fit
 from rsltrace_viewer.model.timeline.columns import Columns
 from rsltrace_viewer.model.timeline.events import EventText
-from rsltrace_viewer.model.view import Sign
 from rsltrace_viewer.terminal.widgets.styles import background_of, set_virtual_size
 
 _MARGIN = 3
@@ -46,6 +46,8 @@ _SIGN_STYLES = {
 }
 _STYLED = {
     "index": "muted",
+    "a": "muted",
+    "b": "muted",
     "time": "time",
     "node": "node",
     "kind": "muted",
@@ -258,7 +260,7 @@ class Timeline(ScrollView, can_focus=True, inherit_bindings=False):
 
     def _style_of(self, name: str, shown: Row, mark: str) -> str:
         sign = shown.sign
-        if name in ("sign", "index") and sign is not None:
+        if name in ("sign", "index", "a", "b") and sign is not None:
             return _SIGN_STYLES[sign]
         if sign in (Sign.ONLY_A, Sign.ONLY_B, Sign.DIFFERS) and name != "time":
             return _SIGN_STYLES[sign] if name in ("input", "output", "outputs") else "plain"
