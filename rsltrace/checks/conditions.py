@@ -6,12 +6,12 @@ import ast
 import re
 from dataclasses import dataclass, replace
 
-from rsltrace.debug.conditions.condition import Armed, Condition, is_true
-from rsltrace.debug.conditions.expressions import Expression, parse_expression
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.occurrences import OnTopic
-from rsltrace.debug.conditions.text import parse_condition
-from rsltrace.debug.conditions.view import EventView, Moment
+from rsltrace.conditions.condition import Armed, Condition, is_true
+from rsltrace.conditions.expressions import Expression, parse_expression
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.occurrences import OnTopic
+from rsltrace.conditions.text import parse_condition
+from rsltrace.conditions.view import EventView, Moment
 from rsltrace.errors import ConditionError
 
 _TOPIC = r"/[A-Za-z_]\w*(?:/[A-Za-z_]\w*)*"

@@ -10,9 +10,9 @@ from rsltrace.checks.conditions import compared, condition, opposite, plain, top
 from rsltrace.checks.functions import violations
 from rsltrace.checks.latency import Known, LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
-from rsltrace.checks.trace_events import TraceEvent, events_of
-from rsltrace.debug.conditions.condition import Armed, Condition
-from rsltrace.debug.conditions.names import Names, names_of
+from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.names import Names, names_of
+from rsltrace.conditions.trace_events import TraceEvent, events_of
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
@@ -111,6 +111,11 @@ def evaluating(
     names = names_of(trace.entities.values(), are_all=came_to_its_end, fields=trace.fields_of)
     held = [_property(trace, job, index, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
+    places = [
+        locate(job, ("checks", index, job.checks[index].kind))
+        for index, one in enumerate(held)
+        if one is not None
+    ]
     if properties:
         topics: set[str] | None = set()
         for spec in (one for one in job.checks if one.latency is None):
@@ -119,8 +124,8 @@ def evaluating(
         for event in events_of(trace, topics):
             if last is not None and event.index >= last:
                 break  # what follows the end
-            for one in properties:
-                _see(one, event)
+            for one, where in zip(properties, places, strict=True):
+                _see(one, event, where)
             yield []
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
@@ -140,11 +145,12 @@ def evaluating(
     yield results
 
 
-def _see(one: Property, event: TraceEvent) -> None:
+def _see(one: Property, event: TraceEvent, where: str) -> None:
     try:
         one.see(event)
     except ConditionError as error:
-        raise CheckError(f"a check cannot be evaluated: {error.message}\n  {error.text}") from None
+        message = f"a check cannot be evaluated: {error.message}\n  {error.text}"
+        raise CheckError(message, where=where) from None
 
 
 def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:

@@ -273,8 +273,8 @@ def _when(shell: Prompt, rest: str) -> None:
 
 def _as_condition(text: str, shell: Prompt) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
-    from rsltrace.debug.conditions.expressions import parse_expression
-    from rsltrace.debug.conditions.text import parse_condition
+    from rsltrace.conditions.expressions import parse_expression
+    from rsltrace.conditions.text import parse_condition
 
     try:
         parse_condition(text, shell.names())

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from rsltrace.debug.conditions.view import Sent
+from rsltrace.conditions.view import Sent
 from rsltrace.errors import TraceError
 from rsltrace.model.event import NO_EVENT, Event, Output, OutputKind
 from rsltrace.trace.reader import Trace

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from rsltrace.debug.conditions.names import Fields
+from rsltrace.conditions.names import Fields
 from rsltrace.errors import did_you_mean
 
 _INTERFACE = re.compile(r"\w+(?:/\w+){1,2}")
