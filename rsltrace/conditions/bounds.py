@@ -26,12 +26,13 @@ class LimitError(ValueError):
 
 
 class Budget:
-    """The steps that an expression has left."""
+    """The steps that an expression has left. ``reading`` is for what stands outside of loops."""
 
-    __slots__ = ("left",)
+    __slots__ = ("left", "reading")
 
     def __init__(self) -> None:
         self.left = STEPS_MAX
+        self.reading: Budget = _ReadingBudget(self)
 
     def spend(self, steps: int) -> None:
         """Take some away.
@@ -53,7 +54,7 @@ class Budget:
         self.spend(1 + (size >> 3 if text else size))
 
 
-class ReadingBudget(Budget):
+class _ReadingBudget(Budget):
     """Outside of loops, what goes through data once costs nothing; what is made costs always."""
 
     __slots__ = ("_paying",)

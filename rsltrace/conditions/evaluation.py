@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import ast
 import dataclasses
+import inspect
 import warnings
 from array import array
 from collections.abc import Callable, Iterator, Mapping
@@ -32,12 +33,18 @@ from rsltrace.conditions.bounds import (
     TEXT_MAX,
     Budget,
     LimitError,
-    ReadingBudget,
     checked,
     weight,
 )
-from rsltrace.conditions.functions import CONSTANTS, FUNCTIONS, METHODS, OF_MODULES, items
-from rsltrace.conditions.operators import BINARY, COMPARE, UNARY, element
+from rsltrace.conditions.functions import (
+    CONSTANTS,
+    FUNCTIONS,
+    METHODS,
+    OF_FLOATS,
+    OF_MODULES,
+    items,
+)
+from rsltrace.conditions.operators import BINARY, COMPARE, UNARY, USUAL, element
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.model.placeholders import PLACEHOLDERS
 
@@ -58,7 +65,7 @@ class Scope:
         self.moment = moment
         self.message = message
         self.budget = budget
-        self.reading = ReadingBudget(budget)
+        self.reading = budget.reading
         self.own: dict[str, Any] = {}
 
 
@@ -278,36 +285,30 @@ class _Compiler:
 
     def _compare(self, node: ast.Compare, own: Mapping[str, str], depth: int) -> Evaluate:
         left = self.part(node.left, own, depth)
-        rest = [
+        (compare, right), *rest = [
             (COMPARE[type(sign)], self.part(one, own, depth))
             for sign, one in zip(node.ops, node.comparators, strict=True)
         ]
-        if len(rest) == 1:
-            compare, right = rest[0]
-            if isinstance(right, _Constant) and type(right.value) in _SMALL:
-                constant = right.value
+        if rest:
+            return _chain(left, compare, right, rest)
+        if isinstance(right, _Constant) and type(right.value) in _SMALL:
+            constant = right.value
+            if not depth:
+                return lambda scope: compare(left(scope), constant)
 
-                def compared_with(scope: Scope) -> Any:
-                    found = compare(left(scope), constant)
-                    if depth and type(found) is not bool:
-                        scope.budget.spend(getattr(found, "size", 1) >> 6)
-                    return found
+            def compared_with(scope: Scope) -> Any:
+                a = left(scope)
+                if type(a) in _SMALL:
+                    return compare(a, constant)
+                return _compared(scope, compare, a, constant)
 
-                return compared_with if depth else lambda scope: compare(left(scope), constant)
+            return compared_with
 
         def compared(scope: Scope) -> Any:
-            found, a = True, left(scope)
-            for compare, right in rest:
-                b = right(scope)
-                if type(b) in _NESTED:
-                    weight(b, scope.budget)
-                elif depth and type(b) not in _SMALL and hasattr(b, "__len__"):
-                    scope.budget.spend(len(b) >> 6)
-                found = compare(a, b)
-                if len(rest) > 1 and not found:
-                    return found
-                a = b
-            return found
+            a, b = left(scope), right(scope)
+            if type(a) in _SMALL and type(b) in _SMALL:
+                return compare(a, b)
+            return _compared(scope, compare, a, b)
 
         return compared
 
@@ -336,9 +337,19 @@ class _Compiler:
                 raise Refused(node, str(error)) from None
             except Exception:
                 pass  # it is said where it is evaluated
-        if depth:
-            return lambda scope: operate(scope.budget, left(scope), right(scope))
-        return lambda scope: operate(scope.reading, left(scope), right(scope))
+        usual = USUAL.get(type(node.op))
+        if usual is None:
+            return lambda scope: operate(
+                scope.budget if depth else scope.reading, left(scope), right(scope)
+            )
+
+        def computed(scope: Scope) -> Any:
+            a, b = left(scope), right(scope)
+            if type(a) is float and type(b) in _REALS:
+                return usual(a, b)
+            return operate(scope.budget if depth else scope.reading, a, b)
+
+        return computed
 
     def _unary(self, node: ast.UnaryOp, own: Mapping[str, str], depth: int) -> Evaluate:
         operate = UNARY[type(node.op)]
@@ -371,6 +382,10 @@ class _Compiler:
                 words = ", ".join(_OPTIONS)
                 raise Refused(option.value, f"functions here take no {option.arg}=, only {words}")
             options[option.arg] = self.part(option.value, own, depth)
+        try:
+            inspect.signature(function).bind(None, *values, **options)
+        except TypeError as error:
+            raise Refused(node, f"{ast.unparse(node.func)}: {error}") from None
         if options:
 
             def called_with(scope: Scope) -> Any:
@@ -381,6 +396,16 @@ class _Compiler:
             return called_with
         if len(values) == 1:
             (only,) = values
+            usual = OF_FLOATS.get(function)
+            if usual is not None:
+
+                def called_often(scope: Scope) -> Any:
+                    value = only(scope)
+                    if type(value) is float:
+                        return usual(value)
+                    return checked(function(scope.budget if depth else scope.reading, value))
+
+                return called_often
             if depth:
                 return lambda scope: checked(function(scope.budget, only(scope)))
             return lambda scope: checked(function(scope.reading, only(scope)))
@@ -441,16 +466,16 @@ class _Compiler:
             among, targets, unpacks, tests, is_free = loops[at]
             own_values, budget = scope.own, scope.budget
             is_last = at == len(loops) - 1
+            first, *others = targets
             for item in items(scope.reading if is_free else budget, among(scope)):
                 if not is_free:
                     budget.spend(cost)
-                if unpacks:
-                    parts = list(item)
-                    if len(parts) != len(targets):
-                        raise ValueError(f"{len(parts)} values for {len(targets)} names")
-                    own_values.update(zip(targets, parts, strict=True))
+                if not unpacks:
+                    own_values[first] = item
+                elif len(others) == 1:
+                    own_values[first], own_values[others[0]] = item
                 else:
-                    own_values[targets[0]] = item
+                    own_values.update(zip(targets, item, strict=True))
                 for test in tests:
                     if not test(scope):
                         break
@@ -463,7 +488,26 @@ class _Compiler:
                     else:
                         yield from run(scope, at + 1)
 
-        return lambda scope: run(scope, 0)
+        among, targets, _, tests, is_free = loops[0]
+        if len(loops) > 1 or tests or len(targets) != 1 + unpacks:
+            return lambda scope: run(scope, 0)
+
+        def simple(scope: Scope) -> Iterator[Any]:  # the usual loop
+            own_values, budget = scope.own, scope.budget
+            first, second = targets[0], targets[-1]
+            for item in items(scope.reading if is_free else budget, among(scope)):
+                if not is_free:
+                    budget.spend(cost)
+                if first is second and not unpacks:
+                    own_values[first] = item
+                else:
+                    own_values[first], own_values[second] = item
+                found = result(scope)
+                if type(found) not in _SMALL:
+                    weight(found, budget)
+                yield found
+
+        return simple
 
     def _comprehension(self, node: ast.ListComp, own: Mapping[str, str], depth: int) -> Evaluate:
         generate = self._generator(node, own, depth)
@@ -471,6 +515,7 @@ class _Compiler:
         return lambda scope: list(generate(scope))
 
 
+_REALS = frozenset((int, float, bool))
 _SMALL = frozenset((int, float, bool, type(None)))
 _NESTED = frozenset((list, tuple))
 _OPTIONS = ("default", "start", "reverse", "ndigits", "axis")
@@ -484,9 +529,54 @@ _WORDS: Mapping[type[ast.AST], str] = {
     ast.Starred: "*",
     ast.Dict: "a dictionary",
     ast.DictComp: "a dictionary",
-    ast.Set: "a set {…}: (…) will do",
-    ast.SetComp: "a set {…}: set(…) will do",
+    ast.Set: "{…}",
+    ast.SetComp: "{…}",
 }
+
+
+def _chain(
+    left: Evaluate,
+    compare: Callable[[Any, Any], Any],
+    right: Evaluate,
+    rest: list[tuple[Callable[[Any, Any], Any], Evaluate]],
+) -> Evaluate:
+    """Return how ``0.1 < x < 3`` is evaluated: each part once."""
+
+    def chained(scope: Scope) -> Any:
+        a, b = left(scope), right(scope)
+        small = type(a) in _SMALL and type(b) in _SMALL
+        found = compare(a, b) if small else _compared(scope, compare, a, b)
+        for compare_next, following in rest:
+            if not found:
+                return found
+            a, b = b, following(scope)
+            small = type(a) in _SMALL and type(b) in _SMALL
+            found = compare_next(a, b) if small else _compared(scope, compare_next, a, b)
+        return found
+
+    if len(rest) == 1 and isinstance(left, _Constant) and isinstance(rest[0][1], _Constant):
+        low, below, high = left.value, rest[0][0], rest[0][1].value
+        if type(low) in _SMALL and type(high) in _SMALL:
+
+            def between(scope: Scope) -> Any:
+                value = right(scope)
+                if type(value) in _SMALL:
+                    return compare(low, value) and below(value, high)
+                return chained(scope)
+
+            return between
+    return chained
+
+
+def _compared(scope: Scope, compare: Callable[[Any, Any], Any], a: Any, b: Any) -> Any:
+    """Compare two values of which one may be large, and pay for it inside of loops."""
+    if type(b) in _NESTED:
+        weight(b, scope.budget)
+    elif scope.own and hasattr(b, "__len__"):
+        scope.budget.spend(len(b) >> 6)
+    if scope.own and hasattr(a, "__len__"):
+        scope.budget.spend(len(a) >> 6)
+    return compare(a, b)
 
 
 class _Constant:

@@ -14,7 +14,7 @@ from types import GeneratorType
 from typing import Any
 
 from rsltrace.conditions.bounds import INT_BITS_MAX, Budget, LimitError, checked
-from rsltrace.conditions.operators import BINARY, fits, is_array, numeric
+from rsltrace.conditions.operators import BINARY, fits, is_array, numeric, plain
 
 Function = Callable[..., Any]
 
@@ -30,10 +30,13 @@ CONSTANTS: Mapping[str, float] = {
 
 
 def items(budget: Budget, value: Any) -> Any:
-    """Return a value to be gone through, and pay for it.
+    """Return a value to be gone through, and pay for it. Items of an array are plain numbers.
 
     :raises TypeError: it is no sequence.
     """
+    if is_array(value):
+        budget.spend(len(value) >> 5)
+        return value.tolist() if value.ndim == 1 else value
     if type(value) is not GeneratorType:
         if isinstance(value, (set, frozenset)):
             raise TypeError("a set has no order: say sorted(...)")
@@ -45,11 +48,11 @@ def _listed(budget: Budget, value: Any) -> list[Any]:
     if type(value) is GeneratorType:
         return list(value)  # each step of it has paid
     budget.spend(len(value))
-    return list(value)
+    return list(items(budget, value) if is_array(value) else value)
 
 
 def _extreme(name: str) -> Function:
-    plain = getattr(builtins, name)
+    builtin = getattr(builtins, name)
 
     def extreme(budget: Budget, *values: Any, **options: Any) -> Any:
         if set(options) - {"default"}:
@@ -60,33 +63,29 @@ def _extreme(name: str) -> Function:
                 budget.spend(value.size >> 8)
                 found = getattr(value, name)()
                 if found == found:  # else it depends on where nan stands, as in Python
-                    return found
+                    return found.item()
             if isinstance(value, (set, frozenset)):
-                return plain(value, **options)
-            return plain(items(budget, value), **options)
-        return plain(*values)
+                return builtin(value, **options)
+            return builtin(items(budget, value), **options)
+        return builtin(*values)
 
     return extreme
 
 
 def _truth(name: str) -> Function:
-    plain = getattr(builtins, name)
+    builtin = getattr(builtins, name)
 
     def truth(budget: Budget, value: Any) -> Any:
         if is_array(value):
             budget.spend(value.size >> 8)
             return bool(getattr(value, name)())
-        return plain(items(budget, value))
+        return builtin(items(budget, value))
 
     return truth
 
 
 def _sum(budget: Budget, value: Any, start: Any = 0) -> Any:
-    if is_array(value) and value.ndim == 1 and value.dtype.kind in "biuf":
-        budget.spend(value.size >> 5)
-        value = value.tolist()  # whose sums are exact, or of 64 bits
-    else:
-        value = items(budget, value)
+    value = items(budget, value)
     add = BINARY[ast.Add]
     if type(value) is list and (not value or type(value[0]) in (int, float, bool)):
         return checked(sum(value, start))
@@ -192,7 +191,7 @@ def _divmod(budget: Budget, a: Any, b: Any) -> tuple[Any, Any]:
 
 def _prod(budget: Budget, value: Any, start: Any = 1) -> Any:
     multiply = BINARY[ast.Mult]
-    for one in items(budget, value.tolist() if is_array(value) else value):
+    for one in items(budget, value):
         start = multiply(budget, start, one)
     return start
 
@@ -229,20 +228,20 @@ def _text(name: str) -> Function:
 
 
 def _of_math(name: str) -> Function:
-    plain = getattr(math, name)
+    function = getattr(math, name)
 
     def compute(budget: Budget, *values: Any) -> Any:
-        return checked(plain(*values))
+        return checked(function(*values))
 
     return compute
 
 
 def _of_many(name: str) -> Function:
     """A function of math that takes a sequence."""
-    plain = getattr(math, name)
+    function = getattr(math, name)
 
     def compute(budget: Budget, *values: Any) -> Any:
-        return plain(*(items(budget, value) for value in values))
+        return function(*(items(budget, value) for value in values))
 
     return compute
 
@@ -267,7 +266,8 @@ def _of_numpy(name: str, takes: int = 1) -> Function:
         function: Any = numpy
         for part in name.split("."):
             function = getattr(function, part)
-        return function(*numbers) if axis is None else function(*numbers, axis=int(axis))
+        options = {} if axis is None else {"axis": int(axis)}
+        return plain(function(*numbers, **options))
 
     return compute
 
@@ -285,14 +285,14 @@ _DIFFERENCES_MAX = 10
 
 def _of_either(name: str) -> Function:
     """A function of math for numbers, of numpy for arrays."""
-    of_number = _of_math(name)
+    of_number = getattr(math, name)
     of_array = _of_numpy(_NAMED_IN_NUMPY.get(name, name), 2 if name in _OF_TWO else 1)
 
     def compute(budget: Budget, *values: Any) -> Any:
         for value in values:
-            if type(value) not in (int, float, bool) and getattr(value, "ndim", 0):
+            if type(value) is not float and getattr(value, "ndim", 0):
                 return of_array(budget, *values)
-        return of_number(budget, *values)
+        return of_number(*values)
 
     return compute
 
@@ -363,6 +363,12 @@ FUNCTIONS: dict[str, Function] = {
     **{name: _of_math(name) for name in _ONLY_OF_MATH},
 }
 """By name."""
+
+OF_FLOATS: Mapping[Function, Callable[[float], Any]] = {
+    FUNCTIONS[name]: getattr(math, name, abs)
+    for name in "abs cos fabs isfinite isinf isnan sin sqrt".split()
+}
+"""What some of them are of a single ``float``, which needs no bounds."""
 
 OF_MODULES: dict[str, dict[str, Function]] = {
     "math": {

@@ -45,7 +45,7 @@ def _other(budget: Budget, sign: str, apply: Callable[[Any, Any], Any], a: Any, 
         a, b = numeric(a, sign), numeric(b, sign)
         fits(a, b)
         budget.spend(max(getattr(a, "size", 1), getattr(b, "size", 1)) >> 6)
-        return apply(a, b)
+        return plain(apply(a, b))
     for one in (a, b):
         if isinstance(one, (*_TEXTS, *_SEQUENCES)):
             return _of_sequences(budget, sign, a, b)
@@ -68,6 +68,12 @@ def _of_sequences(budget: Budget, sign: str, a: Any, b: Any) -> Any:
 
 def _unsupported(sign: str, a: Any, b: Any) -> TypeError:
     return TypeError(f"{sign} is not for {type(a).__name__} and {type(b).__name__}")
+
+
+def plain(value: Any) -> Any:
+    """Return a number of numpy's as one of Python's, which compares and counts the same whatever
+    the release of numpy; anything else as it is."""
+    return value.item() if is_array(value) and not value.ndim else value
 
 
 def numeric(value: Any, what: str) -> Any:
@@ -131,6 +137,13 @@ BINARY: Mapping[type[ast.operator], Operate] = {
     ast.BitOr: _binary("|", operator.or_),
     ast.BitXor: _binary("^", operator.xor),
 }
+USUAL: Mapping[type[ast.operator], Callable[[Any, Any], Any]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+}
+"""Those that need no bounds where one side is of 64 bits (``float``)."""
 UNARY: Mapping[type[ast.unaryop], Callable[[Any], Any]] = {
     ast.Not: operator.not_,
     ast.USub: operator.neg,
@@ -160,7 +173,9 @@ def element(budget: Budget, value: Any, index: Any) -> Any:
         if index is None or (type(index) is tuple and None in index):
             raise TypeError("an array has numbers, slices and masks as indexes")
         found = value[index]
-        if found.ndim and not isinstance(index, slice):
+        if not found.ndim:
+            return found.item()
+        if not isinstance(index, slice):
             budget.spend(found.size)
         return found
     if type(index) is slice:

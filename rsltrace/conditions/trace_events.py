@@ -9,7 +9,7 @@ import numpy as np
 
 from rsltrace.conditions.view import Sent
 from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_EVENT, Event, Output, OutputKind
+from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.logs import log_record
@@ -81,14 +81,13 @@ class TraceEvent:
 
     def _message(self, output: Output) -> object:
         """Decode what was sent. Raises TraceError if that was not kept, or does not fit."""
-        found = self._trace.payload(output)
         channel = self._trace.channel_of(output)
-        if found is None or channel is None:
+        if channel is None or output.sequence == NO_SEQUENCE:
             raise TraceError(
                 f"{self._trace.name} holds no messages of {self._name(output)}, which a check "
                 "reads: record them (record: payloads, topics, exclude)"
             )
-        return self._trace.decode(channel, found[2])
+        return self._trace.decode(channel, self._trace.message(channel.id, output.sequence)[1])
 
 
 def events_of(trace: Trace, topics: Collection[str] | None) -> Iterator[TraceEvent]:
