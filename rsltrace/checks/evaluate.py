@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from rsltrace.checks.conditions import compared, condition, opposite, plain, topic_of
+from rsltrace.checks.conditions import compared, condition, opposite
 from rsltrace.checks.functions import violations
 from rsltrace.checks.latency import Known, LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
 from rsltrace.conditions.condition import Armed, Condition
 from rsltrace.conditions.names import Names, names_of
-from rsltrace.conditions.trace_events import TraceEvent, events_of
+from rsltrace.conditions.topic_fields import plain, topic_of
+from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
@@ -181,7 +182,7 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
         )
     what, after = _conditions(job, index, spec, names)
     assert what is not None
-    start = _Start(trace.start_ns)
+    start = StartOfTrace(trace.start_ns)
     armed = what.arm(start)
     armed_after: Armed | None = after.arm(start) if after is not None else None
     if spec.eventually is not None:
@@ -218,17 +219,6 @@ def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
     for keys, topic in named:
         if wrong := names.unknown(topic, names.topics, "topic"):
             raise JobError(wrong, where=locate(job, ("checks", index, *keys)))
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """The moment at which a run begins: there are no nodes."""
-
-    stamp_ns: int
-
-    def nodes(self) -> dict[str, object]:
-        """Return none."""
-        return {}
 
 
 def _conditions(

@@ -1,6 +1,7 @@
 """The language of conditions: one for checks, metrics, breakpoints, ``cat --where`` and the viewer.
 
 text            a text becomes a condition: ``node /ekf``, ``/odom: pose.pose.position.x > 3``
+topic_fields    ``/odom.pose.x < 3`` is short for ``/odom: pose.x < 3``
 occurrences     the conditions that one event answers
 changes         those that compare an event with what was before it: a time, ``watch``, ``when``
 expressions     expressions about an event: its message, nodes that run

@@ -5,6 +5,7 @@
     node /ekf    entity /scan               before an event of a node, of an entity (name, #number)
     topic /odom                             a message is sent (after), or received (before)
     /odom: pose.pose.position.x > 3         the same, of a message whose fields say so
+    /odom.pose.pose.position.x > 3          (or so)
     output 3f2a                             after an event with such an output hash
     exception ValueError                    after an event that raised; without a type, anything
     log warn /too far/                      after a log record of a level or worse, of a text
@@ -40,6 +41,7 @@ from rsltrace.conditions.occurrences import (
     says_pattern,
     says_words,
 )
+from rsltrace.conditions.topic_fields import plain, topic_of
 from rsltrace.conditions.view import Moment
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.model.finding import Source
@@ -95,6 +97,9 @@ class _Reader:
             return read(self)
         if (message := _MESSAGE.match(text, self._at)) is not None:
             return self._message(message)
+        rewritten = plain(text)
+        if rewritten != text.strip() and topic_of(rewritten) is not None and "." in text:
+            return _Reader(rewritten, self._names).read()
         return self._bare()
 
     # -- by their first word -----------------------------------------------------------------------
