@@ -127,7 +127,7 @@ RUNS_CODE = {
     "rsltrace/doors/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
     "rsltrace/explore/worker.py": "import_module",  # libraries that the last run has imported
     "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
-    "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # user modules, with sets in order
+    "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
     "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
     "rsltrace/run/plans/target.py": "import_module",  # node: module:Class
     "rsltrace/campaign/perturb.py": "runpy",  # this command once more, in another environment

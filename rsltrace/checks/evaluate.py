@@ -150,8 +150,8 @@ def _see(one: Property, event: TraceEvent, where: str) -> None:
     try:
         one.see(event)
     except ConditionError as error:
-        message = f"a check cannot be evaluated: {error.message}\n  {error.text}"
-        raise CheckError(message, where=where) from None
+        message = f"{where}: a check cannot be evaluated: {error.message}\n  {error.text}"
+        raise CheckError(message) from None
 
 
 def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:

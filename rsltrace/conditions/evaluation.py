@@ -645,9 +645,7 @@ def message_field(message: Any, name: str) -> Any:
     """Return a field of a message, or ``NO_FIELD``."""
     names = _FIELDS.get(type(message))
     if names is None:
-        names = _fields_of(message)
-        if names is None:
-            names = getattr(message, "__dict__", ())
+        names = _fields_of(message) or frozenset(field_names(message))
     if name not in names:
         return NO_FIELD
     found = getattr(message, name)

@@ -290,7 +290,7 @@ def _of_either(name: str) -> Function:
 
     def compute(budget: Budget, *values: Any) -> Any:
         for value in values:
-            if type(value) is not float and getattr(value, "ndim", 0):
+            if type(value) is not float and is_array(value) and value.ndim:
                 return of_array(budget, *values)
         return of_number(*values)
 

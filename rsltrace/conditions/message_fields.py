@@ -21,7 +21,7 @@ class WrongField(NamedTuple):
     message: str
 
 
-def wrong_field(tree: ast.Expression, interface: str, fields: Fields) -> WrongField | None:
+def wrong_field(tree: ast.expr, interface: str, fields: Fields) -> WrongField | None:
     """Return the first part of ``tree`` that reads a field which an interface does not have."""
     own = {
         node.id

@@ -7,6 +7,7 @@ import builtins
 import math
 import time
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -14,11 +15,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rsltrace import Trace, evaluate_checks
+from rsltrace.checks.evaluate import job_of_checks
 from rsltrace.conditions.bounds import INT_BITS_MAX, STEPS_MAX, Budget, LimitError
 from rsltrace.conditions.expressions import parse_expression
 from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.conditions.text import parse_condition
-from rsltrace.errors import ConditionError
+from rsltrace.errors import CheckError, ConditionError
+from tests.trace.make import write_run
 
 _CPU_S = 20.0
 """So long may a hostile expression keep a busy machine; most are refused at once."""
@@ -340,3 +344,16 @@ def test_no_pattern_of_logs_keeps_a_check_busy(pattern: str) -> None:
 def test_a_pattern_that_looks_around_is_refused() -> None:
     with pytest.raises(ConditionError, match="look-around"):
         parse_condition("log /(?=x)y/")
+
+
+def test_what_a_check_cannot_compute_is_said_with_its_place(tmp_path: Path) -> None:
+    write_run(tmp_path / "run.mcap", 60, checks="checks:\n  - never: '/count: 2**data**2 < 1'\n")
+    with Trace.open(tmp_path / "run.mcap") as trace:
+        job = job_of_checks(trace)
+        with pytest.raises(CheckError) as caught:
+            evaluate_checks(trace, job)
+    said = str(caught.value)
+    assert said.startswith(
+        f"the job of {tmp_path}/run.mcap:5:12: a check cannot be evaluated: event"
+    )
+    assert "LimitError: it makes a number of more than 512 bits\n  /count: 2**data**2 < 1" in said
