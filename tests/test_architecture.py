@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -109,3 +110,133 @@ def test_files_that_the_guard_knows_by_their_path_are_there() -> None:
     for file in (callers._CALLS_BACK, callers._THREADS, *callers._STANDS_IN):
         assert Path(file).is_file()
     assert Path(callers._DOOR).is_dir()
+
+
+RUNS_CODE = {
+    # Modules of a fixed list of ours, or libraries, by names that stand in the source.
+    "rsltrace/__init__.py": "import_module",  # public names, when they are first used
+    "rsltrace/cli/main.py": "import_module",  # the module of a command
+    "rsltrace/job/__init__.py": "import_module",  # public names of jobs
+    "rsltrace/debug/simulation.py": "import_module",  # rclpy, before the first run
+    "rsltrace/doors/rclpy/boundary/type_support.py": "exec_module import_module",  # of rosidl
+    "rsltrace/doors/rclpy/executors/exchanged.py": "import_module",  # functions of rclpy
+    "rsltrace/guard/pin.py": "import_module",  # threadpoolctl
+    "rsltrace/workspace/build_files.py": "compile exec import_module",  # tomli; setup.py, as colcon
+    # What a run, and only a run, does with code that its job names.
+    "rsltrace/doors/rclpy/wire/interface_classes.py": "import_module",  # classes of messages
+    "rsltrace/doors/rclpy/wire/source_text.py": "compile exec",  # codecs, made of checked names
+    "rsltrace/explore/worker.py": "import_module",  # libraries that the last run has imported
+    "rsltrace/guard/virtual/original_code.py": "compile",  # user modules, as they were written
+    "rsltrace/guard/virtual/set_order.py": "compile exec_module",  # the same, with sets in order
+    "rsltrace/run/plans/main_programs.py": "exec",  # main: a program
+    "rsltrace/run/plans/target.py": "import_module",  # node: module:Class
+    "rsltrace/campaign/perturb.py": "runpy",  # this command once more, in another environment
+    "rsltrace/campaign/processes.py": "runpy",  # a command of ours, in a process
+    # Python launch files are programs; they are read in a process of their own.
+    "rsltrace/launch/api/names.py": "import_module",  # stand-ins for modules of launch
+    "rsltrace/launch/api/substitutions.py": "eval import_module",  # PythonExpression
+    "rsltrace/launch/api/sources.py": "exec_module",  # a Python launch file
+    "rsltrace/launch/apart.py": "pickle",  # the answer of that process
+    # Between processes of one command, on a socket or pipe that nobody else has.
+    "rsltrace/native/apart/link.py": "pickle",  # of user code: plain values only
+    "rsltrace/run/copying.py": "pickle",  # what a copy of the simulation returns
+    # Who sits at the prompt of a session, in a run whose code they have agreed to run.
+    "rsltrace/debug/python_expression.py": "compile eval",
+}
+"""The modules that turn text into code, or could, with what they use and why they may.
+
+None of them is reached by what a trace, a bag or a parameter file says, unless a run was asked for
+(docs/trust.md). Before you add one: expressions have a language (``rsltrace.conditions``), data has
+JSON or CDR.
+"""
+_CALLS = {
+    *("eval", "exec", "compile", "__import__", "import_module", "run_module", "run_path"),
+    *("exec_module", "load_module"),
+}
+_MODULES = set("pickle marshal shelve dill cloudpickle jsonpickle runpy imp code".split())
+_SHELLS = {"os.system", "os.popen", "subprocess.getoutput", "subprocess.getstatusoutput"}
+
+
+class _CodeFinder(ast.NodeVisitor):
+    """Collects what a module uses that turns text into code."""
+
+    def __init__(self) -> None:
+        self.found: set[str] = set()
+
+    def visit_Call(self, node: ast.Call) -> None:
+        called = node.func
+        name = called.id if isinstance(called, ast.Name) else getattr(called, "attr", "")
+        owner = called.value if isinstance(called, ast.Attribute) else None
+        is_ours = name == "compile" and owner is not None and ast.unparse(owner) != "builtins"
+        if name in _CALLS and not is_ours:
+            self.found.add(name)
+        words = {one.arg: one.value for one in node.keywords}
+        if ast.unparse(called) in _SHELLS:
+            self.found.add(ast.unparse(called))
+        if isinstance(words.get("shell"), ast.Constant) and words["shell"].value:  # type: ignore[attr-defined]
+            self.found.add("shell=True")
+        if isinstance(words.get("allow_pickle"), ast.Constant):
+            self.found.add("allow_pickle")
+        if name == "YAML" and getattr(words.get("typ"), "value", "") in ("unsafe", "full"):
+            self.found.add("unsafe YAML")
+        self.generic_visit(node)
+
+    def visit_Import(self, node: ast.Import) -> None:
+        self.found |= {one.name.partition(".")[0] for one in node.names} & _MODULES
+
+    def visit_ImportFrom(self, node: ast.ImportFrom) -> None:
+        module = (node.module or "").partition(".")[0]
+        if not node.level and module in _MODULES:
+            self.found.add(module)
+
+
+def _turns_into_code(source: str) -> set[str]:
+    finder = _CodeFinder()
+    finder.visit(ast.parse(source))
+    for text in re.findall(r"^import ([\w, ]+)$", source, re.M):  # in programs that are texts here
+        finder.found |= {one.strip().split(" ")[0] for one in text.split(",")} & _MODULES
+    return finder.found
+
+
+def test_text_becomes_code_only_where_that_is_meant() -> None:
+    """A trace, a bag or a job may come from anybody: what they say is read, never run."""
+    root = Path(__file__).parents[1]
+    found = {}
+    for folder in ("rsltrace", "viewer"):
+        for path in (root / folder).rglob("*.py"):
+            used = _turns_into_code(path.read_text(encoding="utf-8"))
+            if used:
+                found[str(path.relative_to(root))] = used
+    new = {
+        file: sorted(used - set(RUNS_CODE.get(file, "").split()))
+        for file, used in found.items()
+        if used - set(RUNS_CODE.get(file, "").split())
+    }
+    assert not new, "these turn text into code: mend them, or say in RUNS_CODE why they may"
+    assert RUNS_CODE.keys() <= found.keys(), "what no module does any more goes from the list"
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "eval(text)",
+        "builtins.exec(text)",
+        "compile(tree, 'x', 'eval')",
+        "import pickle",
+        "from pickle import loads",
+        "__import__(name)",
+        "importlib.import_module(name)",
+        "subprocess.run(words, shell=True)",
+        "os.system(text)",
+        "numpy.load(path, allow_pickle=True)",
+        "YAML(typ='unsafe')",
+    ],
+)
+def test_what_turns_text_into_code_is_found(source: str) -> None:
+    assert _turns_into_code(source)
+
+
+def test_the_language_of_conditions_runs_nothing() -> None:
+    """It has neither a way to run code nor the modules that could."""
+    root = Path(__file__).parents[1] / "rsltrace/conditions"
+    assert not any(_turns_into_code(path.read_text("utf-8")) for path in root.glob("*.py"))

@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from rsltrace.checks.conditions import compared, condition, opposite, plain, topic_of
+from rsltrace.checks.conditions import compared, condition, opposite
 from rsltrace.checks.functions import violations
 from rsltrace.checks.latency import Known, LatencyResult, check_latency, latency_title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate, Violation
-from rsltrace.checks.trace_events import TraceEvent, events_of
-from rsltrace.debug.conditions.condition import Armed, Condition
-from rsltrace.debug.conditions.names import Names, names_of
+from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.names import Names, names_of
+from rsltrace.conditions.topic_fields import plain, topic_of
+from rsltrace.conditions.trace_events import StartOfTrace, TraceEvent, events_of
 from rsltrace.errors import EXIT_RUN, CheckError, ConditionError, JobError
 from rsltrace.job import Job, job_from_text, locate
 from rsltrace.job.parts.check import CheckSpec
@@ -111,6 +112,11 @@ def evaluating(
     names = names_of(trace.entities.values(), are_all=came_to_its_end, fields=trace.fields_of)
     held = [_property(trace, job, index, names) for index in range(len(job.checks))]
     properties = [one for one in held if one is not None]
+    places = [
+        locate(job, ("checks", index, job.checks[index].kind))
+        for index, one in enumerate(held)
+        if one is not None
+    ]
     if properties:
         topics: set[str] | None = set()
         for spec in (one for one in job.checks if one.latency is None):
@@ -119,8 +125,8 @@ def evaluating(
         for event in events_of(trace, topics):
             if last is not None and event.index >= last:
                 break  # what follows the end
-            for one in properties:
-                _see(one, event)
+            for one, where in zip(properties, places, strict=True):
+                _see(one, event, where)
             yield []
         for one in properties:
             one.end(trace.end_ns, complete=trace.complete)
@@ -140,11 +146,12 @@ def evaluating(
     yield results
 
 
-def _see(one: Property, event: TraceEvent) -> None:
+def _see(one: Property, event: TraceEvent, where: str) -> None:
     try:
         one.see(event)
     except ConditionError as error:
-        raise CheckError(f"a check cannot be evaluated: {error.message}\n  {error.text}") from None
+        message = f"{where}: a check cannot be evaluated: {error.message}\n  {error.text}"
+        raise CheckError(message) from None
 
 
 def _with_topics(topics: set[str] | None, spec: CheckSpec) -> set[str] | None:
@@ -175,7 +182,7 @@ def _property(trace: Trace, job: Job, index: int, names: Names) -> Property | No
         )
     what, after = _conditions(job, index, spec, names)
     assert what is not None
-    start = _Start(trace.start_ns)
+    start = StartOfTrace(trace.start_ns)
     armed = what.arm(start)
     armed_after: Armed | None = after.arm(start) if after is not None else None
     if spec.eventually is not None:
@@ -212,17 +219,6 @@ def _wrong_names(job: Job, index: int, spec: CheckSpec, names: Names) -> None:
     for keys, topic in named:
         if wrong := names.unknown(topic, names.topics, "topic"):
             raise JobError(wrong, where=locate(job, ("checks", index, *keys)))
-
-
-@dataclass(frozen=True, slots=True)
-class _Start:
-    """The moment at which a run begins: there are no nodes."""
-
-    stamp_ns: int
-
-    def nodes(self) -> dict[str, object]:
-        """Return none."""
-        return {}
 
 
 def _conditions(

@@ -7,11 +7,11 @@ import numbers
 from dataclasses import dataclass
 
 from rsltrace.checks.evaluate import LoadFunction
+from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import CheckError, ConditionError, JobError, RsltraceError
 from rsltrace.job import Job, locate
 from rsltrace.job.parts.metric import MetricSpec
 from rsltrace.job.values.target import target_text
-from rsltrace.trace.expression import Expression
 from rsltrace.trace.reader import Trace
 
 
@@ -80,9 +80,9 @@ def _evaluated(
     return MetricResult(name, _number(value, called), unit)
 
 
-def _expression(job: Job, name: str, text: str) -> Expression:
+def _expression(job: Job, name: str, text: str) -> RunExpression:
     try:
-        return Expression(text)
+        return RunExpression(text)
     except ConditionError as error:
         where = locate(job, ("metrics", name))
         raise JobError(f"metric {name}: {error}", where=where) from None

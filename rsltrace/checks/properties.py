@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from rsltrace.checks.trace_events import TraceEvent
-from rsltrace.debug.conditions.condition import Armed, error_text, shown
-from rsltrace.debug.conditions.expressions import Expression
+from rsltrace.conditions.condition import Armed, error_text, shown
+from rsltrace.conditions.expressions import Expression
+from rsltrace.conditions.trace_events import TraceEvent
 from rsltrace.errors import RsltraceError
 from rsltrace.model.event import OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration, format_seconds

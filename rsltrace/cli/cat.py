@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.cli.output.event_line import EventLines
+from rsltrace.conditions.trace_events import TraceCondition
 from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
 from rsltrace.terminal import line_writer, tell
@@ -86,6 +87,12 @@ class _Time(_IntParam):
 @click.option(
     "--to", "to_ns", type=_Time(), metavar="T", help="Only up to simulated time T, T included."
 )
+@click.option(
+    "--where",
+    metavar="CONDITION",
+    help="Only events of which a condition is true, as of a breakpoint: "
+    "'/odom: pose.pose.position.x > 3', 'log warn', 'exception'.",
+)
 @click.option("--limit", type=click.IntRange(min=0), metavar="N", help="At most N events.")
 def cat(
     trace: Path,
@@ -98,6 +105,7 @@ def cat(
     kinds: tuple[str, ...],
     from_ns: int | None,
     to_ns: int | None,
+    where: str | None,
     limit: int | None,
 ) -> None:
     """Print the events of TRACE, one per line, in the order they happened.
@@ -114,9 +122,11 @@ def cat(
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
         choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
+        condition = None if where is None else TraceCondition(where, opened)
+        events = _events(opened, choice, condition)
         write = line_writer()
         form = _json_form(opened, payloads) if as_json else EventLines(opened, code=code).line
-        for event, outputs in islice(_events(opened, choice), limit):
+        for event, outputs in islice(events, limit):
             write(form(event, outputs))
 
 
@@ -182,7 +192,9 @@ def _warn_if_none(found: set[int], what: str, globs: tuple[str, ...], all_: list
         tell(f"rsltrace: no {what} of the trace matches {' or '.join(globs)}; there are: {names}")
 
 
-def _events(trace: Trace, choice: _Choice) -> Iterator[tuple[Event, list[Output]]]:
+def _events(
+    trace: Trace, choice: _Choice, where: TraceCondition | None
+) -> Iterator[tuple[Event, list[Output]]]:
     """Yield the chosen events with their outputs; memory is that of one segment."""
     segments = trace.segments
     for segment in segments:
@@ -193,10 +205,15 @@ def _events(trace: Trace, choice: _Choice) -> Iterator[tuple[Event, list[Output]
         events = next(trace.events(first, last))
         outputs = next(trace.outputs(first, last))
         ends = np.searchsorted(outputs["event"], events["index"], side="right").tolist()
-        for position in np.flatnonzero(_mask(events, outputs, choice)).tolist():
+        mask = _mask(events, outputs, choice)
+        if where is not None and where.entities is not None:
+            mask &= _touching(events, outputs, where.entities)
+        for position in np.flatnonzero(mask).tolist():
             begin = ends[position - 1] if position else 0
             own = [output_of(row, trace.name) for row in outputs[begin : ends[position]]]
-            yield event_of(events[position], trace.name), own
+            event = event_of(events[position], trace.name)
+            if where is None or where.holds(event, own):
+                yield event, own
 
 
 def _mask(
@@ -211,8 +228,15 @@ def _mask(
     if choice.entities is not None:
         mask &= np.isin(events["entity"], choice.entities)
     if choice.touching is not None:
-        touching = np.isin(events["entity"], choice.touching)
-        senders = outputs["event"][np.isin(outputs["entity"], choice.touching)]
-        touching[(senders - events["index"][0]).astype(np.intp)] = True
-        mask &= touching
+        mask &= _touching(events, outputs, choice.touching)
     return mask
+
+
+def _touching(
+    events: npt.NDArray[np.void], outputs: npt.NDArray[np.void], entities: npt.NDArray[np.uint32]
+) -> npt.NDArray[np.bool_]:
+    """Return which events are of some entities, or send from one."""
+    touching: npt.NDArray[np.bool_] = np.isin(events["entity"], entities)
+    senders = outputs["event"][np.isin(outputs["entity"], entities)]
+    touching[(senders - events["index"][0]).astype(np.intp)] = True
+    return touching

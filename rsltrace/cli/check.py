@@ -75,8 +75,8 @@ def check(
     """
     from rsltrace.checks.evaluate import check_texts, wrong_checks
     from rsltrace.checks.metrics import check_metrics
-    from rsltrace.debug.conditions.message_fields import loaded_fields
-    from rsltrace.debug.conditions.names import Names
+    from rsltrace.conditions.message_fields import loaded_fields
+    from rsltrace.conditions.names import Names
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.run.checking import check_job
 

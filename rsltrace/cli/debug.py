@@ -73,8 +73,8 @@ def debug(
     The exit status is 0 when the session ends, 1 if the run has diverged from TRACE in it, and 2
     for trouble: it could not begin, or a command of a script could not be carried out.
     """
+    from rsltrace.conditions.names import names_of
     from rsltrace.debug.client import DebugSession
-    from rsltrace.debug.conditions.names import names_of
     from rsltrace.debug.prompt.shell import Shell
     from rsltrace.diff.file_kind import is_trace
     from rsltrace.replay.preparation import prepared

@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from greenlet import getcurrent, greenlet
 
+from rsltrace.conditions.message_fields import loaded_fields
+from rsltrace.conditions.names import Names, names_of
+from rsltrace.conditions.text import parse_condition
 from rsltrace.debug import inspection
-from rsltrace.debug.conditions.message_fields import loaded_fields
-from rsltrace.debug.conditions.names import Names, names_of
-from rsltrace.debug.conditions.text import parse_condition
 from rsltrace.debug.debuggers import debugger
 from rsltrace.debug.goal import Goal, Watched, goal_of
 from rsltrace.debug.ledger import Ledger, described

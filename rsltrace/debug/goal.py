@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rsltrace.debug.conditions.condition import Armed, Condition
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.text import parse_condition
-from rsltrace.debug.conditions.view import EventView
+from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.text import parse_condition
+from rsltrace.conditions.view import EventView
 from rsltrace.debug.lines import Message
 from rsltrace.debug.view import View
 

@@ -10,15 +10,15 @@ from dataclasses import asdict
 from itertools import islice
 from typing import TYPE_CHECKING, Any, Protocol
 
-from rsltrace.debug.conditions.expressions import parse_expression
-from rsltrace.debug.conditions.names import nodes_called, short_name
+from rsltrace.conditions.names import nodes_called, short_name
+from rsltrace.debug.python_expression import PythonError, python_value
 from rsltrace.debug.source import source
 from rsltrace.errors import DebugError, did_you_mean
 from rsltrace.middleware.overview import overview
 from rsltrace.middleware.receiver import Receiver
 
 if TYPE_CHECKING:
-    from rsltrace.debug.conditions.names import Names
+    from rsltrace.conditions.names import Names
     from rsltrace.debug.ledger import Ledger
     from rsltrace.debug.view import View
     from rsltrace.run.session import Session
@@ -76,7 +76,7 @@ def full_name(run: Standing, name: str) -> str:
 
 
 def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]:
-    """Return the value of an expression as JSON, and how Python shows it.
+    """Return the value of a Python expression as JSON, and how Python shows it.
 
     :raises ConditionError: it is no expression, or names what is not there.
     :raises DebugError: it raised.
@@ -84,11 +84,10 @@ def evaluate(run: Standing, expression: str, node: str | None) -> dict[str, Any]
     owner = None if node is None else node_named(run, node)
     received = run.view.received()
     message = None if received is None else received[1]
-    parsed = parse_expression(expression, run.names(), has_own=True)
     try:
-        value = parsed.value(run.view, message=message, node=owner)
-    except Exception as error:
-        raise DebugError(f"{expression}: {type(error).__name__}: {error}") from error
+        value = python_value(expression, run.names(), run.view, message=message, node=owner)
+    except PythonError as error:
+        raise DebugError(f"{expression}: {error}") from error
     answer: dict[str, Any] = {"repr": text_of(value), "type": type(value).__qualname__}
     try:
         text = json.dumps(plain(value), allow_nan=False)

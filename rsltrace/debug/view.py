@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from rsltrace.debug.conditions.view import Sent
+from rsltrace.conditions.view import Sent
 from rsltrace.doors.rclpy.stacks.coroutines import TaskRun
 from rsltrace.doors.rclpy.wire.codec import codec_for
 from rsltrace.doors.rclpy.wire.interfaces import get_message_class

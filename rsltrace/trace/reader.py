@@ -515,7 +515,10 @@ class Trace:
 
     def _channel(self, topic: str, type_name: str) -> ChannelInfo | None:
         """Return the channel of a topic: the one of that type, where there are several."""
-        found = [self.channels[i] for i in self._ids_of_topic.get(topic, ())]
+        ids = self._ids_of_topic.get(topic, ())
+        if len(ids) == 1:
+            return self.channels[ids[0]]
+        found = [self.channels[i] for i in ids]
         return next((c for c in found if c.type == type_name), found[0] if found else None)
 
     def _segment_of(self, index: int) -> int:

@@ -19,9 +19,9 @@ from rsltrace.campaign.bisect.repository import Repository
 from rsltrace.campaign.bisect.runs import python_folders
 from rsltrace.campaign.bisect.worktree import Worktree
 from rsltrace.cli.bisect import _same_everywhere
+from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.job import load_job
-from rsltrace.trace.expression import Expression
 from rsltrace.trace.reader import Trace
 
 pytestmark = pytest.mark.ros
@@ -290,9 +290,9 @@ def test_a_check_looks_at_a_trace() -> None:
             (f"len(messages('{topic}')) == count('{topic}')", True),
             (f"last('{topic}') != first('{topic}') or end < 0", True),
         ):
-            assert bool(Expression(text).value(trace)) is holds, text
+            assert bool(RunExpression(text).value(trace)) is holds, text
         with pytest.raises(ConditionError, match="there is no topic /nothing"):
-            Expression("last('/nothing').data > 1").value(trace)
+            RunExpression("last('/nothing').data > 1").value(trace)
 
 
 def test_packages_that_are_installed_in_place_are_those_of_the_revision(
@@ -389,17 +389,17 @@ def test_hooks_and_a_search_of_the_users_own_are_left_alone(robot: Robot, tmp_pa
     [
         ("evnts > 1", "did you mean 'events'?", 0),
         ("count('/x') > )", "unmatched", 14),
-        ("1 + open('x')", "the functions here are", 4),
+        ("1 + open('x')", "'open' is no function here; there are", 4),
         ("last('/x').__class__", "no field of a message", 0),
         ("last(digest)", "takes a topic", 0),
-        ("(lambda: 1)()", "the functions here are", 0),
-        ("max(events, key=abs)", "takes plain arguments", 0),
-        ("f'{digest}'", "JoinedStr has no place in an expression", 0),
+        ("(lambda: 1)()", "only functions can be called", 0),
+        ("max(events, key=abs)", "functions here take no key=", 16),
+        ("f'{digest}'", "an f-string has no place in an expression", 0),
     ],
 )
 def test_a_check_that_is_none_is_refused_with_its_place(text: str, said: str, column: int) -> None:
     with pytest.raises(ConditionError) as caught:
-        Expression(text)
+        RunExpression(text)
     message, shown, caret = str(caught.value).splitlines()
     assert said in message
     assert shown == f"  {text}"

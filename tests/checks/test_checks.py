@@ -24,7 +24,7 @@ from rsltrace import (
 )
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
 from rsltrace.cli.main import cli
-from rsltrace.debug.conditions.condition import Armed
+from rsltrace.conditions.condition import Armed
 from rsltrace.errors import CheckError, JobError
 
 SAMPLE = Path(__file__).parents[2] / "sample_traces" / "nondeterministic_callback"
@@ -164,7 +164,7 @@ def test_a_silent_topic_is_too_slow(
     ("check", "said"),
     [
         ({"always": "/scna: min(ranges) < 2"}, "did you mean '/scan'"),
-        ({"always": "/scan.ranges[0] <"}, "not a Python expression"),
+        ({"always": "/scan.ranges[0] <"}, "not an expression"),
         ({"always": "/scan"}, "for what must not happen, never"),
         ({"never": "node /driver"}, "takes a function"),
         ({"never": "when driver.x > 1"}, "takes a function"),
@@ -251,7 +251,7 @@ class _Event:
         self.index, self.stamp_ns, self.letters = index, stamp_ns, letters
 
     def sent(self) -> Sequence[Any]:
-        from rsltrace.debug.conditions.view import Sent
+        from rsltrace.conditions.view import Sent
 
         return [Sent(1, letter, 0) for letter in self.letters]
 

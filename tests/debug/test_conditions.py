@@ -14,12 +14,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rsltrace.debug.conditions.condition import Armed, Condition
-from rsltrace.debug.conditions.expressions import parse_expression
-from rsltrace.debug.conditions.message_fields import loaded_fields
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.text import parse_condition
-from rsltrace.debug.conditions.view import Sent
+from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.expressions import parse_expression
+from rsltrace.conditions.message_fields import loaded_fields
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.text import parse_condition
+from rsltrace.conditions.view import Sent
 from rsltrace.errors import ConditionError
 from rsltrace.model.event import EventKind, OutputKind
 
@@ -266,8 +266,8 @@ def test_if_takes_fields_of_what_was_received() -> None:
             "geometry_msgs/msg/Point has no field 'w'; it has x, y, z",
             "pose.pose.position.w",
         ),
-        ("/odom: pose.pose.position.x >", "not a Python expression", ">"),
-        ("/odom: (y := 3)", "cannot assign", "y := 3"),
+        ("/odom: pose.pose.position.x >", "not an expression", ">"),
+        ("/odom: (y := 3)", "an assignment (:=) has no place", "y := 3"),
         ("/odom:", "an expression is missing here", ""),
         ("watch efk.P", "there is no node 'efk'; did you mean 'ekf'?", "efk"),
         ("watch wheel.speed", "several nodes are called 'wheel'", "wheel"),

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rsltrace.campaign.processes import Processes
+from rsltrace.conditions.run_expression import RunExpression
 from rsltrace.errors import BisectError, ConditionError
 from rsltrace.terminal import tell
-from rsltrace.trace.expression import Expression
 from rsltrace.trace.reader import Trace
 
 Judge = Callable[[Path, Path], bool]
@@ -39,7 +39,7 @@ def check_of(text: str) -> Check:
     """
     if not _TARGET.fullmatch(text.strip()):
         try:
-            expression = Expression(text)
+            expression = RunExpression(text)
         except ConditionError as error:
             raise BisectError(f"--check: {error}") from None
 

@@ -114,7 +114,8 @@ def _break(shell: Prompt, rest: str) -> None:
     finding [KIND]                after an event in which the guard found something
     watch ekf.P[0][0]             after an event that changes a value
     when node("ekf").P[0][0] > 1  after the event that makes it true
-    Behind all but the last two, 'if EXPRESSION' has to be true as well.
+    Behind all but the last two, 'if EXPRESSION' has to be true as well. Expressions are not Python
+    but the language of checks: fields, attributes of nodes, arithmetic, fixed functions.
     """
     if not rest:
         shell.show(show.breakpoint_lines(shell.session.breakpoints))
@@ -189,9 +190,10 @@ def _node(shell: Prompt) -> str:
 
 @_add("print", "p", usage="EXPRESSION", topic="looking")
 def _print(shell: Prompt, rest: str) -> None:
-    """Evaluate: attributes of this node, node("ekf"), fields of its message, msg, now, event.
+    """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now, event.
 
-    It is evaluated in a copy of the run: whatever it does changes nothing here.
+    This is Python, methods of nodes included, in a copy of the run: whatever it does changes
+    nothing here. Conditions (break, watch, when) have a language of their own, which only looks.
     """
     if not rest:
         raise DebugError('print what? P[0][0] of this node, node("ekf").P, msg, now, event')
@@ -273,8 +275,8 @@ def _when(shell: Prompt, rest: str) -> None:
 
 def _as_condition(text: str, shell: Prompt) -> str:
     """Return the condition that a text means: an expression is ``when …``."""
-    from rsltrace.debug.conditions.expressions import parse_expression
-    from rsltrace.debug.conditions.text import parse_condition
+    from rsltrace.conditions.expressions import parse_expression
+    from rsltrace.conditions.text import parse_condition
 
     try:
         parse_condition(text, shell.names())

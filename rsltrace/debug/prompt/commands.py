@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from rsltrace.errors import DebugError, nearest
 
 if TYPE_CHECKING:
+    from rsltrace.conditions.names import Names
     from rsltrace.debug.client import DebugSession
-    from rsltrace.debug.conditions.names import Names
     from rsltrace.debug.positions import Stopped
 
 

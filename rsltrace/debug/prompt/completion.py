@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from rsltrace.debug.conditions.names import short_name
+from rsltrace.conditions.names import short_name
 from rsltrace.debug.prompt.command_table import COMMANDS, INFO
 from rsltrace.debug.prompt.commands import Prompt
 from rsltrace.errors import DebugError

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
-from rsltrace.debug.conditions.names import Names
+from rsltrace.conditions.names import Names
 from rsltrace.debug.prompt import show
 from rsltrace.debug.prompt.command_table import COMMANDS
 from rsltrace.debug.prompt.completion import completions

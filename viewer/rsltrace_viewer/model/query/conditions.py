@@ -13,9 +13,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from rsltrace.errors import TraceError
+from rsltrace.conditions.trace_events import TraceCondition
+from rsltrace.errors import ConditionError, TraceError
 from rsltrace.model.event import EventFlag, EventKind, Output, OutputKind
-from rsltrace.trace.segments import output_of
+from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.logs import log_record
 from rsltrace_viewer.model.run import Run, Segment
 
@@ -160,6 +161,31 @@ class WithOutput(_Anywhere):
             if among[place] and not found[place]:
                 found[place] = self.accept(run, output_of(row, run.trace.name))
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class Where(_Anywhere):
+    """Events of which a condition is true, in the language of breakpoints and checks."""
+
+    condition: TraceCondition
+
+    def mask(self, run: Run, segment: Segment, among: Mask) -> Mask:
+        """Return the mask. What it cannot be evaluated of does not fulfil it."""
+        outputs = run.segment_outputs(segment.number)
+        left: Mask = among.copy()
+        if (entities := self.condition.entities) is not None:
+            left &= OfEntities(entities, outputs=True).mask(run, segment, among)
+        ends = np.searchsorted(outputs["event"], segment.events["index"], side="right").tolist()
+        for place in np.flatnonzero(left).tolist():
+            begin = ends[place - 1] if place else 0
+            own = [output_of(row, run.trace.name) for row in outputs[begin : ends[place]]]
+            try:
+                left[place] = self.condition.holds(
+                    event_of(segment.events[place], run.trace.name), own
+                )
+            except (ConditionError, TraceError):
+                left[place] = False
+        return left
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from rsltrace.conditions.trace_events import TraceCondition
+from rsltrace.errors import ConditionError
 from rsltrace.model.entity import WITH_TOPIC
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.words.kinds import SHORT_KINDS
@@ -161,6 +163,21 @@ def _read_text(run: Run, token: Token) -> Condition:
     return conditions.Any((conditions.says(folded), MessageText(folded)))
 
 
+def _read_where(run: Run, token: Token) -> Condition:
+    try:
+        return conditions.Where(TraceCondition(unquoted(token), run.trace))
+    except ConditionError as error:
+        raise QueryError(error.message, *place_of(token, error)) from None
+
+
+def place_of(token: Token, error: ConditionError) -> tuple[int, int]:
+    """Return where in a filter the part is that a condition is wrong in."""
+    at = token.text.find(error.text)
+    if at < 0:  # it was written in another way before it was read
+        return max(token.start, 0), token.end
+    return token.start + at + error.start, token.start + at + error.end
+
+
 def bare_word(run: Run, token: Token) -> Condition:
     """Return the condition for a word without a field: in names, logs and exceptions."""
     word = unquoted(token)
@@ -212,5 +229,6 @@ FIELDS: dict[str, Field] = {
     ),
     "is": Field("raised, suspended, silent, finding", _read_is, lambda run: list(_STATES)),
     "hash": Field("first digits of an input or output hash", _read_hash),
+    "where": Field('conditions of breakpoints: "/odom: x > 1"', _read_where),
 }
 """The fields by name."""

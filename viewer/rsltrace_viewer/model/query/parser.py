@@ -2,6 +2,7 @@
 
     node:/ekf kind:timer,sub time:1.5..2 -topic:/tf      all must hold; ``-`` turns one around
     (level:warn or is:raised) text:"too far"             alternatives, brackets, quotes
+    where:"/odom: x > 1"      /odom: x > 1                a condition, as of a breakpoint
     plan                                                 a bare word: in names, logs, exceptions
 
 ``docs/view.md`` explains the fields; ``query_fields`` has the list of them.
@@ -9,11 +10,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Generic, TypeVar
 
+from rsltrace.conditions.topic_fields import is_about_messages
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.fields import FIELDS, bare_word
@@ -55,6 +58,10 @@ def parse(text: str, run: Run) -> Condition | None:
 
 def read(text: str, language: Language[T]) -> T | None:
     """Return what ``text`` stands for in a language; None if it is empty. Raises QueryError."""
+    where = language.fields.get("where")
+    if where is not None and is_about_messages(text):
+        quoted = re.sub(r'(["\\])', r"\\\1", text.strip())
+        return where(Token(f'"{quoted}"', len(text) - len(text.lstrip()) - 1))
     try:
         return _Parser(text, language).whole()
     except RecursionError:
@@ -145,7 +152,7 @@ class _Parser(Generic[T]):
 
 def _cost(condition: Condition) -> int:
     """Numbers first, then logs, then decoded messages."""
-    if isinstance(condition, MessageText):
+    if isinstance(condition, (MessageText, conditions.Where)):
         return 3
     if isinstance(condition, conditions.WithOutput) and condition.accept is not None:
         return 2

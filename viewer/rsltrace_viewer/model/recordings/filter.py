@@ -14,15 +14,18 @@ from itertools import islice
 import numpy as np
 import numpy.typing as npt
 
+from rsltrace.conditions.expressions import parse_expression
+from rsltrace.conditions.topic_fields import OF_MESSAGE, plain
+from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
-from rsltrace.errors import RsltraceError
+from rsltrace.errors import ConditionError, RsltraceError
 from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.decode import to_plain
 from rsltrace.words.logs import parse_log
 from rsltrace.words.matching import LOG_LEVELS, is_named
 from rsltrace.words.times import parse_stamp
 from rsltrace_viewer.model.query.completion import Choices
-from rsltrace_viewer.model.query.fields import level_of, whole_number
+from rsltrace_viewer.model.query.fields import level_of, place_of, whole_number
 from rsltrace_viewer.model.query.parser import Language, read
 from rsltrace_viewer.model.query.tokens import (
     QueryError,
@@ -41,6 +44,7 @@ FIELDS = {
     "index": "message number on its topic: 100..200",
     "text": "text in the message, decoded",
     "level": "log records of a level or worse",
+    "where": 'fields of messages: "/odom: x > 1"',
 }
 _PER_STEP = 256
 _LOG_TYPE = "rcl_interfaces/msg/Log"
@@ -96,6 +100,7 @@ def read_filter(text: str, recordings: Sequence[Recording]) -> Condition | None:
                 "index": _index,
                 "text": lambda token: _says(unquoted(token).casefold()),
                 "level": _level,
+                "where": partial(_where, topics),
             },
             _bare,
             lambda one: Condition(lambda part, among: ~one.mask(part, among), one.reads),
@@ -192,6 +197,35 @@ def _level(token: Token) -> Condition:
         return part.each(accept, among) if is_log else part.all(False)
 
     return Condition(logged, reads=True)
+
+
+def _where(topics: list[str], token: Token) -> Condition:
+    try:
+        found = OF_MESSAGE.match(plain(unquoted(token)))
+        if found is None:
+            raise QueryError("say /topic: EXPRESSION", token.start, token.end)
+        if found[1] not in topics:
+            known = ", ".join(topics[:8])
+            raise QueryError(f"no topic matches; there are {known}", token.start, token.end)
+        expression = parse_expression(found[2], has_own=True)
+    except ConditionError as error:
+        raise QueryError(error.message, *place_of(token, error)) from None
+
+    def holds(part: Part, among: Mask) -> Mask:
+        if part.topic.name != found[1]:
+            return part.all(False)
+        start = StartOfTrace(part.recording.start_ns)
+
+        def accept(data: bytes) -> bool:
+            try:
+                message = part.recording.decode(part.topic, data)
+                return bool(expression.value(start, message=message))
+            except Exception:  # of this message: what it cannot be evaluated of does not fulfil it
+                return False
+
+        return part.each(accept, among)
+
+    return Condition(holds, reads=True)
 
 
 def _bare(token: Token) -> Condition:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from rsltrace.debug.conditions.condition import Armed, error_text, shown
-from rsltrace.debug.conditions.expressions import Expression
-from rsltrace.debug.conditions.view import EventView, Moment
+from rsltrace.conditions.condition import Armed, error_text, shown
+from rsltrace.conditions.expressions import Expression
+from rsltrace.conditions.view import EventView, Moment
 from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import format_seconds
 

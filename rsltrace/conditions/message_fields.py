@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from rsltrace.debug.conditions.names import Fields
+from rsltrace.conditions.names import Fields
 from rsltrace.errors import did_you_mean
 
 _INTERFACE = re.compile(r"\w+(?:/\w+){1,2}")
@@ -21,7 +21,7 @@ class WrongField(NamedTuple):
     message: str
 
 
-def wrong_field(tree: ast.Expression, interface: str, fields: Fields) -> WrongField | None:
+def wrong_field(tree: ast.expr, interface: str, fields: Fields) -> WrongField | None:
     """Return the first part of ``tree`` that reads a field which an interface does not have."""
     own = {
         node.id

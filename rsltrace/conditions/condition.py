@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from rsltrace.debug.conditions.expressions import Expression
-from rsltrace.debug.conditions.view import EventView, Moment
+from rsltrace.conditions.expressions import Expression
+from rsltrace.conditions.view import EventView, Moment
 from rsltrace.errors import ConditionError, RsltraceError
 
 _COMES_AND_GOES = (IndexError, KeyError, ZeroDivisionError)
@@ -69,7 +69,7 @@ def is_true(
         raise
     except Exception as error:
         end = expression.begin + len(expression.text)
-        hint = "; say .any() or .all()" if "ambiguous" in str(error) else ""
+        hint = "; say any(...) or all(...)" if "ambiguous" in str(error) else ""
         raise ConditionError(
             f"event {view.index}: {error_text(error)}{hint}", text, expression.begin, end
         ) from None

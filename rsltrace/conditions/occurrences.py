@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import builtins
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from rsltrace.debug.conditions.condition import Armed, is_true, shown, shown_text
-from rsltrace.debug.conditions.expressions import Expression
-from rsltrace.debug.conditions.view import EventView, Sent
+from rsltrace.conditions.condition import Armed, is_true, shown, shown_text
+from rsltrace.conditions.expressions import Expression
+from rsltrace.conditions.view import EventView, Sent
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.words.matching import is_named
 
@@ -203,9 +202,22 @@ class If(Armed):
         return f"{why} if {self.expression.text}" if found else ""
 
 
-def says_pattern(pattern: re.Pattern[str]) -> Callable[[str], object]:
-    """Return whether a text has something that a regular expression fits."""
-    return pattern.search
+def says_pattern(pattern: str) -> Callable[[str], object]:
+    """Return whether a text has something that a regular expression fits.
+
+    Pydantic's engine takes time in proportion to the text, whatever the pattern. Rejected:
+    Python's, which ``(a+)+$`` in somebody's job keeps busy for ever.
+
+    :raises ValueError: it is none, or one that looks ahead, behind or back.
+    """
+    from pydantic_core import SchemaError, SchemaValidator, core_schema
+
+    try:
+        schema = core_schema.str_schema(pattern=pattern, regex_engine="rust-regex")
+        matches = SchemaValidator(schema).isinstance_python
+    except SchemaError as error:
+        raise ValueError(str(error).splitlines()[-1].strip().removeprefix("error: ")) from None
+    return lambda text: matches(text.encode(errors="replace").decode())
 
 
 def says_words(words: str) -> Callable[[str], object]:

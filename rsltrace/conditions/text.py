@@ -5,6 +5,7 @@
     node /ekf    entity /scan               before an event of a node, of an entity (name, #number)
     topic /odom                             a message is sent (after), or received (before)
     /odom: pose.pose.position.x > 3         the same, of a message whose fields say so
+    /odom.pose.pose.position.x > 3          (or so)
     output 3f2a                             after an event with such an output hash
     exception ValueError                    after an event that raised; without a type, anything
     log warn /too far/                      after a log record of a level or worse, of a text
@@ -23,11 +24,11 @@ import re
 from collections.abc import Callable
 from functools import partial
 
-from rsltrace.debug.conditions.changes import AtTime, Watch, When
-from rsltrace.debug.conditions.condition import Armed, Condition
-from rsltrace.debug.conditions.expressions import parse_expression
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.occurrences import (
+from rsltrace.conditions.changes import AtTime, Watch, When
+from rsltrace.conditions.condition import Armed, Condition
+from rsltrace.conditions.expressions import parse_expression
+from rsltrace.conditions.names import Names
+from rsltrace.conditions.occurrences import (
     AtIndex,
     Found,
     If,
@@ -40,7 +41,8 @@ from rsltrace.debug.conditions.occurrences import (
     says_pattern,
     says_words,
 )
-from rsltrace.debug.conditions.view import Moment
+from rsltrace.conditions.topic_fields import plain, topic_of
+from rsltrace.conditions.view import Moment
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.model.finding import Source
 from rsltrace.words.matching import LOG_LEVELS, is_named
@@ -95,6 +97,9 @@ class _Reader:
             return read(self)
         if (message := _MESSAGE.match(text, self._at)) is not None:
             return self._message(message)
+        rewritten = plain(text)
+        if rewritten != text.strip() and topic_of(rewritten) is not None and "." in text:
+            return _Reader(rewritten, self._names).read()
         return self._bare()
 
     # -- by their first word -----------------------------------------------------------------------
@@ -265,13 +270,13 @@ class _Reader:
         text, at = self._text, self._at
         if text[at : at + 1] == "/" and (end := _closing(text, at)) > at:
             try:
-                pattern = re.compile(text[at + 1 : end])
-            except (re.error, RecursionError, OverflowError) as error:
-                place = getattr(error, "pos", None)
-                self._at += 1 + (place or 0)
-                raise self._wrong(f"not a regular expression: {error}", 1) from None
+                says = says_pattern(text[at + 1 : end])
+            except ValueError as error:
+                self._at += 1
+                message = f"not a regular expression: {error}"
+                raise self._wrong(message, end - at - 1) from None
             self._at = end + 1
-            return says_pattern(pattern)
+            return says
         quote = text[at : at + 1]
         if quote in ("'", '"') and (end := text.find(quote, at + 1)) > 0:
             self._at = end + 1

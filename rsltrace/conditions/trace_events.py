@@ -3,18 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import numpy.typing as npt
 
-from rsltrace.debug.conditions.view import Sent
-from rsltrace.errors import TraceError
-from rsltrace.model.event import NO_EVENT, Event, Output, OutputKind
+from rsltrace.conditions.changes import AtTime, Watch, When
+from rsltrace.conditions.names import names_of
+from rsltrace.conditions.text import parse_condition
+from rsltrace.conditions.topic_fields import plain, topic_of
+from rsltrace.conditions.view import Sent
+from rsltrace.errors import ConditionError, TraceError
+from rsltrace.model.event import NO_EVENT, NO_SEQUENCE, Event, Output, OutputKind
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.logs import log_record
+from rsltrace.words.matching import is_named
 
 _MESSAGES = (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE)
+
+
+@dataclass(frozen=True, slots=True)
+class StartOfTrace:
+    """The moment at which a run begins: there are no nodes."""
+
+    stamp_ns: int
+
+    def nodes(self) -> dict[str, object]:
+        """Return none."""
+        return {}
 
 
 class TraceEvent:
@@ -81,14 +99,49 @@ class TraceEvent:
 
     def _message(self, output: Output) -> object:
         """Decode what was sent. Raises TraceError if that was not kept, or does not fit."""
-        found = self._trace.payload(output)
         channel = self._trace.channel_of(output)
-        if found is None or channel is None:
+        if channel is None or output.sequence == NO_SEQUENCE:
             raise TraceError(
                 f"{self._trace.name} holds no messages of {self._name(output)}, which a check "
                 "reads: record them (record: payloads, topics, exclude)"
             )
-        return self._trace.decode(channel, found[2])
+        return self._trace.decode(channel, self._trace.message(channel.id, output.sequence)[1])
+
+
+class TraceCondition:
+    """A condition that single events of a trace are held against: those that send or receive such
+    a message, log such a text, raise, ...
+
+    ``entities`` are those whose events it can be (sorted), None: any.
+
+    :raises ConditionError: it cannot be understood, or no trace says it.
+    """
+
+    def __init__(self, text: str, trace: Trace) -> None:
+        names = names_of(trace.entities.values(), fields=trace.fields_of)
+        read = parse_condition(text, names)
+        self._armed = read.arm(StartOfTrace(trace.start_ns))
+        inner = getattr(self._armed, "inner", self._armed)
+        if isinstance(inner, (AtTime, Watch, When)):
+            raise ConditionError(
+                "an event of a trace has messages, log records, exceptions and findings: say "
+                "/topic: EXPRESSION, log, exception or finding",
+                text,
+            )
+        self._trace = trace
+        topic = topic_of(plain(text))
+        self.entities: npt.NDArray[np.uint32] | None = None
+        if topic is not None:
+            ids = sorted(one.id for one in trace.entities.values() if is_named(topic, one.name))
+            self.entities = np.array(ids, dtype=np.uint32)
+
+    def holds(self, event: Event, outputs: Sequence[Output]) -> bool:
+        """Return whether it is true of an event.
+
+        :raises ConditionError: it cannot be evaluated.
+        """
+        view = TraceEvent(self._trace, event, outputs)
+        return bool(self._armed.before(view) or self._armed.after(view))
 
 
 def events_of(trace: Trace, topics: Collection[str] | None) -> Iterator[TraceEvent]:
