@@ -3,6 +3,7 @@
 #include <unordered_map>
 
 #include "listeners.h"
+#include "waiting.h"
 
 namespace rsltrace {
 
@@ -47,6 +48,7 @@ void deliver(std::uint32_t id, Reader &reader) {
 }
 
 bool take(Endpoint &endpoint, Item &item) {
+  if (endpoint.inbox.empty()) await_turn(endpoint);
   if (!endpoint.inbox.empty()) {
     item = std::move(endpoint.inbox.front());
     endpoint.inbox.pop_front();
