@@ -125,6 +125,7 @@ class Process:
             Say.TIMER_NEXT: self._timer_next,
             Say.WAIT_SET: self._wait_set,
             Say.ALIVE: self._alive,
+            Say.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
     # -- as the trace has it ---------------------------------------------------------------------

@@ -61,6 +61,7 @@ class Say(IntEnum):
     CLOCK_OWNER = 28
     CLOCK = 29
     READY = 30
+    DROPPED = 31
 
 
 class Told(IntEnum):

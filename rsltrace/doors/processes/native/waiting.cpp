@@ -4,6 +4,7 @@
 #include <rmw/rmw.h>
 
 #include <algorithm>
+#include <list>
 #include <unordered_set>
 
 #include "rmw_common.h"
@@ -69,6 +70,17 @@ Found find(const Wanted &wanted, const Ready &ready) {
 
 void remove(std::vector<Waiter *> &waiters, const Waiter *waiter) {
   waiters.erase(std::remove(waiters.begin(), waiters.end(), waiter), waiters.end());
+}
+
+// Who waits now, and for what.
+struct Parked {
+  const Wanted *wanted;
+  Waiter *waiter;
+};
+
+std::list<Parked> &parked() {
+  static auto *all = new std::list<Parked>;
+  return *all;
 }
 
 // What was handed over without its turn having come, by number.
@@ -169,11 +181,21 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
     say_deadlines(wanted.timers);
     waiter.set = &numbered(wanted);
     for (const auto &one : wanted.conditions) one.condition->waiters.push_back(&waiter);
+    parked().push_back({&wanted, &waiter});
     park(waiter);
+    parked().remove_if([&](const Parked &one) { return one.waiter == &waiter; });
     for (const auto &one : wanted.conditions) remove(one.condition->waiters, &waiter);
     const Found there = find(wanted, waiter.ready);
     if (there.kind != Found::Kind::NOTHING) return there;
     if (now_ns() >= deadline_ns) return {};
+  }
+}
+
+void wake_receivers(std::uint32_t endpoint) {
+  for (const Parked &one : parked()) {
+    if (find(*one.wanted, {Wake::ENTITY, endpoint}).kind == Found::Kind::NOTHING) continue;
+    one.waiter->woken = true;
+    one.waiter->ready = {Wake::ENTITY, endpoint};
   }
 }
 

@@ -40,6 +40,8 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
 std::vector<Found> wait_for(const Wanted &wanted, std::int64_t timeout_ns, const char *what);
 // What a wait without a time finds, without the millisecond that it takes if that is nothing.
 std::vector<Found> ready_now(const Wanted &wanted);
+// Wake whoever waits for an endpoint beside the one whom the loop lets go on.
+void wake_receivers(std::uint32_t endpoint);
 // Have the loop let run what was found so, before it is taken, or the timer called.
 void await_turn(Endpoint &endpoint);
 void await_turn(std::uint32_t timer);

@@ -43,6 +43,7 @@ enum class Say : std::uint32_t {
   CLOCK_OWNER,
   CLOCK,
   READY,
+  DROPPED,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
