@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -11,6 +12,7 @@ import click
 
 from rsltrace.cli.output.native_text import NO_DIGEST, native_json, native_lines, real_time
 from rsltrace.model.built_in import is_built_in
+from rsltrace.model.drop import drops_of
 from rsltrace.model.endless_wait import waits_of
 from rsltrace.model.entity import Entity, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
@@ -89,6 +91,7 @@ def _as_text(trace: Trace, counts: Counts, *, show_all: bool) -> list[str]:
     if edits := edits_of(trace):
         lines += ["", "edits, as a branch of another run", *(f"  {printable(e)}" for e in edits)]
     lines += _guard_lines(trace)
+    lines += _drop_lines(trace)
     lines += ["", *_node_lines(trace, counts), "", *_entity_lines(trace, counts, show_all)]
     return lines
 
@@ -142,6 +145,19 @@ def _guard_lines(trace: Trace) -> list[str]:
     findings = sum(met.count for met in trace.guarded if met.is_finding)
     title = f"guard findings: {findings}" if findings else "guard: nothing that could differ"
     return [*lines, "", title, *table(rows, right=frozenset((4,)))]
+
+
+def _drop_lines(trace: Trace) -> list[str]:
+    """What full queues dropped; nothing for runs in which none did."""
+    rows = [("  dropped", "depth", "node", "kind", "name", "queue")]
+    for drop in drops_of(trace.result):
+        entity = trace.entities.get(drop.entity)
+        if entity is None:
+            continue
+        whose = "a publisher's, in an outage" if drop.in_outage else "its own"
+        row = (f"  {drop.count}", str(drop.depth), _owner(trace, entity), entity.kind.label)
+        rows.append((*row, printable(entity.name) or "-", whose))
+    return ["", "full queues", *table(rows, right=frozenset((0, 1)))] if rows[1:] else []
 
 
 def _entity_lines(trace: Trace, counts: Counts, show_all: bool) -> list[str]:
@@ -202,6 +218,7 @@ def _as_json(trace: Trace, counts: Counts) -> dict[str, Any]:
             }
             for met in trace.guarded
         ],
+        "drops": [asdict(drop) for drop in drops_of(trace.result)],
         "nodes": [node.name for node in _nodes(trace)],
         "entities": [
             {

@@ -262,6 +262,7 @@ class Link:
             self._loop.schedule(until_ns, self._release)
         elif len(self._held) == self._held.maxlen:
             self._lost += 1
+            self.subscription.drop(len(self._held))
         self._held.append((message, arrivals_ns))
 
     def _release(self) -> None:

@@ -88,7 +88,10 @@ class Publisher(DomainEntity):
             delivery = (now_ns, 0, 0, None, data, event, position, digest, now_ns, count)
             ready = loop.ready
             for subscription in self.subscriptions:
-                subscription.queue.append(delivery)
+                queue = subscription.queue
+                if len(queue) == subscription.keep:
+                    subscription.drop()
+                queue.append(delivery)
                 if subscription.active:
                     ready.append(subscription)
                 else:

@@ -44,13 +44,16 @@ def quick_send(dispatcher: Dispatcher, link: OrderedLink, delay: Sampler) -> Sen
     loop = dispatcher.loop
     under_way = dispatcher.event
     subscription = link.subscription
-    entity = subscription.entity_id
+    entity, keep = subscription.entity_id, subscription.keep
     scheduled, next_place = loop.scheduled, loop.next_place
 
     def arrive(release: Release) -> Subscription | None:
         if subscription.destroyed:
             return None
-        subscription.queue.append(release)
+        queue = subscription.queue
+        if len(queue) == keep:
+            subscription.drop()
+        queue.append(release)
         if subscription.active:
             return subscription
         subscription.awaken()

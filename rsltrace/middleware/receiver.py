@@ -17,6 +17,8 @@ class Receiver(DomainEntity):
     """
 
     queue: deque[Any]
+    keep: int | None = None
+    """How many arrivals the queue holds; a full one drops its oldest. None: all."""
     origin = slice(1, 4)
     """Where an arrival says what it is: publishing event, which of its outputs, content hash."""
 
@@ -27,11 +29,19 @@ class Receiver(DomainEntity):
 
     def arrived(self, arrival: Any) -> Receiver | None:
         """Queue an arrival; return this receiver if it is ready for it now."""
+        if len(self.queue) == self.keep:
+            self.drop()
         self.queue.append(arrival)
         if self.active:
             return self
         self.awaken()
         return None
+
+    def drop(self, held: int = 0) -> None:
+        """Count what is dropped by the full queue, or by that of a publisher which holds so many
+        messages in an outage."""
+        drops = self.dispatcher.outcome.drops
+        drops[self, held] = drops.get((self, held), 0) + 1
 
     def awaken(self) -> None:
         """Become active if that is possible by now: something has arrived."""

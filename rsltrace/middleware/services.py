@@ -58,7 +58,8 @@ class ServiceEnd(Receiver):
         self.service = service
         self.type = type
         self.profile = qos.resolved(publisher=True, peers=[])
-        self.queue: deque[Exchange] = deque()
+        self.keep = self.profile.keep
+        self.queue: deque[Exchange] = deque(maxlen=self.keep)
         self._channel: int | None = None
 
     @property

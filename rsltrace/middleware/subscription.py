@@ -48,6 +48,7 @@ class Subscription(Receiver):
         self.type = type
         self.qos = qos
         self.callback = callback
+        self.keep = qos.keep
         self.queue: deque[Delivery] = deque(maxlen=qos.keep)
         self.timed = any(map(finite, (qos.deadline_ns, qos.lifespan_ns, qos.lease_ns)))
         self.publishers: list[DomainEntity] = []

@@ -24,10 +24,12 @@ from rsltrace.loop.timer_queue import timer_queue
 from rsltrace.mcap.sink import unfinished
 from rsltrace.middleware.events.census import Census
 from rsltrace.middleware.faults import FaultsOfAll
+from rsltrace.model.drop import kept_drops
 from rsltrace.model.endless_wait import EndlessWait, kept_waits
 from rsltrace.model.finding import GuardCount
 from rsltrace.model.printable import shortened
 from rsltrace.model.stamp import format_seconds
+from rsltrace.run.full_queues import drop_notes, drops
 from rsltrace.run.inputs import check_output
 from rsltrace.run.launch_files import without_launch_files
 from rsltrace.run.numerical_libraries import LateLibraries
@@ -518,6 +520,7 @@ class Session:
                     "ended_after": str(outcome.ended_after),
                     **self._order_of_starts(),
                     **_waits(error, outcome.waits),
+                    **kept_drops(drops(outcome.drops)),
                     **self._late_numerics(),
                 },
                 replace=self._has_begun or exit_code == 0,
@@ -534,7 +537,7 @@ class Session:
             stop_reason=stop.reason,
             exit_code=exit_code,
             error=error,
-            notes=(*self._notes, *outcome.notes, *unused),
+            notes=(*self._notes, *outcome.notes, *drop_notes(outcome.drops), *unused),
             guarded=self._guarded.counts,
             kept="" if self._writer is None else self._writer.kept,
         )

@@ -25,6 +25,8 @@ _LIBRARIES = (
     "std_msgs__rosidl_generator_c",
     "std_srvs__rosidl_typesupport_c",
     "std_srvs__rosidl_generator_c",
+    "rosgraph_msgs__rosidl_typesupport_c",
+    "rosgraph_msgs__rosidl_generator_c",
 )
 
 

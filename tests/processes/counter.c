@@ -1,7 +1,7 @@
 // A node on rcl alone: a timer counts, and what comes in on /echo goes out on /heard.
 //
 // Usage: counter [period in ms] [when to leave, or what to do at the fifth count: crash, exit, …]
-// It counts from the number in COUNT_FROM, and from that in the file "more" in its folder. With
+// With "address" it publishes where its timer lies instead. It counts from the number in COUNT_FROM, and from that in the file "more" in its folder. With
 // NAMED there is another node, and callbacks are told to tracetools as rclcpp does it.
 #include <rcl/error_handling.h>
 #include <rcl/rcl.h>
@@ -26,11 +26,11 @@ static rcl_publisher_t count_publisher;
 static uint64_t counted = 0;
 
 static void on_timer(rcl_timer_t *timer, int64_t since_last) {
-  (void)timer;
   (void)since_last;
   std_msgs__msg__UInt64 message;
   std_msgs__msg__UInt64__init(&message);
   message.data = ++counted;
+  if (strcmp(action, "address") == 0) message.data = (uint64_t)(uintptr_t)timer;
   CHECK(rcl_publish(&count_publisher, &message, NULL));
   if (counted == 5 && strcmp(action, "crash") == 0) raise(SIGSEGV);
   if (counted == 5 && strcmp(action, "kill") == 0) raise(SIGKILL);

@@ -74,7 +74,7 @@ def test_nodes_of_c_have_one_digest_on_any_core_under_load_with_random_addresses
     with Trace.open(quiet) as trace:
         assert trace.event_count > 100
     if not fixed:
-        monkeypatch.setattr(child, "_NO_RANDOM_ADDRESSES", 0)
+        monkeypatch.setattr(child, "fix_addresses", lambda fixed: False)
     cores = set(sorted(os.sched_getaffinity(0))[where])
     path = tmp_path / "run.mcap"
     with _load(), _on(cores):

@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from rsltrace.campaign.perturb import ADDRESSES, HEAP, can_fix_addresses, record_in, surroundings
 from rsltrace.doors.processes.child import Child
 from rsltrace.doors.processes.life import Life, has_memory
 from rsltrace.job import load_job
@@ -51,6 +53,25 @@ def _logs(path: Path) -> list[tuple[int, str]]:
     with Trace.open(path) as trace:
         records = [(s, trace.decode("/rosout", d)) for s, _, d in trace.messages("/rosout")]
     return [(stamp // 1_000_000, record.msg) for stamp, record in records]  # type: ignore[attr-defined]
+
+
+@pytest.mark.ros
+@pytest.mark.skipif(not can_fix_addresses(), reason="needs setarch, and a kernel that allows it")
+def test_addresses_of_processes_are_perturbed_where_nothing_is_pinned_and_else_fixed(
+    compiled: Callable[[str], Path], tmp_path: Path
+) -> None:
+    (tmp_path / "job.yaml").write_text(f"""
+nodes: [{{program: {compiled("counter.c")}, arguments: ["100", address]}}]
+stop: {{duration: 1s}}
+""")
+    job = str(tmp_path / "job.yaml")
+    first = surroundings(1)
+    ways = [surroundings(0), first.only(ADDRESSES), first.only(HEAP)]
+    free = [record_in(way, [job, "--no-pin"], tmp_path).digest for way in ways]
+    assert "" not in free
+    assert len(set(free)) == len(ways)
+    pinned = [record_in(way, [job], tmp_path).digest for way in ways[:2]]
+    assert len(set(pinned)) == 1
 
 
 @pytest.mark.ros

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import signal
 import socket
 import struct
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,14 +16,13 @@ from rsltrace.doors.processes.life import Life, has_memory
 from rsltrace.doors.processes.shared import Said, Shared
 from rsltrace.doors.processes.wire import HEAD, RECORD, Told
 from rsltrace.errors import JobError
+from rsltrace.guard.pin import fix_addresses
 
 _LARGE = 1 << 14
 """What is longer is not sent, but laid into memory that both see."""
 _HEAD_SIZE = HEAD.size
 _LOOK_S = 0.2
 _GRACE_S = 2.0
-_NO_RANDOM_ADDRESSES = 0x0040000
-_PRESENT = 0xFFFFFFFF
 _LOST_LINK = 120  # of native/link.cpp
 
 
@@ -58,6 +56,9 @@ class Ended:
 class Child:
     """A running executable with the library in it, in a process group of its own.
 
+    Its addresses are the same in every run if they are ``fixed``, where the system allows that; if
+    not, they are what those of whoever starts rsltrace would be.
+
     :raises JobError: if it cannot be started.
     """
 
@@ -67,6 +68,8 @@ class Child:
         environment: Mapping[str, str],
         folder: Path | None,
         name: str,
+        *,
+        fixed: bool = True,
     ) -> None:
         self._name = name
         here, there = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -80,7 +83,7 @@ class Child:
             # Of one length: the environment lies on the stack, and what comes after it moves.
             link = ":".join(f"{number:010d}" for number in (files[0], os.getpid(), *files[1:]))
             try:
-                with _addresses_as_they_are():
+                with _fixed_addresses() if fixed else nullcontext():
                     self._process = subprocess.Popen(
                         list(argv),
                         env={**environment, "RSLTRACE_LINK": link},
@@ -192,14 +195,11 @@ class Child:
 
 
 @contextmanager
-def _addresses_as_they_are() -> Iterator[None]:
+def _fixed_addresses() -> Iterator[None]:
     """Let children have the same addresses in every run, where the system allows it."""
-    personality = ctypes.CDLL(None).personality
-    before = personality(ctypes.c_ulong(_PRESENT))
-    if before >= 0:
-        personality(ctypes.c_ulong(before | _NO_RANDOM_ADDRESSES))
+    changed = fix_addresses(True)
     try:
         yield
     finally:
-        if before >= 0:
-            personality(ctypes.c_ulong(before))
+        if changed:
+            fix_addresses(False)

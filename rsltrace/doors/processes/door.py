@@ -24,11 +24,15 @@ _EVERY_PROCESS_ENDED = "every process has ended"
 
 @dataclass(frozen=True, slots=True)
 class Program:
-    """What to start as a process: the whole command line, and what it finds around it."""
+    """What to start as a process: the whole command line, and what it finds around it.
+
+    It has the same addresses in every run if it is ``pinned``.
+    """
 
     argv: Sequence[str]
     environment: Mapping[str, str] = field(default_factory=dict)
     folder: Path | None = None
+    pinned: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +88,8 @@ class ProcessDoor:
 
         def begin() -> None:
             on_start()
-            process.begin(lambda: Child(program.argv, program.environment, program.folder, name))
+            argv, environment, folder = program.argv, program.environment, program.folder
+            process.begin(lambda: Child(argv, environment, folder, name, fixed=program.pinned))
 
         domain.dispatcher.run_outside(
             OutsideEvent(process.describe),

@@ -31,6 +31,9 @@ class Thing(Protocol):
     def dispatch(self) -> None:
         """Hand over what is ready."""
 
+    def may_run(self) -> bool:
+        """Return whether there is something to hand over now."""
+
     def describe(self) -> str:
         """Name it for people."""
 
@@ -255,6 +258,10 @@ class ProcessTimer(Timer):
     def cancel(self) -> None:
         self.state.canceled = True
         self.dispatcher.loop.timers.remove(self.state)
+
+    def may_run(self) -> bool:
+        """Return whether it is due."""
+        return not self.state.canceled and self.state.deadline_ns <= self.dispatcher.loop.now_ns
 
     def dispatch(self) -> None:
         loop, state, process = self.dispatcher.loop, self.state, self.process

@@ -105,6 +105,7 @@ class Process:
         self._questions: dict[int, Question] = {
             Say.HELLO: self._hello,
             Say.TAKE: self._take,
+            Say.READY: self._ready,
             Say.GID: lambda fields: gid_of(self.things[fields.number()].entity_id),
             Say.QOS: self._qos,
             Say.MATCHED: self._matched,
@@ -124,6 +125,7 @@ class Process:
             Say.TIMER_NEXT: self._timer_next,
             Say.WAIT_SET: self._wait_set,
             Say.ALIVE: self._alive,
+            Say.DROPPED: lambda fields: self.things[fields.number()].drop(),
         }
 
     # -- as the trace has it ---------------------------------------------------------------------
@@ -374,6 +376,15 @@ class Process:
     def _take(self, fields: Fields) -> bytes:
         item = self.things[fields.number()].take()
         return HEAD.pack(0) if item is None else HEAD.pack(1) + item
+
+    def _ready(self, fields: Fields) -> bytes:
+        """Say which of some things are ready, in the order in which the loop would run them."""
+        asked = [self.things[fields.number()] for _ in range(fields.number())]
+        order = dict.fromkeys((*self._held, *self.dispatcher.loop.ready))
+        places = {thing: place for place, thing in enumerate(order)}
+        ready = [thing.number for thing in asked if thing.may_run()]
+        ready.sort(key=lambda number: (places.get(self.things[number], len(places)), number))
+        return struct.pack(f"<{1 + len(ready)}I", len(ready), *ready)
 
     def _qos(self, fields: Fields) -> bytes:
         end = self.things[fields.number()]

@@ -85,6 +85,7 @@ def program(
     folder: Path | None,
     search_path: Sequence[str] = (),
     prefixes: Sequence[str] = (),
+    pinned: bool = True,
 ) -> Program:
     """Return a command as a process of the run: with variables of ``surroundings`` but for those of
     ``environment``.
@@ -108,7 +109,7 @@ def program(
     if prefixes:  # what is built comes first
         found = [*_listed(around, "AMENT_PREFIX_PATH"), *prefixes]
         around["AMENT_PREFIX_PATH"] = os.pathsep.join(found)
-    return Program(list(command), around, folder)
+    return Program(list(command), around, folder, pinned)
 
 
 def _listed(environment: Mapping[str, str], name: str) -> list[str]:

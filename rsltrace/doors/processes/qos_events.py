@@ -49,6 +49,10 @@ class ProcessQosEvent(QosEvent):
                 0,
             )
 
+    def may_run(self) -> bool:
+        """Return whether there is a status to hand over."""
+        return self.has_news()
+
     def take(self) -> bytes:
         """Return the status, packed."""
         counts = astuple(self.take_event())

@@ -60,6 +60,8 @@ class Say(IntEnum):
     TIMER_OF = 27
     CLOCK_OWNER = 28
     CLOCK = 29
+    READY = 30
+    DROPPED = 31
 
 
 class Told(IntEnum):

@@ -75,6 +75,7 @@ class Processes:
             folder=self.folder(spec, where),
             search_path=self.search_path,
             prefixes=self.prefixes,
+            pinned=self._job.guard.pins,
         )
 
     @cached_property

@@ -1,8 +1,10 @@
 #include "endpoints.h"
 
+#include <algorithm>
 #include <unordered_map>
 
 #include "listeners.h"
+#include "waiting.h"
 
 namespace rsltrace {
 
@@ -24,6 +26,11 @@ Item read_item(Reader &reader) {
   return item;
 }
 
+void drop_oldest(Endpoint &endpoint) {
+  endpoint.inbox.pop_front();
+  if (endpoint.reported > 0) --endpoint.reported;
+}
+
 }  // namespace
 
 std::uint32_t new_id() {
@@ -41,15 +48,29 @@ void forget(std::uint32_t id) {
   if (linked()) say(Say::GONE, body);
 }
 
+std::size_t depth_of(const rmw_qos_profile_t &qos) {
+  return qos.history == RMW_QOS_POLICY_HISTORY_KEEP_ALL ? 0 : std::max<std::size_t>(qos.depth, 1);
+}
+
 void deliver(std::uint32_t id, Reader &reader) {
   const auto found = endpoints().find(id);
-  if (found != endpoints().end()) found->second->inbox.push_back(read_item(reader));
+  if (found == endpoints().end()) return;
+  Endpoint &endpoint = *found->second;
+  if (endpoint.depth != 0 && endpoint.inbox.size() == endpoint.depth) {
+    drop_oldest(endpoint);
+    Writer body;
+    body.number(id);
+    say(Say::DROPPED, body);
+  }
+  endpoint.inbox.push_back(read_item(reader));
+  has_arrived(id);
 }
 
 bool take(Endpoint &endpoint, Item &item) {
+  if (endpoint.inbox.empty()) await_turn(endpoint);
   if (!endpoint.inbox.empty()) {
     item = std::move(endpoint.inbox.front());
-    endpoint.inbox.pop_front();
+    drop_oldest(endpoint);
     return true;
   }
   if (!linked()) return false;

@@ -29,6 +29,8 @@ struct Endpoint {
   explicit Endpoint(std::uint32_t id_) : id(id_) {}
   std::uint32_t id;
   std::deque<Item> inbox;
+  std::size_t depth = 0;     // how many items the inbox holds; 0: all
+  std::size_t reported = 0;  // how many of them a listener has been called for (listeners.h)
   MessageCodec type;        // of a topic, or of requests
   MessageCodec other_type;  // of responses
   std::int64_t requests = 0;  // how many a client has sent
@@ -36,7 +38,9 @@ struct Endpoint {
 
 void remember(Endpoint *endpoint);
 void forget(std::uint32_t id);
-// Put what the loop has sent into the endpoint's inbox.
+// How many items an endpoint of a QoS holds.
+std::size_t depth_of(const rmw_qos_profile_t &qos);
+// Put what the loop has sent into the endpoint's inbox; a full one drops its oldest.
 void deliver(std::uint32_t id, Reader &reader);
 // Take the oldest item: from the inbox, or from what waits in the loop. False: there is none.
 bool take(Endpoint &endpoint, Item &item);

@@ -26,18 +26,31 @@ GuardCondition &changed() {
   return *condition;
 }
 
+// Call a listener for what it has not been called for.
+void report(Listener listener) {
+  Endpoint &endpoint = *listener.endpoint;
+  const std::size_t count = endpoint.inbox.size() - endpoint.reported;
+  endpoint.reported = endpoint.inbox.size();
+  if (count > 0) listener.callback(listener.data, count);
+}
+
 // A thread that waits for all of them, as a middleware has one; it runs when nobody else can.
 void *serve(void *) {
   for (;;) {
     Wanted wanted;
     wanted.only_new = true;
     wanted.conditions.push_back({&changed(), 0});
-    for (const auto &[id, listener] : listeners())
+    std::vector<std::uint32_t> ids;
+    for (const auto &[id, listener] : listeners()) {
       wanted.receivers.push_back({listener.endpoint, id, 0});
-    const Found found = wait_for_one(wanted, -1, "what executors are to be told of");
-    if (found.kind != Found::Kind::RECEIVER) continue;
-    const auto told = listeners().find(static_cast<std::uint32_t>(wanted.receivers[found.index].place));
-    if (told != listeners().end()) told->second.callback(told->second.data, 1);
+      ids.push_back(id);
+    }
+    wait_for_one(wanted, -1, "what executors are to be told of");
+    changed().is_triggered = false;
+    for (const std::uint32_t id : ids) {  // a callback may change who listens
+      const auto told = listeners().find(id);
+      if (told != listeners().end()) report(told->second);
+    }
   }
   return nullptr;
 }
@@ -58,7 +71,13 @@ void listen_to(Endpoint &endpoint, rmw_event_callback_t callback, const void *da
   listeners()[endpoint.id] = {&endpoint, callback, data};
   start();
   trigger(changed());
-  if (!endpoint.inbox.empty()) callback(data, endpoint.inbox.size());
+  report(listeners()[endpoint.id]);
+}
+
+void has_arrived(std::uint32_t id) {
+  if (listeners().count(id) == 0) return;
+  changed().is_triggered = true;  // or it waits, and is woken
+  wake_receivers(id);
 }
 
 void listen_no_more(std::uint32_t id) {

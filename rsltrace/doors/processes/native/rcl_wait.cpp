@@ -10,6 +10,7 @@
 
 #include <algorithm>
 
+#include "executor_order.h"
 #include "ros_clocks.h"
 #include "timers.h"
 #include "waiting.h"
@@ -93,60 +94,83 @@ Waited waited_by(const rcl_wait_set_t &set) {
   return waited;
 }
 
-// The place of a timer that is due by a clock which is set, NONE if there is none.
-std::size_t due(const rcl_wait_set_t &set, const std::vector<std::size_t> &driven) {
+// The places of the timers that are due by a clock which is set.
+std::vector<std::size_t> due(const rcl_wait_set_t &set, const std::vector<std::size_t> &driven) {
   static const auto is_ready = rcl<decltype(rcl_timer_is_ready)>("rcl_timer_is_ready");
+  std::vector<std::size_t> places;
   for (const std::size_t place : driven) {
     bool ready = false;
-    if (is_ready(set.timers[place], &ready) == RCL_RET_OK && ready) return place;
+    if (is_ready(set.timers[place], &ready) == RCL_RET_OK && ready) places.push_back(place);
   }
-  return NONE;
+  return places;
 }
 
 struct Outcome {
-  Found found;
-  std::size_t due = NONE;  // in the timers of the wait set
+  std::vector<Found> found;
+  std::vector<std::size_t> due;  // in the timers of the wait set
 };
 
 // Fills `waited`, anew whenever a clock is set: what drives it may have changed.
 Outcome wait(const rcl_wait_set_t &set, Waited &waited, std::int64_t timeout_ns) {
   const bool for_ever = timeout_ns < 0 || timeout_ns > NEVER_NS - now_ns();
   const std::int64_t deadline_ns = for_ever ? NEVER_NS : now_ns() + timeout_ns;
-  Outcome outcome;
   while (true) {
     waited = waited_by(set);
+    const Wanted &wanted = waited.wanted;
+    Outcome outcome;
     outcome.due = due(set, waited.driven);
-    if (outcome.due != NONE) return outcome;
-    outcome.found = wait_for_one(waited.wanted, timeout_ns, "rcl_wait");
-    const bool was_set = outcome.found.kind == Found::Kind::CONDITION &&
-                         waited.wanted.conditions[outcome.found.index].place == NONE;
+    if (!outcome.due.empty()) {
+      if (timeout_ns == 0) outcome.found = ready_now(wanted);
+      else outcome.due.resize(1);
+      return outcome;
+    }
+    outcome.found = wait_for(wanted, timeout_ns, "rcl_wait");
+    const bool was_set = std::all_of(
+        outcome.found.begin(), outcome.found.end(), [&](const Found &one) {
+          return one.kind == Found::Kind::CONDITION && wanted.conditions[one.index].place == NONE;
+        });
     if (!was_set) return outcome;
     if (!for_ever) timeout_ns = std::max<std::int64_t>(deadline_ns - now_ns(), 0);
   }
 }
 
+// The places of what stays in a wait set: what is ready.
+struct Kept {
+  std::vector<std::size_t> receivers[EVENT + 1];
+  std::vector<std::size_t> conditions;
+  std::vector<std::size_t> timers;
+};
+
+void keep(Kept &kept, const Waited &waited, const Found &found) {
+  switch (found.kind) {
+    case Found::Kind::RECEIVER: {
+      const auto &one = waited.wanted.receivers[found.index];
+      kept.receivers[one.kind].push_back(one.place);
+      break;
+    }
+    case Found::Kind::CONDITION:
+      kept.conditions.push_back(waited.wanted.conditions[found.index].place);
+      break;
+    case Found::Kind::TIMER: kept.timers.push_back(waited.timer_places[found.index]); break;
+    case Found::Kind::NOTHING: break;
+  }
+}
+
 template <typename Item>
-void keep_only(Item **items, std::size_t size, std::size_t place) {
+void keep_only(Item **items, std::size_t size, const std::vector<std::size_t> &places) {
   for (std::size_t i = 0; i < size; i++) {
-    if (i != place) items[i] = nullptr;
+    if (std::find(places.begin(), places.end(), i) == places.end()) items[i] = nullptr;
   }
 }
 
 // With the one that was found all that are triggered, for rclpy: it looks at them in the order of
-// their creation. (rclcpp goes by addresses, and gets one at a time.)
-void keep_conditions(rcl_wait_set_t &set, const Wanted &wanted, const Found &found) {
+// their creation. (rclcpp goes by addresses, and gets one at a time, unless it only looks.)
+void keep_triggered(Kept &kept, const Wanted &wanted) {
   static const bool takes_all = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
-  std::vector<bool> kept(set.size_of_guard_conditions, false);
-  if (found.kind == Found::Kind::CONDITION) kept[wanted.conditions[found.index].place] = true;
   for (const auto &one : wanted.conditions) {
-    const bool is_there = found.kind == Found::Kind::CONDITION && takes_all && one.place != NONE &&
-                          one.condition->is_triggered;
-    if (!is_there) continue;
+    if (!takes_all || one.place == NONE || !one.condition->is_triggered) continue;
     one.condition->is_triggered = false;
-    kept[one.place] = true;
-  }
-  for (std::size_t i = 0; i < kept.size(); i++) {
-    if (!kept[i]) set.guard_conditions[i] = nullptr;
+    kept.conditions.push_back(one.place);
   }
 }
 
@@ -170,19 +194,18 @@ RSLTRACE_EXPORT rcl_ret_t rcl_wait(rcl_wait_set_t *set, int64_t timeout) {
   }
   Waited waited;
   const Outcome outcome = wait(*set, waited, timeout);
-  const Wanted &wanted = waited.wanted;
-  const Found &found = outcome.found;
-  const bool is_receiver = found.kind == Found::Kind::RECEIVER;
-  const auto place = [&](std::uint32_t kind) {
-    if (!is_receiver || wanted.receivers[found.index].kind != kind) return NONE;
-    return wanted.receivers[found.index].place;
-  };
-  keep_only(set->subscriptions, set->size_of_subscriptions, place(SUBSCRIPTION));
-  keep_only(set->services, set->size_of_services, place(SERVICE));
-  keep_only(set->clients, set->size_of_clients, place(CLIENT));
-  keep_conditions(*set, wanted, found);
-  keep_only(set->timers, set->size_of_timers,
-            found.kind == Found::Kind::TIMER ? waited.timer_places[found.index] : outcome.due);
-  keep_only(set->events, set->size_of_events, place(EVENT));
-  return found.kind == Found::Kind::NOTHING && outcome.due == NONE ? RCL_RET_TIMEOUT : RCL_RET_OK;
+  Kept kept;
+  for (const Found &one : outcome.found) keep(kept, waited, one);
+  if (!kept.conditions.empty()) keep_triggered(kept, waited.wanted);
+  kept.timers.insert(kept.timers.end(), outcome.due.begin(), outcome.due.end());
+  keep_only(set->subscriptions, set->size_of_subscriptions, kept.receivers[SUBSCRIPTION]);
+  keep_only(set->services, set->size_of_services, kept.receivers[SERVICE]);
+  keep_only(set->clients, set->size_of_clients, kept.receivers[CLIENT]);
+  keep_only(set->guard_conditions, set->size_of_guard_conditions, kept.conditions);
+  keep_only(set->timers, set->size_of_timers, kept.timers);
+  keep_only(set->events, set->size_of_events, kept.receivers[EVENT]);
+  show_in_order(*set, {kept.receivers[SUBSCRIPTION], kept.timers, kept.receivers[CLIENT],
+                       kept.receivers[SERVICE]});
+  const bool is_timeout = outcome.found.size() == 1 && outcome.found[0].kind == Found::Kind::NOTHING;
+  return is_timeout ? RCL_RET_TIMEOUT : RCL_RET_OK;
 }

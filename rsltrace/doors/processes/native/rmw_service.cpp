@@ -31,6 +31,7 @@ Handle *create(Say kind, const rmw_node_t *node, const rosidl_service_type_suppo
   if (!type.find(type_support)) return nullptr;
   auto *made = new Endpoint(new_id());
   made->type = type.request;
+  made->depth = depth_of(*qos);
   made->other_type = type.response;
   remember(made);
   Writer body;

@@ -62,6 +62,7 @@ RSLTRACE_EXPORT rmw_subscription_t *rmw_create_subscription(
   if (!type.find(type_support)) return nullptr;
   auto *made = new Endpoint(new_id());
   made->type = type;
+  made->depth = depth_of(*qos);
   remember(made);
   Writer body;
   body.number(made->id);

@@ -7,6 +7,7 @@
 
 #include "endpoints.h"
 #include "guard_conditions.h"
+#include "waiting.h"
 
 namespace rsltrace {
 
@@ -153,6 +154,7 @@ RSLTRACE_EXPORT rcl_ret_t rcl_timer_fini(rcl_timer_t *timer) {
 namespace {
 
 void note_called(const rcl_timer_t *timer) {
+  await_turn(timer_id(timer));
   const auto found = timers().find(timer_id(timer));
   if (found != timers().end()) found->second.was_called = true;
 }

@@ -1,16 +1,23 @@
 #include "waiting.h"
 
+#include <dlfcn.h>
 #include <rmw/rmw.h>
 
 #include <algorithm>
+#include <list>
+#include <unordered_set>
 
 #include "rmw_common.h"
+#include "scheduler.h"
 #include "threads.h"
 #include "timers.h"
 
 namespace rsltrace {
 
 namespace {
+
+// After a hundred waits that find something, and none of it is taken, a millisecond passes.
+constexpr unsigned LOOK_WEIGHT = 100;
 
 // Give the set of ids a number, the same as last time if it is the same set.
 const WaitSet &numbered(const Wanted &wanted) {
@@ -49,7 +56,7 @@ Found ready_here(const Wanted &wanted) {
   return {};
 }
 
-Found ready_there(const Wanted &wanted, const Ready &ready) {
+Found find(const Wanted &wanted, const Ready &ready) {
   for (std::size_t i = 0; i < wanted.receivers.size(); i++) {
     if (ready.kind == Wake::ENTITY && wanted.receivers[i].endpoint->id == ready.id) {
       return {Found::Kind::RECEIVER, i};
@@ -65,12 +72,104 @@ void remove(std::vector<Waiter *> &waiters, const Waiter *waiter) {
   waiters.erase(std::remove(waiters.begin(), waiters.end(), waiter), waiters.end());
 }
 
+// Who waits now, and for what.
+struct Parked {
+  const Wanted *wanted;
+  Waiter *waiter;
+};
+
+std::list<Parked> &parked() {
+  static auto *all = new std::list<Parked>;
+  return *all;
+}
+
+// What was handed over without its turn having come, by number.
+std::unordered_set<std::uint32_t> &without_turn() {
+  static auto *all = new std::unordered_set<std::uint32_t>;
+  return *all;
+}
+
+void forget_turns(const Wanted &wanted) {
+  if (without_turn().empty()) return;
+  for (const auto &one : wanted.receivers) without_turn().erase(one.endpoint->id);
+  for (const auto id : wanted.timers) without_turn().erase(id);
+}
+
+// Which of some things the loop has ready, in the order in which it would run them.
+std::vector<std::uint32_t> ask_ready(const std::vector<std::uint32_t> &ids) {
+  Writer body;
+  body.number(static_cast<std::uint32_t>(ids.size()));
+  for (const auto id : ids) body.number(id);
+  const auto answer = ask(Say::READY, body);
+  Reader reader(answer.data(), answer.size());
+  std::vector<std::uint32_t> ready(reader.number<std::uint32_t>());
+  for (auto &id : ready) id = reader.number<std::uint32_t>();
+  return ready;
+}
+
+// What the loop has ready, without asking it to let that run.
+std::vector<Found> ready_there(const Wanted &wanted) {
+  std::vector<std::uint32_t> ids;
+  for (const auto &one : wanted.receivers) ids.push_back(one.endpoint->id);
+  ids.insert(ids.end(), wanted.timers.begin(), wanted.timers.end());
+  say_deadlines(wanted.timers);
+  std::vector<Found> found;
+  for (const std::uint32_t id : ask_ready(ids)) {
+    found.push_back(find(wanted, {Wake::ENTITY, id}));
+    if (found.back().kind == Found::Kind::NOTHING) found.back() = find(wanted, {Wake::TIMER, id});
+  }
+  return found;
+}
+
+Found without_its_turn(const Wanted &wanted, const Found &found) {
+  without_turn().insert(found.kind == Found::Kind::TIMER
+                            ? wanted.timers[found.index]
+                            : wanted.receivers[found.index].endpoint->id);
+  return found;
+}
+
 }  // namespace
+
+std::vector<Found> ready_now(const Wanted &wanted) {
+  forget_turns(wanted);
+  std::vector<Found> found;
+  for (std::size_t i = 0; i < wanted.conditions.size(); i++) {
+    if (!wanted.conditions[i].condition->is_triggered) continue;
+    wanted.conditions[i].condition->is_triggered = false;
+    found.push_back({Found::Kind::CONDITION, i});
+  }
+  for (std::size_t i = 0; i < wanted.receivers.size(); i++) {
+    if (!wanted.receivers[i].endpoint->inbox.empty()) found.push_back({Found::Kind::RECEIVER, i});
+  }
+  for (const Found &one : ready_there(wanted)) {
+    const bool is_here = one.kind == Found::Kind::RECEIVER &&
+                         !wanted.receivers[one.index].endpoint->inbox.empty();
+    if (!is_here) found.push_back(without_its_turn(wanted, one));
+  }
+  return found;
+}
+
+void await_turn(Endpoint &endpoint) {
+  if (without_turn().erase(endpoint.id) == 0 || ask_ready({endpoint.id}).empty()) return;
+  Wanted wanted;
+  wanted.receivers.push_back({&endpoint, 0, 0});
+  wait_for_one(wanted, -1, "its turn");
+}
+
+void await_turn(std::uint32_t timer) {
+  if (without_turn().erase(timer) == 0) return;
+  say_deadlines({timer});
+  if (ask_ready({timer}).empty()) return;
+  Wanted wanted;
+  wanted.timers.push_back(timer);
+  wait_for_one(wanted, -1, "its turn");
+}
 
 Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *what) {
   const std::int64_t wait_ns = timeout_ns == 0 ? POLL_NS : timeout_ns;
   const bool for_ever = wait_ns < 0 || wait_ns > NEVER_NS - now_ns();
   const std::int64_t deadline_ns = for_ever ? NEVER_NS : now_ns() + wait_ns;
+  forget_turns(wanted);
   while (true) {
     const Found here = ready_here(wanted);
     if (here.kind != Found::Kind::NOTHING) return here;
@@ -82,12 +181,40 @@ Found wait_for_one(const Wanted &wanted, std::int64_t timeout_ns, const char *wh
     say_deadlines(wanted.timers);
     waiter.set = &numbered(wanted);
     for (const auto &one : wanted.conditions) one.condition->waiters.push_back(&waiter);
+    parked().push_back({&wanted, &waiter});
     park(waiter);
+    parked().remove_if([&](const Parked &one) { return one.waiter == &waiter; });
     for (const auto &one : wanted.conditions) remove(one.condition->waiters, &waiter);
-    const Found there = ready_there(wanted, waiter.ready);
+    const Found there = find(wanted, waiter.ready);
     if (there.kind != Found::Kind::NOTHING) return there;
     if (now_ns() >= deadline_ns) return {};
   }
+}
+
+void wake_receivers(std::uint32_t endpoint) {
+  for (const Parked &one : parked()) {
+    if (find(*one.wanted, {Wake::ENTITY, endpoint}).kind == Found::Kind::NOTHING) continue;
+    one.waiter->woken = true;
+    one.waiter->ready = {Wake::ENTITY, endpoint};
+  }
+}
+
+std::vector<Found> wait_for(const Wanted &wanted, std::int64_t timeout_ns, const char *what) {
+  if (timeout_ns == 0) {
+    std::vector<Found> found = ready_now(wanted);
+    if (!found.empty()) {
+      if (Thread *thread = me()) look(*thread, LOOK_WEIGHT);  // who takes nothing of it looks again
+      return found;
+    }
+  }
+  std::vector<Found> found = {wait_for_one(wanted, timeout_ns, what)};
+  // rclpy finds what a guard condition has kept it from in its next wait, which it begins at once.
+  static const bool has_python = dlsym(RTLD_DEFAULT, "Py_IsInitialized") != nullptr;
+  if (timeout_ns > 0 && found[0].kind == Found::Kind::CONDITION && !has_python) {
+    const std::vector<Found> there = ready_there(wanted);
+    if (!there.empty()) found.push_back(without_its_turn(wanted, there[0]));
+  }
+  return found;
 }
 
 }  // namespace rsltrace
@@ -120,11 +247,9 @@ struct Arrays {
   std::size_t sizes[3];
 };
 
-void clear_others(const Arrays &arrays, std::uint32_t kind, std::size_t place) {
-  for (std::uint32_t i = 0; i < 3; i++) {
-    for (std::size_t j = 0; j < arrays.sizes[i]; j++) {
-      if (i != kind || j != place) arrays.items[i][j] = nullptr;
-    }
+void clear_others(void **items, std::size_t size, const std::vector<std::size_t> &kept) {
+  for (std::size_t i = 0; i < size; i++) {
+    if (std::find(kept.begin(), kept.end(), i) == kept.end()) items[i] = nullptr;
   }
 }
 
@@ -159,23 +284,18 @@ RSLTRACE_EXPORT rmw_ret_t rmw_wait(rmw_subscriptions_t *subscriptions,
   }
   const auto timeout_ns =
       timeout == nullptr ? -1 : static_cast<std::int64_t>(rmw_time_total_nsec(*timeout));
-  const Found found = wait_for_one(wanted, timeout_ns, "rmw_wait");
-  const bool is_receiver = found.kind == Found::Kind::RECEIVER;
-  for (std::size_t i = 0; events != nullptr && i < events->event_count; i++) {
-    const bool is_it = is_receiver && wanted.receivers[found.index].kind == EVENT &&
-                       wanted.receivers[found.index].place == i;
-    if (!is_it) events->events[i] = nullptr;
+  const std::vector<Found> found = wait_for(wanted, timeout_ns, "rmw_wait");
+  std::vector<std::size_t> kept[EVENT + 1];
+  std::vector<std::size_t> kept_conditions;
+  for (const Found &one : found) {
+    if (one.kind == Found::Kind::RECEIVER)
+      kept[wanted.receivers[one.index].kind].push_back(wanted.receivers[one.index].place);
+    if (one.kind == Found::Kind::CONDITION)
+      kept_conditions.push_back(wanted.conditions[one.index].place);
   }
-  const bool is_condition = found.kind == Found::Kind::CONDITION;
-  for (std::size_t i = 0; conditions != nullptr && i < conditions->guard_condition_count; i++) {
-    if (!is_condition || wanted.conditions[found.index].place != i) {
-      conditions->guard_conditions[i] = nullptr;
-    }
-  }
-  if (is_receiver) {
-    clear_others(arrays, wanted.receivers[found.index].kind, wanted.receivers[found.index].place);
-  } else {
-    clear_others(arrays, EVENT, 0);
-  }
-  return found.kind == Found::Kind::NOTHING ? RMW_RET_TIMEOUT : RMW_RET_OK;
+  for (std::uint32_t i = 0; i < EVENT; i++) clear_others(arrays.items[i], arrays.sizes[i], kept[i]);
+  if (events != nullptr) clear_others(events->events, events->event_count, kept[EVENT]);
+  if (conditions != nullptr)
+    clear_others(conditions->guard_conditions, conditions->guard_condition_count, kept_conditions);
+  return found[0].kind == Found::Kind::NOTHING ? RMW_RET_TIMEOUT : RMW_RET_OK;
 }

@@ -42,6 +42,8 @@ enum class Say : std::uint32_t {
   TIMER_OF,
   CLOCK_OWNER,
   CLOCK,
+  READY,
+  DROPPED,
 };
 
 // From the loop to the library: what comes after (length, kind). What is SHARED is to be read from
