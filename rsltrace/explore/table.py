@@ -3,7 +3,10 @@
 search.json      what is searched, and how
 results.jsonl    a row for each trial, in the order in which they ended
 strategy.json    what a strategy has to remember, as of the last row
-traces/          the traces of runs that failed: the first ones of each cause
+traces/          the traces of runs that failed: those of the lowest numbers of each cause
+
+A trace that a row names may be displaced by that of an earlier trial which ends later: whoever
+reads the rows finds the traces that are there.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,7 +71,7 @@ class Table:
 
     def trace_of(self, number: int) -> Path:
         """Return where the trace of a trial goes."""
-        return self.folder / TRACES / f"{number:06d}.mcap"
+        return _trace_of(self.folder, number)
 
     def add(self, result: TrialResult, learned: TrialResult | None = None) -> None:
         """Append a row, and what the strategy needs to know beside it.
@@ -131,9 +135,19 @@ def _read(path: Path) -> Iterator[TrialResult]:
         if not line.endswith(b"\n"):
             return  # cut off while it was written
         try:
-            yield result_of(json.loads(line))
+            found = result_of(json.loads(line))
         except (ValueError, KeyError, TypeError):
             raise ExploreError(f"{path}:{number}: this is no row of a search") from None
+        trace = _trace_of(path.parent, found.trial.number)
+        yield found if found.trace is None else replace(found, trace=_if_there(trace))
+
+
+def _trace_of(folder: Path, number: int) -> Path:
+    return folder / TRACES / f"{number:06d}.mcap"
+
+
+def _if_there(trace: Path) -> str | None:
+    return str(trace) if trace.is_file() else None
 
 
 def _whole_rows(path: Path) -> list[TrialResult]:
