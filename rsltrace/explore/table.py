@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -25,6 +26,7 @@ from rsltrace.explore.trial import TrialResult, result_of
 from rsltrace.model.regular_file import read_regular
 
 RESULTS, SEARCH, LEARNED, TRACES = "results.jsonl", "search.json", "learned.jsonl", "traces"
+PAGE, PARQUET, SMALL = "report.html", "results.parquet", "small"
 
 
 class Table:
@@ -34,8 +36,11 @@ class Table:
         or is another one, or if it cannot be written to.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, Any], *, resume: bool) -> None:
-        """``about`` are JSON values that say what is searched; to resume they must be the same."""
+    def __init__(
+        self, folder: Path, about: Mapping[str, Any], *, resume: bool, force: bool = False
+    ) -> None:
+        """``about`` are JSON values that say what is searched; to resume they must be the same.
+        ``force`` deletes the search that is in the folder."""
         self.folder = folder
         self.earlier: list[TrialResult] = []
         """The results that were there, of a search that is resumed."""
@@ -43,6 +48,7 @@ class Table:
         """What had to be kept of some of them."""
         self._about = dict(about)
         self._resume = resume
+        self._force = force
         self._files: dict[str, int] = {}
 
     def __enter__(self) -> Table:
@@ -100,10 +106,13 @@ class Table:
             if self._resume:
                 raise ExploreError(f"{self.folder}: there is no search to resume")
             return
+        if self._force:
+            self._delete()
+            return
         if not self._resume:
             raise ExploreError(
-                f"{self.folder} has the results of a search: --resume goes on with it, -o names "
-                "another folder"
+                f"{self.folder} has the results of a search: --resume goes on with it, --force "
+                "replaces it, -o names another folder"
             )
         try:
             about = json.loads(read_regular(there))
@@ -115,6 +124,15 @@ class Table:
                     f"{self.folder}: its search was another one ({key} differs); -o names another "
                     "folder"
                 )
+
+    def _delete(self) -> None:
+        """Delete the search in the folder; what else lies there stays."""
+        for name in (TRACES, SMALL):
+            with suppress(FileNotFoundError):
+                shutil.rmtree(self.folder / name)
+        (self.folder / TRACES).mkdir()
+        for name in (RESULTS, LEARNED, PAGE, PARQUET, SEARCH):
+            (self.folder / name).unlink(missing_ok=True)
 
 
 def rows(folder: Path) -> Iterator[TrialResult]:

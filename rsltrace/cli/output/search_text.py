@@ -13,14 +13,19 @@ _CAUSES_MAX = 20
 _TEXT_MAX = 300
 
 
-def search_lines(search: Search, source: JobSource, folder: Path) -> Iterator[str]:
-    """Yield the lines of the summary: what was tried, what failed, how to see it."""
+def search_lines(
+    search: Search, source: JobSource, folder: Path, *, caution: str = ""
+) -> Iterator[str]:
+    """Yield the lines of the summary: what was tried, what failed, how to see it; ``caution`` is
+    what was not looked for."""
     tally = search.tally
     failed = sum(tally.failures.values())
     yield (
         f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different digest')}, "
         f"{failed} failed" + (f" of {_counted(len(tally.failures), 'cause')}" if failed else "")
     )
+    if caution:
+        yield caution
     if tally.plain is not None and tally.plain.failure is not None:
         yield "the job fails as it is: its plain order needs no search"
     for key in _by_frequency(tally)[:_CAUSES_MAX]:

@@ -26,7 +26,8 @@ class Found:
 
     ``parameters`` are those that are declared with a literal name; the value is None where the
     source does not give a literal default. ``name`` is the node's, "" where the source does not
-    give it literally. ``is_main`` is a function that returns nothing, so no node.
+    give it literally. ``is_main`` is a function that returns nothing, so no node. ``topics`` are
+    those that it publishes on, as far as the source has literal names.
     """
 
     target: str
@@ -34,6 +35,7 @@ class Found:
     parameters: dict[str, Any]
     name: str = ""
     is_main: bool = False
+    topics: tuple[str, ...] = ()
 
 
 def look_up(target: str, folders: list[Path]) -> Found:
@@ -56,7 +58,9 @@ def look_up(target: str, folders: list[Path]) -> Found:
             raise JobError(f"{target}: {file} has no {name!r}{did_you_mean(name, names)}")
     if body is None:
         return Found(target, folder, {})
-    return Found(target, folder, _parameters(body), _node_name(body), _is_main(body))
+    name, is_main = _node_name(body), _is_main(body)
+    topics = _topics(body if isinstance(body, ast.ClassDef) else tree, name)
+    return Found(target, folder, _parameters(body), name, is_main, topics)
 
 
 def look_up_file(source: str) -> Found:
@@ -179,6 +183,28 @@ def _add(found: dict[str, Any], prefix: str, parts: list[ast.expr]) -> None:
     name = _literal(parts[0])
     if isinstance(name, str) and name:
         found[prefix + name] = _literal(parts[1]) if len(parts) > 1 else None
+
+
+def _topics(body: ast.AST, node_name: str) -> tuple[str, ...]:
+    """Return the full names of the topics for which publishers are made."""
+    found: list[str] = []
+    for node in ast.walk(body):
+        if not isinstance(node, ast.Call) or getattr(node.func, "attr", "") != "create_publisher":
+            continue
+        keyword = next((k.value for k in node.keywords if k.arg == "topic"), None)
+        given = node.args[1] if len(node.args) > 1 else keyword
+        topic = _literal(given) if given is not None else None
+        if not isinstance(topic, str) or not topic:
+            continue
+        if topic.startswith("~/"):
+            if not node_name:
+                continue
+            topic = f"{node_name}/{topic[2:]}"
+        topic = f"/{topic.lstrip('/')}"
+        with suppress(ValueError):
+            check_topic(topic)
+            found.append(topic)
+    return tuple(dict.fromkeys(found))
 
 
 def _literal(node: ast.expr) -> Any:
