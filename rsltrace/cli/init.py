@@ -151,8 +151,8 @@ def _job_text(
 def _checks_text(nodes: list[Found]) -> Iterator[str]:
     """Offer checks that fit the nodes."""
     topics = list(dict.fromkeys(topic for node in nodes for topic in node.topics))
-    yield "# checks:  # what has to be true of every run (docs/checks.md); explore searches for\n"
-    yield "#   - never: log error  # the run in which it is not\n"
+    yield "# checks:  # what has to be true of every run: docs/checks.md\n"
+    yield "#   - never: log error\n"
     for topic in topics[:_TOPICS_MAX] or ["/cmd_vel"] * (not nodes):
         yield f"#   - eventually: {topic}\n"
         yield f"#   - {{rate: {topic}, at_least: 1 Hz}}\n"

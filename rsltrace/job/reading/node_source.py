@@ -8,13 +8,14 @@ from __future__ import annotations
 import ast
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError, did_you_mean
-from rsltrace.job.values.names import check_node_name, check_target
+from rsltrace.job.values.names import check_node_name, check_target, check_topic
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"
