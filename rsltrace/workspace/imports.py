@@ -79,11 +79,7 @@ class Workspace:
 
     def shadows(self, name: str) -> bool:
         """Whether a folder of that name could be taken for a package, though it is none."""
-        for folder in self._folders:
-            place = folder / name
-            if place.is_dir() and not (place / "__init__.py").exists():
-                return True
-        return False
+        return any(_is_no_module(folder / name) for folder in self._folders)
 
     def module(self, name: str) -> Path | None:
         """Return the file or folder of a module that a package would install, or None."""
@@ -130,7 +126,7 @@ class _Kinds:
         package, _, rest = name.partition(".")
         if not rest and self._workspace.shadows(name):
             built = PathFinder.find_spec(name)
-            if built is not None and built.origin is None:
+            if built is not None and (built.origin is None or _is_of_sources(built.origin)):
                 return _source_spec(self._workspace, name)
             return None
         if rest not in _KINDS and rest != package + _SUPPORT:
@@ -177,12 +173,28 @@ class _Packages:
         return distributions(self._workspace.packages, context or DistributionFinder.Context())
 
 
+def _is_no_module(folder: Path) -> bool:
+    """Whether a folder is no module of its name: it has no __init__.py, or is the folder of a ROS
+    package, whose modules lie where its build files say."""
+    has_init = (folder / "__init__.py").is_file()
+    return folder.is_dir() and (not has_init or (folder / "package.xml").is_file())
+
+
+def _is_of_sources(file: str) -> bool:
+    """Whether an __init__.py lies beside a package.xml."""
+    return _is_no_module(Path(file).parent)
+
+
 def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:
     """Return the spec of a module that lies among the sources of a package, or None."""
     place = workspace.module(name)
     if place is None:
         return None
-    return _spec(name, place if place.suffix == ".py" else place / "__init__.py")
+    if place.is_file() or (place / "__init__.py").is_file():
+        return _spec(name, place if place.is_file() else place / "__init__.py")
+    spec = ModuleSpec(name, None, is_package=True)  # without an __init__.py: a namespace package
+    spec.submodule_search_locations = [str(place)]
+    return spec
 
 
 def _spec(name: str, file: Path) -> ModuleSpec | None:
@@ -210,11 +222,16 @@ def unbuilt_programs(package: str) -> set[str]:
 
 
 def unbuilt_fault(package: str) -> str:
-    """Return how the ``setup.py`` of a package failed when it was asked; empty if it did not."""
+    """Say what of the build files of a package was not understood; empty if all was."""
     from rsltrace.workspace.build_files import setup_fault
+    from rsltrace.workspace.installs import unknown_installs
 
-    faults = (setup_fault(one.packages[package].folder) for one in _open if package in one.packages)
-    return next(filter(None, faults), "")
+    said = []
+    for found in [one.packages[package] for one in _open if package in one.packages][:1]:
+        fault = setup_fault(found.folder)
+        said += [f"its setup.py, asked without setuptools, failed: {fault}"] if fault else []
+        said += unknown_installs(found)[:1]
+    return "; ".join(said)
 
 
 def unbuilt_prefix(package: str) -> Path | None:

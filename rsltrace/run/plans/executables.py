@@ -169,7 +169,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         listed = ", ".join(sorted(compiled)[:10])
         has += f"; once it is built (colcon build): {listed}"
     if fault := unbuilt_fault(package):
-        has += f"; its setup.py, asked without setuptools, failed: {fault}"
+        has += f"; {fault}"
     it = _near(name, {*available, *compiled}, "it")
     raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 
