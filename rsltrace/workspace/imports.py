@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import SetupError
 from rsltrace.guard.guard import engage
+from rsltrace.model.module_search import is_beside_package_xml
 
 if TYPE_CHECKING:
     from importlib.metadata import Distribution, DistributionFinder
@@ -79,7 +80,11 @@ class Workspace:
 
     def shadows(self, name: str) -> bool:
         """Whether a folder of that name could be taken for a package, though it is none."""
-        return any(_is_no_module(folder / name) for folder in self._folders)
+        for place in (folder / name for folder in self._folders):
+            init = place / "__init__.py"
+            if place.is_dir() and (not init.exists() or is_beside_package_xml(str(init))):
+                return True
+        return False
 
     def module(self, name: str) -> Path | None:
         """Return the file or folder of a module that a package would install, or None."""
@@ -126,7 +131,7 @@ class _Kinds:
         package, _, rest = name.partition(".")
         if not rest and self._workspace.shadows(name):
             built = PathFinder.find_spec(name)
-            if built is not None and (built.origin is None or _is_of_sources(built.origin)):
+            if built is not None and (built.origin is None or is_beside_package_xml(built.origin)):
                 return _source_spec(self._workspace, name)
             return None
         if rest not in _KINDS and rest != package + _SUPPORT:
@@ -171,18 +176,6 @@ class _Packages:
         from rsltrace.workspace.distributions import distributions
 
         return distributions(self._workspace.packages, context or DistributionFinder.Context())
-
-
-def _is_no_module(folder: Path) -> bool:
-    """Whether a folder is no module of its name: it has no __init__.py, or is the folder of a ROS
-    package, whose modules lie where its build files say."""
-    has_init = (folder / "__init__.py").is_file()
-    return folder.is_dir() and (not has_init or (folder / "package.xml").is_file())
-
-
-def _is_of_sources(file: str) -> bool:
-    """Whether an __init__.py lies beside a package.xml."""
-    return _is_no_module(Path(file).parent)
 
 
 def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:

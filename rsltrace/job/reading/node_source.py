@@ -10,12 +10,12 @@ import os
 import sys
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError, did_you_mean
 from rsltrace.job.values.names import check_node_name, check_target, check_topic
+from rsltrace.model.module_search import find_module
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"
@@ -133,16 +133,8 @@ def _is_main(body: ast.AST) -> bool:
 
 
 def _file_of(module: str, folders: list[Path]) -> tuple[Path | None, Path]:
-    parts = module.split(".")
     for folder in [*folders, None]:
-        path = [str(folder)] if folder is not None else sys.path
-        spec = None
-        for depth in range(len(parts)):
-            spec = PathFinder.find_spec(".".join(parts[: depth + 1]), path)
-            if spec is None or (spec.submodule_search_locations is None and depth + 1 < len(parts)):
-                spec = None
-                break
-            path = list(spec.submodule_search_locations or ())
+        spec = find_module(module, [str(folder)] if folder is not None else sys.path)
         if spec is not None and spec.origin is not None and spec.origin.endswith(".py"):
             return folder, Path(spec.origin)
     places = ", ".join(str(folder) for folder in folders)
