@@ -11,10 +11,10 @@ import tokenize
 from collections.abc import Iterator, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
-from importlib.machinery import ModuleSpec, PathFinder
 from pathlib import Path
 
 from rsltrace.audit.scopes import Module, parse_scopes
+from rsltrace.model.module_search import find_module
 from rsltrace.model.regular_file import read_regular
 
 _INSTALLED = {"site-packages", "dist-packages"}
@@ -153,7 +153,7 @@ def collect_modules(
         if (name, package) in seen:
             continue
         seen.add((name, package))
-        spec = find(name, path)
+        spec = find_module(name, path)
         if spec is None or spec.origin is None:
             if name in wanted and (spec is None or not spec.submodule_search_locations):
                 missing.append(name)
@@ -178,22 +178,3 @@ def _is_own(file: Path, name: str, package: str, folders: Sequence[Path]) -> boo
     return any(file.is_relative_to(folder) for folder in folders) or (
         bool(package) and name.partition(".")[0] == package
     )
-
-
-def find(name: str, path: Sequence[str]) -> ModuleSpec | None:
-    """Return where a module is, without importing anything."""
-    spec: ModuleSpec | None = None
-    places: Sequence[str] | None = path
-    full = ""
-    for part in name.split("."):
-        if not part or places is None:
-            return None
-        full = f"{full}.{part}" if full else part
-        try:
-            spec = PathFinder.find_spec(full, list(places))
-        except (ImportError, ValueError, KeyError):  # KeyError: of folders without modules
-            return None
-        if spec is None:
-            return None
-        places = spec.submodule_search_locations
-    return spec

@@ -17,12 +17,16 @@ import numpy.typing as npt
 from rsltrace.cli.output.event_json import EventJson
 from rsltrace.cli.output.event_line import EventLines
 from rsltrace.conditions.trace_events import TraceCondition
+from rsltrace.errors import TraceError, did_you_mean
 from rsltrace.model.entity import WITH_TOPIC, Entity, EntityKind
 from rsltrace.model.event import Event, EventKind, Output
-from rsltrace.terminal import line_writer, tell
+from rsltrace.model.printable import printable
+from rsltrace.terminal import line_writer
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
 from rsltrace.words.times import parse_stamp
+
+_NAMES_MAX = 12
 
 if TYPE_CHECKING:
     _IntParam = click.ParamType[int]
@@ -159,17 +163,14 @@ def _choice(
     wanted: set[int] | None = None
     touching = None
     if nodes:
-        owners = {e.id for e in everything if e.kind is EntityKind.NODE and _any(e.name, nodes)}
-        _warn_if_none(owners, "node", nodes, [e for e in everything if e.kind is EntityKind.NODE])
+        owners = _named(trace, "node", nodes, [e for e in everything if e.kind is EntityKind.NODE])
         wanted = {e.id for e in everything if e.node in owners}
     if entities:
-        named = {e.id for e in everything if _any(e.name, entities) or str(e.id) in entities}
-        _warn_if_none(named, "entity", entities, everything)
+        named = _named(trace, "entity", entities, everything, by_id=True)
         wanted = named if wanted is None else wanted & named
     if topics:
         with_topic = [e for e in everything if e.kind in WITH_TOPIC]
-        on_topic = {e.id for e in with_topic if _any(e.name, topics)}
-        _warn_if_none(on_topic, "topic or service", topics, with_topic)
+        on_topic = _named(trace, "topic or service", topics, with_topic)
         touching = np.array(sorted(on_topic), dtype=np.uint32)
     labels = [kind for kind in EventKind if kind.label in kinds]
     return _Choice(
@@ -181,15 +182,28 @@ def _choice(
     )
 
 
-def _any(name: str, globs: tuple[str, ...]) -> bool:
-    return bool(name) and any(fnmatchcase(name, glob) for glob in globs)
+def _named(
+    trace: Trace, what: str, globs: tuple[str, ...], there: list[Entity], *, by_id: bool = False
+) -> set[int]:
+    """Return the entities that match one of ``globs``.
 
-
-def _warn_if_none(found: set[int], what: str, globs: tuple[str, ...], all_: list[Entity]) -> None:
-    """An empty answer to a mistyped name looks like a run in which nothing happened: say so."""
-    if not found:
-        names = ", ".join(sorted({e.name for e in all_ if e.name})[:12]) or "none"
-        tell(f"rsltrace: no {what} of the trace matches {' or '.join(globs)}; there are: {names}")
+    :raises TraceError: if none matches one of them: an empty answer to a mistyped name looks like
+        a run in which nothing happened.
+    """
+    names = sorted({entity.name for entity in there if entity.name})
+    found: set[int] = set()
+    for glob in globs:
+        matching = {
+            e.id
+            for e in there
+            if (e.name and fnmatchcase(e.name, glob)) or (by_id and str(e.id) == glob)
+        }
+        if not matching:
+            listed = f"; there are: {', '.join(names[:_NAMES_MAX]) or 'none'}"
+            near = did_you_mean(glob, names) or listed
+            raise TraceError(f"{trace.name} has no {what} {printable(glob)}{near}")
+        found |= matching
+    return found
 
 
 def _events(

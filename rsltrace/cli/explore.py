@@ -88,6 +88,7 @@ def _fork_after(
 )
 @click.option("--stop-at-first", is_flag=True, help="End the search with the first run that fails.")
 @click.option("--resume", is_flag=True, help="Go on with the search in the output folder.")
+@click.option("--force", is_flag=True, help="Replace the search in the output folder.")
 @click.option(
     "--jobs",
     type=click.IntRange(min=1),
@@ -157,6 +158,7 @@ def explore(
     budget: Budget,
     stop_at_first: bool,
     resume: bool,
+    force: bool,
     jobs: int | None,
     output: Path | None,
     depth: int | None,
@@ -186,6 +188,8 @@ def explore(
     from rsltrace.explore.trial import JobSource
     from rsltrace.explore.vary import check_vary
 
+    if resume and force:
+        raise click.UsageError("--resume goes on with a search, --force replaces it: give one")
     named, changes, text = job_words(words, launch, skip, all_overrides(overrides, None, until))
     labelled = tuple(("--set", one) if isinstance(one, str) else one for one in changes)
     source = JobSource(str(named), labelled, text, str(named.parent))
@@ -198,7 +202,7 @@ def explore(
     about = _about(source, job, strategy, seed, depth)
     if fork_after is not None:
         about["fork after"] = fork_after[1]
-    with terminated(), Table(folder, about, resume=resume) as table:
+    with terminated(), Table(folder, about, resume=resume, force=force) as table:
         chosen = strategy_named(strategy, job, seed=seed, depth=depth, fork_after=fork_after)
         search = Search(
             job,
@@ -335,7 +339,7 @@ class _End:
         from rsltrace.explore.report.formats import github_text, json_text, junit_text
         from rsltrace.explore.report.page import write_page
         from rsltrace.explore.report.parquet import write_parquet
-        from rsltrace.explore.table import rows
+        from rsltrace.explore.table import PAGE, PARQUET, rows
 
         source, search = self._source, self._search
         explored = Exploration(
@@ -350,19 +354,20 @@ class _End:
                 for cause, one in self._small.items()
                 if not one.trouble
             },
+            checks=len(job.checks),
             units={name: spec.unit for name, spec in job.metrics.items() if spec.unit},
         )
         try:
-            write_page(explored, self._folder / "report.html")
+            write_page(explored, self._folder / PAGE)
             with suppress(ExploreError):  # without pyarrow there are the rows alone
-                write_parquet(explored, self._folder / "results.parquet")
+                write_parquet(explored, self._folder / PARQUET)
         except OSError as error:
             raise ExploreError(
                 f"the report in {self._folder} cannot be written: {error.strerror}; the results "
                 "are kept there, and --resume goes on"
             ) from None
         if self._form == "text":
-            for line in search_lines(search, source, self._folder):
+            for line in search_lines(search, source, self._folder, caution=explored.caution):
                 say(line)
             self._say_small()
         else:

@@ -26,6 +26,7 @@ _HEAD = """\
 """
 _SCHEMA = "job.schema.json"
 _PLACES = (".", "src", "scripts", "..")
+_TOPICS_MAX = 3
 _OF_EVERY_NODE = ("/rosout", "/parameter_events")
 """Recorded with everything else, and hardly ever meant: the nodes of the run have their own."""
 
@@ -142,8 +143,19 @@ def _job_text(
         yield "# stop: {duration: 60s}  # without it, the end of the bags ends the run\n"
     else:
         yield "stop:\n  duration: 10s  # of simulated time\n"
+    yield from _checks_text(nodes)
     yield "# seed: 1  # of whatever is random\n"
     yield "# record: {exclude: [/camera/*]}  # payloads to leave out; hashes are always kept\n"
+
+
+def _checks_text(nodes: list[Found]) -> Iterator[str]:
+    """Offer checks that fit the nodes."""
+    topics = list(dict.fromkeys(topic for node in nodes for topic in node.topics))
+    yield "# checks:  # what has to be true of every run: docs/checks.md\n"
+    yield "#   - never: log error\n"
+    for topic in topics[:_TOPICS_MAX] or ["/cmd_vel"] * (not nodes):
+        yield f"#   - eventually: {topic}\n"
+        yield f"#   - {{rate: {topic}, at_least: 1 Hz}}\n"
 
 
 def _node_text(node: Found) -> Iterator[str]:

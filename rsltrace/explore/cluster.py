@@ -2,7 +2,7 @@
 
 Every worker of Dask gets the files of the job once, under their hash, and runs trials in processes
 of rsltrace's own (``workers.Worker``), as many at a time as it has threads. Rows come back; the
-trace of a run that failed stays where it is, unless it is one of the first of its cause.
+trace of a run that failed is fetched if it is one of those that are kept.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import os
 import queue
 import shutil
 import time
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, replace
@@ -21,6 +20,7 @@ from typing import Any
 from rsltrace._version import __version__
 from rsltrace.errors import ExploreError
 from rsltrace.explore.bundle import Bundle, bundle_of
+from rsltrace.explore.kept_traces import KeptTraces
 from rsltrace.explore.outcome import Wants
 from rsltrace.explore.trial import CRASH, Failure, JobSource, Trial, TrialResult, result_of
 from rsltrace.explore.workers import Worker
@@ -37,7 +37,6 @@ CONFIGURED = "dask"
 """Stands for the scheduler that Dask's own configuration names (DASK_SCHEDULER_ADDRESS)."""
 
 _CONNECT_S = 30
-_FETCHED_OF_A_CAUSE = 3
 _TRIES_MAX = 3
 _AHEAD = 2
 """Tasks that a worker's thread has waiting, so that it need not wait for us."""
@@ -122,7 +121,7 @@ class Cluster:
         self._place = _Place(bundle_of(source), pins=pins)
         self._address = address
         self._futures: dict[Future, tuple[Trial, Path]] = {}
-        self._failures: Counter[str] = Counter()
+        self._kept = KeptTraces()
         self._client: Client | None = None
 
     def __enter__(self) -> Cluster:
@@ -236,13 +235,11 @@ class Cluster:
         return self._with_trace(result_of(values), address, trace)
 
     def _with_trace(self, found: TrialResult, address: str, trace: Path) -> TrialResult:
-        """Fetch the trace of a run if it is one of the first of its cause, else have it deleted."""
+        """Fetch the trace of a run if it may be kept, else have it deleted."""
+        number, failure = found.trial.number, found.failure
+        wanted = failure is None or self._kept.add(failure.key, number) != number
         if found.trace is None:
             return found
-        wanted = found.failure is None
-        if found.failure is not None:
-            self._failures[found.failure.key] += 1
-            wanted = self._failures[found.failure.key] <= _FETCHED_OF_A_CAUSE
         assert self._client is not None
         try:
             answer = self._client.run(_take_trace, found.trace, wanted, workers=[address])

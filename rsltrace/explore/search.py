@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+from rsltrace.explore.kept_traces import KeptTraces
 from rsltrace.explore.outcome import Wants
 from rsltrace.explore.strategies.strategy import Strategy
 from rsltrace.explore.table import Table
@@ -19,8 +20,6 @@ from rsltrace.mcap.sink import unfinished
 
 _TIMEOUT_MIN_S = 60.0
 _TIMEOUT_FACTOR = 30
-_KEPT_OF_A_CAUSE = 3
-"""So many traces of runs that failed for one cause are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +111,7 @@ class Search:
         self.is_exhausted = False
         """Whether the strategy has nothing left to try."""
         self._table = table
+        self._kept = KeptTraces()
         self._plain = _plain_trial(job)
         self._budget = budget
         self._stop_at_first = stop_at_first
@@ -173,7 +173,7 @@ class Search:
         learned = {one.trial.number: one for one in self._table.learned}
         plain = None
         for row in self._table.earlier:
-            self.tally.add(row)
+            self._count(row)
             self._done.add(row.trial.number)
             full = learned.get(row.trial.number, row)
             if row.trial.number == 0:
@@ -249,18 +249,16 @@ class Search:
         on_result(result)
 
     def _count(self, result: TrialResult) -> TrialResult:
-        """Count a run; of one cause only the first traces are kept, that of the first run among
-        them, whenever it ends."""
+        """Count a run; return it as it is written down, without a trace that is not kept."""
         self.tally.add(result)
-        failure = result.failure
-        if failure is None or result.trace is None or result.trial.number == 0:
+        if result.failure is None:
             return result
-        is_first = self.tally.first[failure.key] is result
-        if is_first or self.tally.failures[failure.key] <= _KEPT_OF_A_CAUSE:
-            return result
-        with suppress(OSError):
-            Path(result.trace).unlink()
-        return replace(result, trace=None)
+        number = result.trial.number
+        dropped = self._kept.add(result.failure.key, number)
+        if dropped is not None:
+            with suppress(OSError):
+                self._table.trace_of(dropped).unlink()
+        return replace(result, trace=None) if dropped == number else result
 
 
 def _plain_trial(job: Job) -> Trial:

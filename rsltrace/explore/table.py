@@ -3,7 +3,10 @@
 search.json      what is searched, and how
 results.jsonl    a row for each trial, in the order in which they ended
 strategy.json    what a strategy has to remember, as of the last row
-traces/          the traces of runs that failed: the first ones of each cause
+traces/          the traces of runs that failed: those of the lowest numbers of each cause
+
+A trace that a row names may be displaced by that of an earlier trial which ends later: whoever
+reads the rows finds the traces that are there.
 """
 
 from __future__ import annotations
@@ -11,8 +14,10 @@ from __future__ import annotations
 import errno
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +26,7 @@ from rsltrace.explore.trial import TrialResult, result_of
 from rsltrace.model.regular_file import read_regular
 
 RESULTS, SEARCH, LEARNED, TRACES = "results.jsonl", "search.json", "learned.jsonl", "traces"
+PAGE, PARQUET, SMALL = "report.html", "results.parquet", "small"
 
 
 class Table:
@@ -30,8 +36,11 @@ class Table:
         or is another one, or if it cannot be written to.
     """
 
-    def __init__(self, folder: Path, about: Mapping[str, Any], *, resume: bool) -> None:
-        """``about`` are JSON values that say what is searched; to resume they must be the same."""
+    def __init__(
+        self, folder: Path, about: Mapping[str, Any], *, resume: bool, force: bool = False
+    ) -> None:
+        """``about`` are JSON values that say what is searched; to resume they must be the same.
+        ``force`` deletes the search that is in the folder."""
         self.folder = folder
         self.earlier: list[TrialResult] = []
         """The results that were there, of a search that is resumed."""
@@ -39,6 +48,7 @@ class Table:
         """What had to be kept of some of them."""
         self._about = dict(about)
         self._resume = resume
+        self._force = force
         self._files: dict[str, int] = {}
 
     def __enter__(self) -> Table:
@@ -67,7 +77,7 @@ class Table:
 
     def trace_of(self, number: int) -> Path:
         """Return where the trace of a trial goes."""
-        return self.folder / TRACES / f"{number:06d}.mcap"
+        return _trace_of(self.folder, number)
 
     def add(self, result: TrialResult, learned: TrialResult | None = None) -> None:
         """Append a row, and what the strategy needs to know beside it.
@@ -96,10 +106,13 @@ class Table:
             if self._resume:
                 raise ExploreError(f"{self.folder}: there is no search to resume")
             return
+        if self._force:
+            self._delete()
+            return
         if not self._resume:
             raise ExploreError(
-                f"{self.folder} has the results of a search: --resume goes on with it, -o names "
-                "another folder"
+                f"{self.folder} has the results of a search: --resume goes on with it, --force "
+                "replaces it, -o names another folder"
             )
         try:
             about = json.loads(read_regular(there))
@@ -111,6 +124,15 @@ class Table:
                     f"{self.folder}: its search was another one ({key} differs); -o names another "
                     "folder"
                 )
+
+    def _delete(self) -> None:
+        """Delete the search in the folder; what else lies there stays."""
+        for name in (TRACES, SMALL):
+            with suppress(FileNotFoundError):
+                shutil.rmtree(self.folder / name)
+        (self.folder / TRACES).mkdir()
+        for name in (RESULTS, LEARNED, PAGE, PARQUET, SEARCH):
+            (self.folder / name).unlink(missing_ok=True)
 
 
 def rows(folder: Path) -> Iterator[TrialResult]:
@@ -131,9 +153,19 @@ def _read(path: Path) -> Iterator[TrialResult]:
         if not line.endswith(b"\n"):
             return  # cut off while it was written
         try:
-            yield result_of(json.loads(line))
+            found = result_of(json.loads(line))
         except (ValueError, KeyError, TypeError):
             raise ExploreError(f"{path}:{number}: this is no row of a search") from None
+        trace = _trace_of(path.parent, found.trial.number)
+        yield found if found.trace is None else replace(found, trace=_if_there(trace))
+
+
+def _trace_of(folder: Path, number: int) -> Path:
+    return folder / TRACES / f"{number:06d}.mcap"
+
+
+def _if_there(trace: Path) -> str | None:
+    return str(trace) if trace.is_file() else None
 
 
 def _whole_rows(path: Path) -> list[TrialResult]:

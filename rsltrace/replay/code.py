@@ -14,6 +14,7 @@ from typing import Any
 from rsltrace.errors import JobError
 from rsltrace.job import Job
 from rsltrace.job.values.target import target_text
+from rsltrace.model.module_search import find_module
 from rsltrace.run.plans.executables import source_of
 from rsltrace.workspace.installs import module_folders
 
@@ -105,19 +106,10 @@ def _executable(name: str, folders: Sequence[str]) -> Iterator[tuple[str, Path |
 def file_of(module: str, folders: Sequence[str], *, installed: bool = True) -> Path | None:
     """Return the file that a module would be loaded from: of ``folders``, or, if it may be an
     ``installed`` one, then of Python's own path."""
-    path: Sequence[str] | None = [*folders, *sys.path] if installed else folders
-    spec: ModuleSpec | None = None
-    parts = module.split(".")
-    for depth, part in enumerate(parts, 1):
-        if path is None or not part.isidentifier():
-            return None
-        full = ".".join(parts[:depth])
-        spec = PathFinder.find_spec(full, path)
-        if spec is None and installed:
-            spec = _found_otherwise(full)
-        if spec is None:
-            return None
-        path = spec.submodule_search_locations
+    if installed:
+        spec = find_module(module, [*folders, *sys.path], _found_otherwise)
+    else:
+        spec = find_module(module, folders)
     if spec is None or not spec.origin or not spec.has_location:
         return None
     return Path(spec.origin)

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -123,6 +124,8 @@ def keep_heap() -> None:
         mallopt(_M_MMAP_THRESHOLD, _HEAP_BLOCK_BYTES)
 
 
+_RELEASES = {"3": "humble", "4": "iron", "7": "jazzy", "9": "kilted"}
+"""Releases of ROS by the first part of rclpy's version."""
 _INSTALLED = frozenset(("site-packages", "dist-packages"))
 
 
@@ -178,7 +181,8 @@ def _kept_streams() -> Iterator[None]:
 
 @contextmanager
 def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
-    """Let user modules be imported from the job's search path, and forget them afterwards.
+    """Let user modules be imported from the job's search path, and forget them afterwards; they
+    find the variables of a sourced ROS.
 
     In a ``native`` run, interfaces that nobody has built cannot be sent.
     """
@@ -186,7 +190,7 @@ def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
     old_path, old_modules = list(sys.path), set(sys.modules)
     sys.path[:0] = folders
     try:
-        with unbuilt_packages(list(map(Path, folders)), native=native) as workspace:
+        with _sourced(), unbuilt_packages(list(map(Path, folders)), native=native) as workspace:
             try:
                 yield
             finally:
@@ -196,6 +200,30 @@ def search_path(job: Job, *, native: bool = False) -> Iterator[None]:
         sys.path[:] = old_path
         for name in {*user_modules(folders), *_namespaces(folders)} - old_modules:
             del sys.modules[name]
+
+
+@contextmanager
+def _sourced() -> Iterator[None]:
+    """Set what ROS's setup files set and programs ask for, if nobody has."""
+    values = {"ROS_VERSION": "2", "ROS_PYTHON_VERSION": "3", "ROS_DISTRO": _distribution()}
+    added = {name: value for name, value in values.items() if value and name not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for name in added:
+            os.environ.pop(name, None)
+
+
+@lru_cache(maxsize=1)
+def _distribution() -> str:
+    """Return the release of ROS that rclpy's wheel is of, empty if nobody knows."""
+    spec = importlib.util.find_spec("rclpy")
+    if spec is None or spec.origin is None:
+        return ""
+    versions = Path(spec.origin).parents[1].glob("rclpy-*-info")
+    majors = (path.name.removeprefix("rclpy-").partition(".")[0] for path in versions)
+    return next((_RELEASES[major] for major in majors if major in _RELEASES), "")
 
 
 def _namespaces(folders: list[str]) -> list[str]:

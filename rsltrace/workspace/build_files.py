@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 _ASK = """
-import json, sys, types
+import fnmatch, json, os, sys, types
 from importlib.machinery import ModuleSpec
 sys.stdout = sys.stderr
 said = {}
@@ -31,14 +31,32 @@ class Anything(list, metaclass=Names):  # called, derived from, asked for names:
         pass
     def __getattr__(self, name):
         return getattr(Anything, name)
+def find(where=".", exclude=(), include=("*",), inits=True):
+    def matches(name, patterns):
+        return any(fnmatch.fnmatchcase(name, one) for one in patterns)
+    found = []
+    for folder, folders, files in os.walk(where):
+        folders[:] = sorted(one for one in folders if one.isidentifier())
+        if folder == where:
+            continue
+        if inits and "__init__.py" not in files:
+            folders.clear()
+            continue
+        name = os.path.relpath(folder, where).replace(os.sep, ".")
+        if matches(name, include) and not matches(name, exclude):
+            found.append(name)
+    return found
+def find_namespaces(where=".", exclude=(), include=("*",)):
+    return find(where, exclude, include, inits=False)
+known = {"find_packages": find, "find_namespace_packages": find_namespaces}
 class Modules:
     def find_spec(self, name, path=None, target=None):
-        known = name.partition(".")[0] in ("setuptools", "distutils")
-        return ModuleSpec(name, self, is_package=True) if known else None
+        ours = name.partition(".")[0] in ("setuptools", "distutils")
+        return ModuleSpec(name, self, is_package=True) if ours else None
     def create_module(self, spec):
         return types.ModuleType(spec.name)
     def exec_module(self, module):
-        module.__getattr__ = lambda name: getattr(Anything, name)
+        module.__getattr__ = lambda name: known.get(name) or getattr(Anything, name)
         module.setup = lambda *words, **named: said.update(named)
 sys.meta_path.insert(0, Modules())
 code = compile(open("setup.py", "rb").read(), "setup.py", "exec")
@@ -51,6 +69,7 @@ json.dump({name: said[name] for name in wanted if said.get(name)}, sys.__stdout_
 """
 """Finds out what a ``setup.py`` tells setuptools, without setuptools."""
 _ASK_SECONDS = 60
+_ENTRY_POINTS = "options.entry_points"
 
 Groups = dict[str, dict[str, str]]
 """Entry points: what each name stands for, by group."""
@@ -89,9 +108,13 @@ def _asked(folder: Path) -> tuple[dict[str, Any], str]:
 
 def setup_cfg(folder: Path) -> configparser.ConfigParser:
     """Return ``setup.cfg``; empty if there is none, or nothing that can be read."""
+    return _configured(folder / "setup.cfg")
+
+
+def _configured(file: Path) -> configparser.ConfigParser:
     parser = configparser.ConfigParser(delimiters=("=",), interpolation=None, strict=False)
     try:
-        parser.read(folder / "setup.cfg", encoding="utf-8")
+        parser.read(file, encoding="utf-8")
     except (configparser.Error, UnicodeDecodeError):
         return configparser.ConfigParser()
     return parser
@@ -130,6 +153,44 @@ def name_and_version(folder: Path) -> tuple[str | None, str | None]:
     return said("name"), said("version")
 
 
+def package_dir(folder: Path) -> dict[str, str]:
+    """Return where the modules of packages lie, by name; "" is for all others."""
+    listed = setup_cfg(folder).get("options", "package_dir", fallback="")
+    table = _table(_pyproject(folder), "tool", "setuptools", "package-dir")
+    setup = setup_py(folder).get("package_dir")
+    return {**text_mapping(table), **_targets(listed.splitlines()), **text_mapping(setup)}
+
+
+def source_root(folder: Path) -> str:
+    """Return the folder of the modules as the build files have it, or as people have it."""
+    given = package_dir(folder).get("")
+    if given is not None:
+        return given
+    find = _table(_pyproject(folder), "tool", "setuptools", "packages", "find")
+    where = find.get("where")
+    if isinstance(where, list) and where and isinstance(where[0], str):
+        return where[0]
+    listed = setup_cfg(folder).get("options.packages.find", "where", fallback="").strip()
+    if listed:
+        return listed
+    return "src" if (folder / "src").is_dir() and not (folder / "CMakeLists.txt").is_file() else "."
+
+
+def packages(folder: Path) -> set[str]:
+    """Return the names of the packages that the build files list one by one."""
+    listed = setup_cfg(folder).get("options", "packages", fallback="").replace(",", "\n")
+    found = [*setup_py(folder).get("packages", ()), *listed.split()]
+    table = _table(_pyproject(folder), "tool", "setuptools").get("packages")
+    found += table if isinstance(table, list) else []
+    return {name for name in map(str, found) if name.replace(".", "_").isidentifier()}
+
+
+def console_scripts_in(setup_cfg_file: Path) -> dict[str, str]:
+    """Return the console scripts that a ``setup.cfg`` elsewhere lists."""
+    options = _configured(setup_cfg_file)
+    return _targets(options.get(_ENTRY_POINTS, "console_scripts", fallback="").splitlines())
+
+
 def entry_points(folder: Path) -> Groups:
     """Return the entry points that a package would have, were it installed."""
     found: Groups = {}
@@ -137,8 +198,8 @@ def entry_points(folder: Path) -> Groups:
     for group, lines in _of_setup_py(given):
         found.setdefault(group, {}).update(_targets(lines))
     listed = setup_cfg(folder)
-    if listed.has_section("options.entry_points"):
-        for group, text in listed["options.entry_points"].items():
+    if listed.has_section(_ENTRY_POINTS):
+        for group, text in listed[_ENTRY_POINTS].items():
             found.setdefault(group, {}).update(_targets(text.splitlines()))
     for group, targets in _of_pyproject(folder):
         if targets:
@@ -187,6 +248,6 @@ def text_mapping(value: object) -> dict[str, str]:
 
 
 __all__ = [
-    *("Groups", "entry_points", "name_and_version"),
-    *("setup_cfg", "setup_fault", "setup_py", "text_mapping"),
+    *("Groups", "console_scripts_in", "entry_points", "name_and_version", "package_dir"),
+    *("packages", "setup_fault", "setup_py", "source_root"),
 ]

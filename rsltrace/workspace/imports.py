@@ -10,6 +10,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from importlib import import_module
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec, spec_from_file_location
 from pathlib import Path
@@ -18,11 +19,13 @@ from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import SetupError
 from rsltrace.guard.guard import engage
+from rsltrace.model.module_search import is_beside_package_xml
 
 if TYPE_CHECKING:
     from importlib.metadata import Distribution, DistributionFinder
 
     from rsltrace.source_packages import SourcePackage
+    from rsltrace.workspace.interfaces import InterfaceMaker
 
 _KINDS = ("msg", "srv", "action")
 _SUPPORT = "_s__rosidl_typesupport_c"
@@ -36,7 +39,7 @@ class Workspace:
         self._folders = folders
         self._native = native
         self._packages: dict[str, SourcePackage] | None = None
-        self._prefixes: dict[str, Path] = {}
+        self._makers: dict[str, InterfaceMaker] | None = None
         self._modules: dict[str, Path] | None = None
         self.made: set[str] = set()
         """Packages whose interfaces somebody has imported."""
@@ -51,21 +54,37 @@ class Workspace:
                 self._packages = source_packages(self._folders)
         return self._packages
 
-    def interfaces(self, name: str) -> Path | None:
-        """Return the folder with a package's classes, made if need be; None if it has none.
-
-        :raises JobError, SetupError: if they cannot be made.
-        """
+    def interfaces(self, name: str) -> InterfaceMaker | None:
+        """Return what makes the classes of a package; None if it has none."""
         package = self.packages.get(name)
         if package is None or not package.interfaces:
             return None
-        if name not in self._prefixes:
-            with engage(None):  # what that takes is none of the node's doing
-                from rsltrace.workspace.interfaces import interface_prefix
+        with engage(None):
+            if self._makers is None:
+                from rsltrace.workspace.interfaces import interface_makers
 
-                self._prefixes[name] = interface_prefix(package, self.packages)
-            self.made.add(name)
-        return self._prefixes[name] / "site-packages" / name
+                self._makers = interface_makers(self.packages)
+            maker = self._makers[name]
+            _ = maker.prefix  # which is laid out now
+        self.made.add(name)
+        return maker
+
+    def made_module(self, package: str, kind: str, module: str) -> Path | None:
+        """Return the file of ``package.kind.module``, made if need be; None if there is no such
+        interface.
+
+        :raises JobError, SetupError: if it cannot be made.
+        """
+        maker = self.interfaces(package)
+        if maker is None:
+            return None
+        with engage(None):  # what that takes is none of the node's doing
+            for stem in dict.fromkeys(maker.names(kind).values()):
+                file = maker.module_of(kind, stem)
+                if file.stem == module:
+                    maker.make(kind, stem)
+                    return file
+        return None
 
     def require_type_support(self, name: str) -> None:
         """Raise SetupError if the interfaces of a package have to be compiled, which is not one
@@ -79,9 +98,9 @@ class Workspace:
 
     def shadows(self, name: str) -> bool:
         """Whether a folder of that name could be taken for a package, though it is none."""
-        for folder in self._folders:
-            place = folder / name
-            if place.is_dir() and not (place / "__init__.py").exists():
+        for place in (folder / name for folder in self._folders):
+            init = place / "__init__.py"
+            if place.is_dir() and (not init.exists() or is_beside_package_xml(str(init))):
                 return True
         return False
 
@@ -130,9 +149,13 @@ class _Kinds:
         package, _, rest = name.partition(".")
         if not rest and self._workspace.shadows(name):
             built = PathFinder.find_spec(name)
-            if built is not None and built.origin is None:
+            if built is not None and (built.origin is None or is_beside_package_xml(built.origin)):
                 return _source_spec(self._workspace, name)
             return None
+        kind, _, inner = rest.partition(".")
+        if inner.startswith("_") and kind in _KINDS and package in self._workspace.made:
+            module = self._workspace.made_module(package, kind, inner)
+            return None if module is None else _spec(name, module)
         if rest not in _KINDS and rest != package + _SUPPORT:
             return None
         if rest not in _KINDS:
@@ -140,9 +163,10 @@ class _Kinds:
         built = PathFinder.find_spec(name, path)
         if built is not None and built.origin is not None:
             return None
-        folder = self._workspace.interfaces(package)
-        if folder is None:
+        maker = self._workspace.interfaces(package)
+        if maker is None:
             return None
+        folder = maker.modules
         file = folder / rest / "__init__.py" if rest in _KINDS else folder / f"{rest}.py"
         return _spec(name, file) if file.is_file() else None
 
@@ -162,8 +186,8 @@ class _Packages:
         found = _source_spec(self._workspace, name)
         if found is not None:
             return found
-        folder = self._workspace.interfaces(name)
-        return None if folder is None else _spec(name, folder / "__init__.py")
+        maker = self._workspace.interfaces(name)
+        return None if maker is None else _spec(name, maker.modules / "__init__.py")
 
     def find_distributions(
         self, context: DistributionFinder.Context | None = None
@@ -182,7 +206,11 @@ def _source_spec(workspace: Workspace, name: str) -> ModuleSpec | None:
     place = workspace.module(name)
     if place is None:
         return None
-    return _spec(name, place if place.suffix == ".py" else place / "__init__.py")
+    if place.is_file() or (place / "__init__.py").is_file():
+        return _spec(name, place if place.is_file() else place / "__init__.py")
+    spec = ModuleSpec(name, None, is_package=True)  # without an __init__.py: a namespace package
+    spec.submodule_search_locations = [str(place)]
+    return spec
 
 
 def _spec(name: str, file: Path) -> ModuleSpec | None:
@@ -191,6 +219,27 @@ def _spec(name: str, file: Path) -> ModuleSpec | None:
 
 
 _open: list[Workspace] = []
+
+
+def made_when_imported(module: str) -> tuple[Callable[[str], Any], list[str]]:
+    """Return ``__getattr__`` and ``__all__`` of ``package.msg`` and its like, whose classes are
+    made when somebody imports them."""
+    package, _, kind = module.partition(".")
+    workspace = next(one for one in reversed(_open) if package in one.made)
+    maker = workspace.interfaces(package)
+    assert maker is not None
+    names = maker.names(kind)
+
+    def get(name: str) -> Any:
+        if name not in names:
+            raise AttributeError(f"module {module!r} has no attribute {name!r}")
+        file = maker.module_of(kind, names[name])
+        made = import_module(f"{module}.{file.stem}")
+        offered = {one: getattr(made, one) for one, stem in names.items() if stem == names[name]}
+        vars(sys.modules[module]).update(offered)
+        return offered[name]
+
+    return get, sorted(names)
 
 
 def unbuilt_executables(package: str) -> dict[str, str | Path]:
@@ -210,11 +259,16 @@ def unbuilt_programs(package: str) -> set[str]:
 
 
 def unbuilt_fault(package: str) -> str:
-    """Return how the ``setup.py`` of a package failed when it was asked; empty if it did not."""
+    """Say what of the build files of a package was not understood; empty if all was."""
     from rsltrace.workspace.build_files import setup_fault
+    from rsltrace.workspace.installs import unknown_installs
 
-    faults = (setup_fault(one.packages[package].folder) for one in _open if package in one.packages)
-    return next(filter(None, faults), "")
+    said = []
+    for found in [one.packages[package] for one in _open if package in one.packages][:1]:
+        fault = setup_fault(found.folder)
+        said += [f"its setup.py, asked without setuptools, failed: {fault}"] if fault else []
+        said += unknown_installs(found)[:1]
+    return "; ".join(said)
 
 
 def unbuilt_prefix(package: str) -> Path | None:
@@ -304,6 +358,7 @@ def _exchange(stack: ExitStack, real: Callable[..., Any], ours: Callable[..., An
 
 __all__ = [
     "Workspace",
+    "made_when_imported",
     "unbuilt_executables",
     "unbuilt_names",
     "unbuilt_packages",

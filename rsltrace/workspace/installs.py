@@ -1,32 +1,32 @@
-"""What the build files of a package would install: files and folders, modules, executables.
-
-Of ``CMakeLists.txt`` the plain words are read.
-"""
+"""What the build files of a package would install: files and folders, modules, executables."""
 
 from __future__ import annotations
 
 import os
-import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import takewhile
 from pathlib import Path
 
 from rsltrace.source_packages import SourcePackage, source_packages
-from rsltrace.workspace.build_files import entry_points, setup_cfg, setup_py, text_mapping
+from rsltrace.workspace.build_files import (
+    console_scripts_in,
+    entry_points,
+    package_dir,
+    packages,
+    setup_py,
+    source_root,
+)
+from rsltrace.workspace.cmake import Command, commands, is_expanded
 
-_COMMENT = re.compile(r"#[^\n]*")
-_INSTALL = re.compile(r"\binstall\s*\(\s*(DIRECTORY|FILES|PROGRAMS)\b([^)]*)\)", re.IGNORECASE)
-_PYTHON_PACKAGE = re.compile(r"\bament_python_install_package\s*\(\s*([\w./-]+)([^)]*)\)")
-_PROJECT = re.compile(r"\bproject\s*\(\s*([\w-]+)", re.IGNORECASE)
-_PROGRAM = re.compile(
-    r"\b(?:ament_auto_)?add_executable\s*\(\s*([^\s)]+)"
-    r"|\brclcpp_components_register_node\s*\([^)]*\bEXECUTABLE\s+([^\s)]+)",
-    re.IGNORECASE,
+_KINDS = ("DIRECTORY", "FILES", "PROGRAMS")
+_OPTIONS = frozenset(
+    "DESTINATION TYPE RENAME PATTERN REGEX FILES_MATCHING EXCLUDE USE_SOURCE_PERMISSIONS "
+    "PERMISSIONS FILE_PERMISSIONS DIRECTORY_PERMISSIONS CONFIGURATIONS COMPONENT OPTIONAL "
+    "EXCLUDE_FROM_ALL MESSAGE_NEVER DIRECTORY FILES PROGRAMS".split()
 )
-_RENAME = re.compile(r"\bRENAME\s+(\S+)")
-_END = re.compile(
-    r"\b(?:PATTERN|REGEX|FILES_MATCHING|USE_SOURCE_PERMISSIONS|PERMISSIONS|OPTIONAL|RENAME)\b.*",
-    re.DOTALL,
-)
+"""The keywords of ``install``, each of which ends the list before it."""
+_PYTHON_PACKAGE, _PYTHON_MODULE = "ament_python_install_package", "ament_python_install_module"
+_PROGRAMS = ("add_executable", "ament_auto_add_executable")
 _NO_MODULES = frozenset("test tests launch setup conftest scripts doc docs config resource".split())
 
 
@@ -38,22 +38,38 @@ def installed_files(package: SourcePackage) -> Iterator[tuple[str, Path]]:
             yield f"{folder}/{os.path.basename(file)}", package.folder / file
     for file in setup.get("scripts", ()):
         yield f"lib/{package.name}/{os.path.basename(file)}", package.folder / file
-    for kind, words in _INSTALL.findall(_cmake(package)):
-        sources, _, rest = _END.sub("", words).partition("DESTINATION")
-        target = (rest.split() or [""])[0].strip('"')
-        renamed = _RENAME.search(words)
-        for source in (word.strip('"') for word in sources.split()):
-            path = package.folder / source
-            if kind.upper() == "DIRECTORY" and source.endswith("/") and path.is_dir():
-                for child in sorted(path.iterdir()):
-                    yield f"{target}/{child.name}", child
-            else:
-                yield f"{target}/{renamed[1] if renamed else path.name}", path
+    for command in commands(package):
+        yield from _installed(command)
+
+
+def _installed(command: Command) -> Iterator[tuple[str, Path]]:
+    """Give what an ``install`` of ``CMakeLists.txt`` puts where."""
+    words = command.words
+    if command.name != "install" or words[:1] not in [(kind,) for kind in _KINDS]:
+        return
+    (target,) = _values(words, "DESTINATION")[:1] or ("",)
+    target = target.strip("/")
+    renamed = _values(words, "RENAME")
+    for source in filter(is_expanded, _values(words, words[0])):
+        path = command.folder / source
+        if words[0] == "DIRECTORY" and source.endswith("/") and path.is_dir():
+            for child in sorted(path.iterdir()):
+                yield f"{target}/{child.name}", child
+        else:
+            yield f"{target}/{renamed[0] if renamed else path.name}", path
+
+
+def _values(words: Sequence[str], keyword: str) -> list[str]:
+    """Return the words after a keyword of ``install``, up to the next one."""
+    if keyword not in words:
+        return []
+    rest = words[words.index(keyword) + 1 :]
+    return list(takewhile(lambda word: word not in _OPTIONS, rest))
 
 
 def executables(package: SourcePackage) -> dict[str, str | Path]:
     """Return what ``ros2 run`` would find: ``module:function`` or a script, by name."""
-    found: dict[str, str | Path] = dict(_console_scripts(package.folder))
+    found: dict[str, str | Path] = dict(_console_scripts(package))
     for place, source in installed_files(package):
         folder, _, name = place.rpartition("/")
         if folder == f"lib/{package.name}" and source.is_file():
@@ -62,29 +78,74 @@ def executables(package: SourcePackage) -> dict[str, str | Path]:
 
 
 def compiled_executables(package: SourcePackage) -> set[str]:
-    """Return the names of the programs that a package has to be built for, as far as they are
-    written out."""
-    return {(name or other).strip('"') for name, other in _PROGRAM.findall(_cmake(package))}
+    """Return the names of the programs that a package has to be built for."""
+    found = set()
+    for command in commands(package):
+        if command.name in _PROGRAMS:
+            found |= set(command.words[:1])
+        elif command.name == "rclcpp_components_register_node":
+            found |= set(_option(command, "EXECUTABLE"))
+    return set(filter(is_expanded, found))
+
+
+def unknown_installs(package: SourcePackage) -> list[str]:
+    """Say which files and modules are installed that have no name before the package is configured,
+    with the line of ``CMakeLists.txt``."""
+    said = (
+        command.unknown()
+        for command in commands(package)
+        if (command.name == "install" and command.words[:1] in [(kind,) for kind in _KINDS])
+        or command.name in (*_PROGRAMS, _PYTHON_PACKAGE, _PYTHON_MODULE)
+    )
+    return [one for one in said if one is not None]
 
 
 def modules(package: SourcePackage) -> dict[str, Path]:
     """Return the modules that a package would install, by name: files, or folders with modules."""
-    setup = setup_py(package.folder)
-    given = text_mapping(setup.get("package_dir"))
-    root = package.folder / (given.get("") or _source_root(package.folder))
-    found: dict[str, Path] = {}
-    for name in setup.get("py_modules", ()):
-        found[name] = root / f"{name}.py"
-    for name in {str(name).partition(".")[0] for name in setup.get("packages", ())}:
-        found[name] = package.folder / given[name] if name in given else root / name
-    for name, words in _PYTHON_PACKAGE.findall(_cmake(package)):
-        folder = re.search(r"\bPACKAGE_DIR\s+(\S+)", words)
-        found[name] = package.folder / (folder[1].strip('"') if folder else name)
-    for place in (package.folder, root):
+    found = {**_modules_of_build_files(package.folder), **_modules_of_cmake(package)}
+    for place in dict.fromkeys((package.folder, package.folder / source_root(package.folder))):
         for init in sorted(place.glob("*/__init__.py")):
             if init.parent.name not in _NO_MODULES:
                 found.setdefault(init.parent.name, init.parent)
-    return {name: path for name, path in found.items() if path.exists()}
+        if any((place / package.name).glob("*.py")):  # without __init__.py: a namespace package
+            found.setdefault(package.name, place / package.name)
+    return {name: path for name, path in found.items() if _is_module(name, path)}
+
+
+def _is_module(name: str, path: Path) -> bool:
+    """Whether a path is a module; find_namespace_packages() takes every folder for one."""
+    is_package = (path / "__init__.py").is_file()
+    return path.is_file() or is_package or (path.is_dir() and name not in _NO_MODULES)
+
+
+def _modules_of_build_files(folder: Path) -> dict[str, Path]:
+    given = package_dir(folder)
+    root = folder / source_root(folder)
+    setup = setup_py(folder)
+    found = {str(name): root / f"{name}.py" for name in setup.get("py_modules", ())}
+    for name in {name.partition(".")[0] for name in packages(folder)}:
+        found[name] = folder / given[name] if name in given else root / name
+    return found
+
+
+def _modules_of_cmake(package: SourcePackage) -> dict[str, Path]:
+    found: dict[str, Path] = {}
+    for command in commands(package):
+        words = command.words
+        if command.name == _PYTHON_PACKAGE and words and is_expanded(words[0]):
+            folder = _option(command, "PACKAGE_DIR")[:1] or [words[0]]
+            if is_expanded(folder[0]):
+                found[words[0]] = command.folder / folder[0]
+        elif command.name == _PYTHON_MODULE and words and is_expanded(words[0]):
+            path = command.folder / words[0]
+            found[path.stem] = path
+    return found
+
+
+def _option(command: Command, keyword: str) -> list[str]:
+    """Return the word after a keyword, if it is there."""
+    words = command.words
+    return list(words[words.index(keyword) + 1 :][:1]) if keyword in words else []
 
 
 def module_folders(folders: Iterable[Path], *, ask: bool = True) -> list[Path]:
@@ -98,33 +159,16 @@ def module_folders(folders: Iterable[Path], *, ask: bool = True) -> list[Path]:
     return list(dict.fromkeys(path.parent for one in packages for path in modules(one).values()))
 
 
-def _source_root(folder: Path) -> str:
-    """Return the folder of the modules as ``setup.cfg`` has it, or as people have it."""
-    options = setup_cfg(folder)
-    given = options.get("options", "package_dir", fallback="").strip()
-    if given.startswith("="):
-        return given[1:].strip()
-    return "src" if (folder / "src").is_dir() and not (folder / "CMakeLists.txt").is_file() else "."
-
-
-def _console_scripts(folder: Path) -> dict[str, str]:
-    found = entry_points(folder).get("console_scripts", {})
+def _console_scripts(package: SourcePackage) -> dict[str, str]:
+    found = dict(entry_points(package.folder).get("console_scripts", {}))
+    for command in commands(package):  # ament_python_install_package(NAME SETUP_CFG FILE)
+        if command.name == _PYTHON_PACKAGE and command.words:
+            given = _option(command, "SETUP_CFG") or [
+                f"{path}/../setup.cfg" for path in _option(command, "PACKAGE_DIR")
+            ]
+            for file in filter(is_expanded, given):
+                found |= console_scripts_in(command.folder / file)
     return {name: target.partition("[")[0].strip() for name, target in found.items()}
-
-
-def _cmake(package: SourcePackage) -> str:
-    """Return ``CMakeLists.txt`` without comments, with what a project's own variables stand for."""
-    try:
-        text = (package.folder / "CMakeLists.txt").read_text("utf-8", "replace")
-    except OSError:
-        return ""
-    text = _COMMENT.sub("", text)
-    project = _PROJECT.search(text)
-    for name in ("PROJECT_NAME", "CMAKE_PROJECT_NAME"):
-        text = text.replace(f"${{{name}}}", project[1] if project else package.name)
-    for name in ("CMAKE_CURRENT_SOURCE_DIR", "PROJECT_SOURCE_DIR", "CMAKE_SOURCE_DIR"):
-        text = text.replace(f"${{{name}}}", str(package.folder))
-    return text
 
 
 __all__ = [
@@ -133,4 +177,5 @@ __all__ = [
     "installed_files",
     "module_folders",
     "modules",
+    "unknown_installs",
 ]

@@ -274,15 +274,22 @@ def test_cat_selects_across_segments(tmp_path: Path) -> None:
     assert int(lines(path, "--from", f"{last.stamp_ns}ns")[-1].split()[0]) == last.index
 
 
-def test_a_name_that_matches_nothing_is_said(run: tuple[Path, Feeder]) -> None:
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--node", "taler"], "has no node taler; did you mean '/talker'?"),
+        (["--node", "/talker", "--node", "x"], "has no node x; there are: /listener, /talker"),
+        (["--topic", "/x"], "has no topic or service /x; "),
+        (["--entity", "99"], "has no entity 99; there are: "),
+    ],
+)
+def test_a_name_that_matches_nothing_is_an_error(
+    run: tuple[Path, Feeder], words: list[str], said: str
+) -> None:
     path, _ = run
-    result = call("cat", path, "--node", "/taler")
-    assert (result.exit_code, result.stdout) == (0, "")
-    assert "no node of the trace matches /taler; there are: /listener, /talker" in result.stderr
-    result = call("cat", path, "--topic", "/x")
-    assert "no topic or service of the trace matches /x" in result.stderr
-    result = call("cat", path, "--entity", "99")
-    assert "no entity of the trace matches 99" in result.stderr
+    result = call("cat", path, *words)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert said in result.stderr
 
 
 @pytest.mark.parametrize(

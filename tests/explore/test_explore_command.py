@@ -52,6 +52,14 @@ def test_a_failing_order_is_found_and_repeated_by_the_command_that_is_printed(
     assert "--resume goes on with it" in refused.stderr
     other = command("explore", job, "--resume", "--strategy", "pct", "-o", folder)
     assert "its search was another one (strategy differs)" in other.stderr
+    (folder / "mine.txt").touch()
+    words = ["--set", "checks=[]", "--budget", 1, "--force"]
+    replaced = command("explore", job, *words, "-o", folder)
+    assert replaced.returncode == 0, replaced.stderr
+    assert "the job has no checks: only exceptions" in replaced.stdout
+    assert sorted(path.name for path in (folder / "traces").iterdir()) == ["000000.mcap"]
+    assert len(list(rows(folder))) == 1
+    assert (folder / "mine.txt").exists()
 
 
 @pytest.mark.long

@@ -171,7 +171,21 @@ def test_formats_for_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -
     assert raised.startswith("::error file=robot/nodes.py,line=12,title=")
     kept = Exploration("job.yaml", [TrialResult(Trial(0, {}))])
     assert ElementTree.fromstring(junit_text(kept)).attrib["failures"] == "0"
-    assert github_text(kept) == "::notice file=job.yaml::1 runs, none failed"
+    assert github_text(kept).startswith("::notice file=job.yaml::1 runs, none failed; the job has ")
+
+
+def test_a_job_without_checks_is_told_what_was_not_looked_for() -> None:
+    result = TrialResult(Trial(0, {}), digest="1")
+    for checks, said in ((0, True), (2, False)):
+        found = Exploration("job.yaml", [result], checks=checks)
+        for text in (
+            page(found).decode(),
+            json.dumps(json_values(found)),
+            junit_text(found),
+            github_text(found),
+        ):
+            assert ("he job has no checks: only exceptions" in text) is said
+            assert ("never: log error" in text.replace("%3A", ":")) is said
 
 
 def test_a_command_that_nobody_can_read_is_not_shown() -> None:

@@ -376,3 +376,22 @@ def test_what_a_device_says_is_given_again_when_it_is_gone(
     again = go(code, "again", replay=first)
     assert said(again) == said(first)
     assert again.digest == first.digest
+
+
+@pytest.mark.parametrize("guard", ["", "{}"])
+def test_a_device_that_a_thread_of_the_node_plays_stops_no_time(
+    go: Callable[..., Any], guard: str
+) -> None:
+    code = node_code(
+        "os.write(self.near, b'hello')",
+        imports="import os, pty, threading, tty",
+        module="def play(end, say):\n    while True:\n        say(os.read(end, 99).decode())\n",
+        init=(
+            "far, self.near = pty.openpty()\n"
+            "tty.setraw(self.near)\n"
+            "threading.Thread(target=play, args=(far, self.say), daemon=True).start()"
+        ),
+    )
+    done = go(code, "run", guard=guard)
+    assert done.end_ns - done.start_ns == 1_200_000_000
+    assert said(done) == [["hello"], ["hello"]]

@@ -91,9 +91,9 @@ def test_a_module_is_no_job(job_file: Callable[..., Path], command: Any) -> None
         "rsltrace: error: nodes_under_test.py: this is Python, not a job file; "
         "`rsltrace init --from nodes_under_test.py` writes one\n"
     )
-    job_file("nodes: [{node: 'nodes_under_test.py:Talker'}]\n")
+    job_file("nodes: [{node: '../nodes_under_test.py:Talker'}]\n")
     done = command("record", "job.yaml")
-    assert "a module is named with dots: nodes_under_test:Talker\n" in done.stderr
+    assert "add .. to search_path and write nodes_under_test:Talker\n" in done.stderr
 
 
 def test_a_command_that_is_misspelt(command: Any) -> None:

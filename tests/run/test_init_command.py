@@ -30,6 +30,9 @@ class Hearer(Node):
         self.declare_parameters('deep', [('a', 1), ('b', [1.0, 2.0])])
         self.declare_parameters('', [('c',)])
         self.create_subscription(UInt64, '/n', lambda message: None, 10)
+        heard = self.create_publisher(UInt64, 'heard', 10)
+        self.create_publisher(UInt64, topic='~/own', qos_profile=10)
+        self.create_timer(0.2, lambda: heard.publish(UInt64()))
 """
 MAINS = """
 import rclpy
@@ -110,10 +113,15 @@ def test_a_job_from_a_node_and_a_bag_runs(rsltrace: Any, folder: Path) -> None:
     offered = text.replace("    # parameters:  #", "    parameters:  #").replace(
         "    #   ", "      "
     )
+    offered = offered.replace("# checks:  #", "checks:  #").replace("\n#   - ", "\n  - ")
     (folder / "more.yaml").write_text(offered)
     job = load_job(folder / "more.yaml")
     assert job.nodes[0].parameters["name"] == "x: y"
     assert job.nodes[0].parameters["deep.b"] == (1.0, 2.0)
+    checked = rsltrace("check", "run.mcap", "--job", "more.yaml")
+    for title in ("never log error", "eventually /heard", "rate /heard"):
+        assert f"check passed: {title}" in checked.stdout
+    assert "check violated: eventually /hearer/own" in checked.stdout
 
 
 @pytest.mark.long
@@ -125,6 +133,18 @@ def test_each_kind_of_first_job_loads(rsltrace: Any, folder: Path, sources: list
 
 
 @pytest.mark.long
+def test_a_node_is_named_by_its_file_in_a_job_as_for_init(rsltrace: Any, folder: Path) -> None:
+    (folder / "nodes.py").write_text(NODE)
+    rsltrace("init", "--from", "nodes.py:Hearer")
+    (folder / "by_file.yaml").write_text(
+        (folder / "job.yaml").read_text().replace("node: nodes:Hearer", "node: nodes.py:Hearer")
+    )
+    runs = [rsltrace("record", name, "-o", f"{name}.mcap") for name in ("job.yaml", "by_file.yaml")]
+    assert runs[0].returncode == 0, runs[0].stderr
+    assert runs[0].stdout == runs[1].stdout
+    assert load_job(folder / "by_file.yaml").nodes[0].target == "nodes:Hearer"
+
+
 def test_a_file_that_exists_is_left_alone(rsltrace: Any, folder: Path) -> None:
     (folder / "job.yaml").write_text("mine")
     done = rsltrace("init")

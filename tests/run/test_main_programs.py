@@ -173,3 +173,71 @@ def test_what_cannot_be_run_is_refused_at_its_line(entry: str, said: str, progra
     assert said in str(refused.value)
     assert "job.yaml:2:" in str(refused.value)
     assert not (programs / "run.mcap").exists()
+
+
+EARLY = {
+    # rclpy.init() in a module that the main's imports, as rosboard has it.
+    "early/__init__.py": "",
+    "early/ros.py": (
+        "import sys\nimport rclpy\nrclpy.init(args=sys.argv)\nNODES = []\n"
+        "def make(name):\n    NODES.append(rclpy.create_node(name))\n    return NODES[0]\n"
+    ),
+    "early/node.py": (
+        "import threading\nfrom early import ros\n"
+        "def main():\n    import rclpy\n    from early.later import say\n"
+        "    node = ros.make('early')\n"
+        "    threading.Thread(target=rclpy.spin, args=(node,), daemon=True).start()\n"
+        "    node.create_timer(0.5, lambda: say(node, len(ros.NODES)))\n"
+        "    threading.Event().wait()\n"
+    ),
+    "early/later.py": (
+        "from early.ros import NODES\n"
+        "def say(node, count):\n"
+        "    node.get_logger().info(f'{node.get_name()} {count} {len(NODES)}')\n"
+    ),
+    # The whole node is made when the module is imported.
+    "whole.py": (
+        "import rclpy\nrclpy.init()\nnode = rclpy.create_node('whole')\n"
+        "node.create_timer(0.5, lambda: node.get_logger().info('whole'))\n"
+        "def main():\n    rclpy.spin(node)\n"
+    ),
+    "swallows.py": (
+        "import rclpy\ntry:\n    rclpy.init()\nexcept BaseException:\n    pass\n"
+        "def main():\n    node = rclpy.create_node('swallows')\n"
+        "    node.create_timer(0.5, lambda: node.get_logger().info('swallows'))\n"
+        "    rclpy.spin(node)\n"
+    ),
+    "asks.py": (
+        "import rclpy\nCONTEXT = rclpy.get_default_context()\nassert not rclpy.ok()\n"
+        "def main():\n    rclpy.init()\n    assert CONTEXT.ok()\n"
+        "    node = rclpy.create_node('asks', context=CONTEXT)\n"
+        "    node.create_timer(0.5, lambda: node.get_logger().info('asks'))\n"
+        "    rclpy.spin(node)\n"
+    ),
+    "job.yaml": (
+        "stop: {duration: 0.7s}\nnodes:\n"
+        "  - {main: 'early.node:main'}\n  - {main: 'early.node:main', name: other}\n"
+        "  - {main: 'whole:main'}\n  - {main: 'swallows:main'}\n  - {main: 'asks:main'}\n"
+    ),
+    "hosted.yaml": "stop: {duration: 1s}\nnodes: [{node: 'whole:main'}]\n",
+    "wrong.yaml": "stop: {duration: 1s}\nnodes: [{main: 'early.node:mian'}]\n",
+}
+
+
+def test_a_module_that_initializes_rclpy_when_it_is_imported(
+    tmp_path: Path, rsltrace: Callable[..., Any]
+) -> None:
+    for name, text in EARLY.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+    done = rsltrace("record", "job.yaml", "-o", "run.mcap")
+    assert done.returncode == 0, done.stderr
+    said = [line.split("]: ")[1] for line in done.stderr.splitlines() if "]: " in line]
+    assert sorted(said) == ["asks", "early 1 1", "other 1 1", "swallows", "whole"]
+    again = rsltrace("record", "job.yaml", "-o", "again.mcap")
+    assert again.stdout == done.stdout
+    hosted = rsltrace("record", "hosted.yaml", "-o", "hosted.mcap")
+    assert "move rclpy.init() into a function that makes the node and spins" in hosted.stderr
+    wrong = rsltrace("record", "wrong.yaml", "-o", "wrong.mcap")
+    assert wrong.returncode == 3
+    assert "has no attribute 'mian'" in wrong.stderr

@@ -201,6 +201,52 @@ def test_verify_leaves_shares_where_they_are(
     assert done.returncode == 0, done.stdout
 
 
+_NAMESPACES = {
+    # No __init__.py: listed by name, found by find_namespace_packages, by setup.cfg, by nobody.
+    "ws/plain/package.xml": _PACKAGE.format("plain"),
+    "ws/plain/setup.py": "from setuptools import setup\nsetup(packages=['plain'], "
+    "entry_points={'console_scripts': ['go = plain.main:main']})\n",
+    "ws/plain/plain/main.py": "from .helper import word\n"
+    + _TALKER.replace("tools_cmake", "found"),
+    "ws/plain/plain/helper.py": "from listed.deep.words import word\n",
+    "ws/found/package.xml": _PACKAGE.format("found"),
+    "ws/found/setup.py": "from setuptools import find_namespace_packages, setup\n"
+    "setup(packages=find_namespace_packages(where='code'), package_dir={'': 'code'})\n",
+    "ws/found/code/found/helper.py": "from plain.helper import word\n",
+    "ws/listed/package.xml": _PACKAGE.format("listed"),
+    "ws/listed/setup.cfg": "[options]\npackages =\n  listed\n  listed.deep\n"
+    "package_dir =\n  = python\n",
+    "ws/listed/python/listed/deep/words.py": "from beside.inner import word\n",
+    # An __init__.py beside package.xml: the folder of the package is not its module.
+    "ws/beside/package.xml": _PACKAGE.format("beside"),
+    "ws/beside/__init__.py": "raise ImportError('the folder of the package')\n",
+    "ws/beside/setup.py": "from setuptools import find_packages, setup\n"
+    "setup(packages=find_packages())\n",
+    "ws/beside/beside/__init__.py": "",
+    "ws/beside/beside/inner.py": "def word():\n    return 'from all'\n",
+    "job.yaml": "search_path: [ws, ws/plain, ws/found]\nstop: {duration: 2s}\n"
+    "nodes: [{executable: plain/go}]\n",
+}
+
+
+@pytest.mark.ros
+def test_modules_without_an_init_and_an_init_beside_package_xml(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: Command
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    _write(tmp_path, _NAMESPACES)
+    done = command("record", "job.yaml", "-o", "run.mcap")
+    assert done.returncode == 0, done.stderr
+    with Trace.open("run.mcap") as trace:
+        said = [trace.decode("/said", data).data for _, _, data in trace.messages("/said")]  # type: ignore[attr-defined]
+    assert set(said) == {"from all"}
+    audit = command("audit", "job.yaml")
+    assert "nothing found in 6 files" in audit.stdout + audit.stderr
+    listed = command("replay", "run.mcap", "--job-folder", tmp_path)
+    assert "ws/beside/beside/inner.py\n" in listed.stderr
+    assert "ws/plain/plain/main.py\n" in listed.stderr
+
+
 def test_what_build_files_say(tmp_path: Path) -> None:
     _write(
         tmp_path,

@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from rsltrace.errors import JobError, SetupError
 from rsltrace.job import load_job
@@ -21,7 +23,7 @@ from rsltrace.trace.reader import Trace
 from rsltrace.workspace import cache
 from rsltrace.workspace.build_files import entry_points, name_and_version
 from rsltrace.workspace.imports import unbuilt_packages
-from rsltrace.workspace.interfaces import interface_prefix
+from rsltrace.workspace.interfaces import interface_makers, module_name
 from rsltrace.workspace.share import share_prefix
 
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
@@ -200,12 +202,13 @@ def test_classes_and_hashes_are_those_that_a_build_makes(
     _write(tmp_path, {"package.xml": "<package><name>std_srvs</name></package>"})
     (tmp_path / "srv").mkdir()
     (tmp_path / "srv" / "SetBool.srv").write_bytes((share / "srv" / "SetBool.srv").read_bytes())
-    packages = source_packages([tmp_path])
+    maker = interface_makers(source_packages([tmp_path]))["std_srvs"]
     of_node = io.StringIO()  # what a node prints is the same in the first run and the next
     monkeypatch.setattr(sys, "stderr", of_node)
-    made = interface_prefix(packages["std_srvs"], packages)
-    assert "the interfaces of std_srvs (interface files: 1)" in capfd.readouterr().err
-    assert made == interface_prefix(packages["std_srvs"], packages)
+    maker.make("srv", "SetBool")
+    made = maker.prefix
+    assert "making Python classes of std_srvs/srv/SetBool, once" in capfd.readouterr().err
+    interface_makers(source_packages([tmp_path]))["std_srvs"].make("srv", "SetBool")
     assert (capfd.readouterr().err, of_node.getvalue()) == ("", "")
     (site,) = import_module("std_srvs").__path__
     for ours, built in (
@@ -227,21 +230,84 @@ def test_a_type_is_described_from_its_file_as_from_its_library() -> None:
 
 
 @pytest.mark.parametrize(
-    ("files", "said"),
+    ("text", "said"),
     [
-        ({"msg/Oops.msg": "float6 x\n"}, r"msg/Oops\.msg: rosidl cannot read it: 'float6' is an"),
-        ({"msg/Far.msg": "moon_msgs/Rock rock\n"}, r"msg/Far\.msg: it uses types of .*'moon_msgs'"),
+        ("float6 x\n", r"msg/Odd\.msg: rosidl cannot read it: 'float6' is an"),
+        ("\nmoon_msgs/Rock rock\n", r"msg/Odd\.msg:2: it uses types of .*'moon_msgs'"),
+        (
+            "# late\nbool x\nduration wait  # s\n",
+            r"Odd\.msg:3: 'duration' .* ROS 1: write builtin_",
+        ),
+        ("time[] at\n", r"Odd\.msg:1: 'time' is a type of ROS 1: write builtin_interfaces/Time"),
+        ("Header header\n", r"Odd\.msg:1: 'Header' is a type of ROS 1: write std_msgs/Header"),
+        ("Fine f\nNone[3] x\n", r"Odd\.msg:2: there is no None\.msg in the package 'odd'"),
+        ("Fine f\nodd/msg/Other[<=3] x\n", r"msg/Other\.msg:1: it and odd/Odd need each other"),
     ],
 )
-def test_files_that_cannot_be_understood_are_named(
-    tmp_path: Path, caches: Path, files: dict[str, str], said: str
+def test_files_that_cannot_be_understood_are_named_and_stop_no_others(
+    tmp_path: Path, caches: Path, text: str, said: str
 ) -> None:
+    files = {"msg/Odd.msg": text, "msg/Other.msg": "Odd odd\n", "msg/Fine.msg": "int32 x\n"}
     _write(tmp_path, {"package.xml": "<package><name>odd</name></package>", **files})
-    packages = source_packages([tmp_path])
+    maker = interface_makers(source_packages([tmp_path]))["odd"]
     with pytest.raises(JobError, match=said):
-        interface_prefix(packages["odd"], packages)
+        maker.make("msg", "Odd")
+    maker.make("msg", "Fine")
+    assert maker.module_of("msg", "Fine").is_file()
+    assert not maker.module_of("msg", "Odd").exists()
     left = [path.name for path in (caches / "rsltrace" / "interfaces").iterdir()]
-    assert not [name for name in left if name.startswith((".new", "odd"))]
+    assert not [name for name in left if name.startswith(".new")]
+
+
+def test_only_what_is_imported_is_made_and_what_is_ready_is_kept(
+    tmp_path: Path, caches: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    files = {
+        "far/package.xml": "<package><name>far_msgs</name></package>",
+        "far/msg/Leaf.msg": "int32 x\n",
+        "far/msg/Unused.msg": "moon_msgs/Rock rock\n",
+        "near/package.xml": "<package><name>near_msgs</name></package>",
+        "near/msg/HTTPBox2D.msg": "far_msgs/Leaf[2] leaves\nInner inner\n",
+        "near/msg/Inner.msg": "std_msgs/Header header\n",
+        "near/msg/Other.msg": "time t\n",
+        "near/srv/Ask.srv": "Inner inner\n---\n",
+    }
+    _write(tmp_path, files)
+
+    def made() -> list[str]:
+        folders = (caches / "rsltrace" / "interfaces").glob("*_msgs-*/site-packages/*/*")
+        return sorted(path.name for folder in folders for path in folder.glob("_[a-z]*.py"))
+
+    with unbuilt_packages([tmp_path]) as workspace:
+        module = import_module("near_msgs.msg")
+        assert dir(module) == ["HTTPBox2D", "Inner", "Other"]
+        assert made() == []
+        box = module.HTTPBox2D()
+        assert made() == ["_http_box2_d.py", "_inner.py", "_leaf.py"]
+        assert "of near_msgs/msg/HTTPBox2D and of what it uses (interface files: 3)" in (
+            capfd.readouterr().err
+        )
+        assert box.leaves[1].x == 0
+        assert type(box.inner) is import_module("near_msgs.msg._inner").Inner
+        assert not hasattr(module, "Nothing")
+        with pytest.raises(JobError, match=r"Other\.msg:1: 'time' is a type of ROS 1"):
+            _ = module.Other
+        import_module("near_msgs.srv._ask")
+        assert capfd.readouterr().err.count("note") == 1
+        assert import_module("near_msgs.srv").Ask_Request().inner is not None
+        share = workspace.interfaces("near_msgs").prefix / "share" / "near_msgs"  # type: ignore[union-attr]
+        assert (share / "srv" / "Ask_Event.json").is_file()
+        assert '"far_msgs/msg/Leaf"' in (share / "msg" / "HTTPBox2D.json").read_text()
+    with unbuilt_packages([tmp_path]):
+        import_module("near_msgs.msg").HTTPBox2D()
+        assert capfd.readouterr().err == ""
+
+
+@given(st.from_regex(r"[A-Z][A-Za-z0-9]{0,12}", fullmatch=True))
+def test_modules_are_named_as_rosidl_names_them(name: str) -> None:
+    from rosidl_pycommon import convert_camel_case_to_lower_case_underscore as named
+
+    assert module_name(name) == named(name)
 
 
 def test_packages_are_found_as_colcon_finds_them(tmp_path: Path) -> None:

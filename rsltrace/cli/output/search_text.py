@@ -6,25 +6,30 @@ import shlex
 from collections.abc import Iterator
 from pathlib import Path
 
-from rsltrace.explore.search import Search
+from rsltrace.explore.search import Search, Tally
 from rsltrace.explore.trial import JobSource, TrialResult, overrides_of
 
 _CAUSES_MAX = 20
 _TEXT_MAX = 300
 
 
-def search_lines(search: Search, source: JobSource, folder: Path) -> Iterator[str]:
-    """Yield the lines of the summary: what was tried, what failed, how to see it."""
+def search_lines(
+    search: Search, source: JobSource, folder: Path, *, caution: str = ""
+) -> Iterator[str]:
+    """Yield the lines of the summary: what was tried, what failed, how to see it; ``caution`` is
+    what was not looked for."""
     tally = search.tally
     failed = sum(tally.failures.values())
     yield (
         f"{_counted(tally.runs, 'run')}, {_counted(len(tally.digests), 'different digest')}, "
         f"{failed} failed" + (f" of {_counted(len(tally.failures), 'cause')}" if failed else "")
     )
+    if caution:
+        yield caution
     if tally.plain is not None and tally.plain.failure is not None:
         yield "the job fails as it is: its plain order needs no search"
-    for key, count in tally.failures.most_common(_CAUSES_MAX):
-        yield from _cause(tally.first[key], count, source)
+    for key in _by_frequency(tally)[:_CAUSES_MAX]:
+        yield from _cause(tally.first[key], tally.failures[key], source)
     more = len(tally.failures) - _CAUSES_MAX
     if more > 0:
         yield f"and {_counted(more, 'more cause')}"
@@ -36,6 +41,13 @@ def search_lines(search: Search, source: JobSource, folder: Path) -> Iterator[st
     if search.is_exhausted:
         yield "nothing is left to try"
     yield f"results: {folder}, as a page: {folder / 'report.html'}"
+
+
+def _by_frequency(tally: Tally) -> list[str]:
+    """Return the causes, the most frequent first, whichever came first."""
+    return sorted(
+        tally.failures, key=lambda key: (-tally.failures[key], tally.first[key].trial.number)
+    )
 
 
 def _cause(result: TrialResult, count: int, source: JobSource) -> Iterator[str]:

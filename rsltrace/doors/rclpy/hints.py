@@ -34,6 +34,8 @@ _STANDS_STILL = (
     "which lets it advance by a nanosecond per look"
 )
 
+_INITIALIZED = "Context.init() must only be called once"
+
 _COMPILED = (
     "\n  The guard has compiled this code so that it goes through sets in order; "
     "to run it as it is, write 'guard: {order: allow}' in the job"
@@ -85,6 +87,12 @@ def import_raised(module: str, error: BaseException, said: str) -> str:
         hint = (
             "; what a module does when it is imported should be definitions: put the rest into a "
             "function (and name that with 'main:'), or run it as a program ('script:', 'module:')"
+        )
+    elif isinstance(error, RuntimeError) and said.endswith(_INITIALIZED):
+        hint = (
+            ": rclpy is initialized already, the nodes of a job share one process; move "
+            "rclpy.init() into a function that makes the node and spins, and name that with "
+            "'main:', or run the file as a program ('script:')"
         )
     shown = f" ({place})\n    {line.strip()}" if place else ""
     return f"module {module!r} cannot be imported: it raised {said}{hint}{shown}"

@@ -14,6 +14,13 @@ from rsltrace.explore.trial import Failure, Trial, TrialResult, overrides_of
 _COMMAND_MAX = 400
 _AT_LINE = re.compile(r" at (?P<file>[^:\s]+):(?P<line>\d+)")
 
+NO_CHECKS = (
+    "the job has no checks: only exceptions, deadlocks, livelocks, crashes and runs that do not "
+    "end in time were looked for. What has to be true of every run goes into the job, as in "
+    "checks: [never: log error] (docs/checks.md)"
+)
+"""What somebody has to know of a search in which nothing else could fail."""
+
 Value = float | str
 
 
@@ -32,6 +39,7 @@ class Exploration:
     ``job`` is the job file as it was named, ``arguments`` what else a command needs to mean the
     same job (``--set``, ``--launch``). ``coverage`` says in sentences what was tried and what was
     not, ``units`` has the units of metrics, ``reduced`` the runs made small by their failure's key.
+    ``checks`` is how many checks the job has.
     """
 
     job: str
@@ -42,6 +50,12 @@ class Exploration:
     wall_s: float = 0.0
     units: Mapping[str, str] = field(default_factory=dict)
     reduced: Mapping[str, Reduced] = field(default_factory=dict)
+    checks: int = 0
+
+    @property
+    def caution(self) -> str:
+        """What was not looked for, in a sentence; empty if the job says what has to be true."""
+        return "" if self.checks else NO_CHECKS
 
     @property
     def failed(self) -> list[TrialResult]:

@@ -28,6 +28,8 @@ def json_values(explored: Exploration) -> dict[str, Any]:
         "strategy": explored.strategy,
         "runs": len(explored.results),
         "failed": len(explored.failed),
+        "checks": explored.checks,
+        "caution": explored.caution,
         "digests": explored.digests,
         "wall_s": round(explored.wall_s, 3),
         "coverage": list(explored.coverage),
@@ -96,7 +98,9 @@ def junit_text(explored: Exploration) -> str:
         kind = {"type": cause.failure.kind, "message": _text(said)}
         SubElement(case, "failure", kind).text = printable_lines(_details(explored, cause))
     if not found:
-        _case(suite, explored, f"{len(explored.results)} runs")
+        case = _case(suite, explored, f"{len(explored.results)} runs")
+        if explored.caution:
+            SubElement(case, "system-out").text = explored.caution
     indent(suites)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + tostring(suites, encoding="unicode")
 
@@ -120,7 +124,9 @@ def github_text(explored: Exploration) -> str:
     found = causes(explored)
     if not found:
         name = _property(_from_here(explored.job))
-        return f"::notice file={name}::{len(explored.results)} runs, none failed"
+        said = f"{len(explored.results)} runs, none failed"
+        said += f"; {explored.caution}" if explored.caution else ""
+        return f"::notice file={name}::{_escaped(said)}"
     lines = []
     for cause in found:
         file, line = _place(explored, cause)

@@ -37,7 +37,7 @@ pre { background: var(--soft); padding: .6rem .8rem; overflow-x: auto; border-ra
 .numbers { display: flex; flex-wrap: wrap; gap: .4rem 2rem; margin: 1rem 0; padding: 0 }
 .numbers div { font-size: 1.4rem } .numbers span { display: block; font-size: .8rem; opacity: .75 }
 .cause { border-left: 4px solid var(--bad); padding: .1rem 0 .1rem 1rem; margin: 1rem 0 }
-.decides { font-weight: 600 }
+.decides, .caution { font-weight: 600 }
 .charts { display: grid; grid-template-columns: repeat(auto-fill, minmax(22rem, 1fr)); gap: 1rem }
 .wide { overflow-x: auto }
 table { border-collapse: collapse; font-size: .9rem } caption { text-align: left; opacity: .75 }
@@ -111,6 +111,8 @@ def _failures(body: Element, explored: Exploration) -> None:
     found = causes(explored)
     if not found:
         _add(body, "p", f"None of the {len(explored.results):,} runs failed.")
+    if explored.caution:
+        _add(body, "p", f"{explored.caution[:1].upper()}{explored.caution[1:]}.", "caution")
     for cause in found:
         _cause(SubElement(body, "div", {"class": "cause"}), explored, cause)
 

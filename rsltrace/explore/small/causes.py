@@ -10,10 +10,10 @@ from pathlib import Path
 from rsltrace.errors import ExploreError
 from rsltrace.explore.small.folder import write_small
 from rsltrace.explore.small.reduction import Reduction
+from rsltrace.explore.table import SMALL
 from rsltrace.explore.trial import JobSource, TrialResult
 from rsltrace.explore.workers import Worker
 
-SMALL = "small"
 _CAUSES_MAX = 10
 
 

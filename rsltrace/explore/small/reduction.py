@@ -87,7 +87,8 @@ class Reduced:
 
 
 class Reduction:
-    """Reduces ``result``, a trial of ``source`` that has failed and whose trace is there.
+    """Reduces ``result``, a trial of ``source`` that has failed. If its trace is not there, its run
+    is made once more.
 
     ``scratch`` is a folder for traces, ``runs_max`` how many runs may be made.
     """
@@ -160,9 +161,7 @@ class Reduction:
             tuple(overlay["faults"]) if "faults" in overlay else None,
             tuple(overlay.get("set", {}).items()),
         )
-        if self._given.trace is None:
-            raise ExploreError(f"the trace of trial {self._given.trial.number} is not there")
-        with Trace.open(self._given.trace) as trace:
+        with Trace.open(self._trace()) as trace:
             choices = trace.attachment(ATTACHMENT_CHOICES)
             end_ns = trace.end_ns
         if "policy" in overlay or choices is not None:
@@ -170,6 +169,19 @@ class Reduction:
             departures = tuple({"choice": number, "run": run} for number, run in made if run)
             parts = replace(parts, departures=departures)
         return replace(parts, until_ns=end_ns) if "until" in overlay else parts
+
+    def _trace(self) -> Path:
+        """Return the trace of the given trial, made again if it is not there."""
+        trial = self._given.trial
+        if self._given.trace is not None and Path(self._given.trace).is_file():
+            return Path(self._given.trace)
+        self.runs += 1
+        place = self._scratch / "given.mcap"
+        again = self._worker.run(trial, place, Wants(keep=True), self._timeout_s)
+        if again.trace is None:
+            said = "it did not fail" if again.failure is None else again.failure.text
+            raise ExploreError(f"trial {trial.number} leaves no trace: {said}")
+        return Path(again.trace)
 
     def _fewer(self, parts: Parts, key: str) -> Parts:
         """Leave out departures, faults or settings."""

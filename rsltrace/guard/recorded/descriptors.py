@@ -36,6 +36,7 @@ _TERMINAL = (
     *("tcgetwinsize", "tcsetwinsize"),
 )
 _real_fstat = copy_of(os.fstat)  # type: ignore[arg-type]
+_isatty = copy_of(os.isatty)  # type: ignore[arg-type]
 _get_blocking = copy_of(os.get_blocking)  # type: ignore[arg-type]
 
 
@@ -157,7 +158,9 @@ def _blocks(fd: int) -> bool:
     """Return whether reading from a descriptor may have to wait for somebody."""
     try:
         kind = _real_fstat(fd).st_mode
-        return (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)) and _get_blocking(fd)
+        waits = stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)
+        waits = waits or (stat.S_ISCHR(kind) and _isatty(fd))  # a device that a thread plays, too
+        return waits and _get_blocking(fd)
     except OSError:
         return False
 

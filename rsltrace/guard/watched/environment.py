@@ -23,8 +23,9 @@ from rsltrace.guard.guard import Guard, engaged
 from rsltrace.guard.libraries import is_library
 from rsltrace.model.finding import READ_BY, Mode, Source
 
-_NOT_READ = ("PYTHON", "ROS_PYTHON_CHECK_FIELDS")
-"""What Python looks at for itself, and what every class of messages does when it is imported."""
+_NOT_READ = ("PYTHON", "ROS_PYTHON_", "ROS_VERSION")
+"""What Python looks at for itself, what every class of messages does when it is imported, and what
+is the same wherever there is ROS 2."""
 
 _LAYS_OUT = {"os", "_collections_abc", "collections.abc", "shutil", "locale", "gettext", "argparse"}
 

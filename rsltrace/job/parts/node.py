@@ -82,7 +82,8 @@ class NodeSpec(Part):
     node: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(
         default=None,
         description="What to construct: `module:Class`, a Node subclass, or `module:function`, "
-        "which returns a node or a list of nodes. Looked for in `search_path`.",
+        "which returns a node or a list of nodes. Looked for in `search_path`. A file in the job's "
+        "folder may be named as `folder/file.py:Class`.",
         examples=["my_robot.ekf:EkfNode"],
     )
     main: Annotated[Target | None, check(check_callable_target, optional=True)] = Field(

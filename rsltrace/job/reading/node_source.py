@@ -8,13 +8,14 @@ from __future__ import annotations
 import ast
 import os
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
-from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
 from rsltrace.errors import JobError, did_you_mean
-from rsltrace.job.values.names import check_node_name, check_target
+from rsltrace.job.values.names import check_node_name, check_target, check_topic
+from rsltrace.model.module_search import find_module
 
 _DECLARE_ONE = "declare_parameter"
 _DECLARE_SEVERAL = "declare_parameters"
@@ -26,7 +27,8 @@ class Found:
 
     ``parameters`` are those that are declared with a literal name; the value is None where the
     source does not give a literal default. ``name`` is the node's, "" where the source does not
-    give it literally. ``is_main`` is a function that returns nothing, so no node.
+    give it literally. ``is_main`` is a function that returns nothing, so no node. ``topics`` are
+    those that it publishes on, as far as the source has literal names.
     """
 
     target: str
@@ -34,6 +36,7 @@ class Found:
     parameters: dict[str, Any]
     name: str = ""
     is_main: bool = False
+    topics: tuple[str, ...] = ()
 
 
 def look_up(target: str, folders: list[Path]) -> Found:
@@ -56,7 +59,9 @@ def look_up(target: str, folders: list[Path]) -> Found:
             raise JobError(f"{target}: {file} has no {name!r}{did_you_mean(name, names)}")
     if body is None:
         return Found(target, folder, {})
-    return Found(target, folder, _parameters(body), _node_name(body), _is_main(body))
+    name, is_main = _node_name(body), _is_main(body)
+    topics = _topics(body if isinstance(body, ast.ClassDef) else tree, name)
+    return Found(target, folder, _parameters(body), name, is_main, topics)
 
 
 def look_up_file(source: str) -> Found:
@@ -128,16 +133,8 @@ def _is_main(body: ast.AST) -> bool:
 
 
 def _file_of(module: str, folders: list[Path]) -> tuple[Path | None, Path]:
-    parts = module.split(".")
     for folder in [*folders, None]:
-        path = [str(folder)] if folder is not None else sys.path
-        spec = None
-        for depth in range(len(parts)):
-            spec = PathFinder.find_spec(".".join(parts[: depth + 1]), path)
-            if spec is None or (spec.submodule_search_locations is None and depth + 1 < len(parts)):
-                spec = None
-                break
-            path = list(spec.submodule_search_locations or ())
+        spec = find_module(module, [str(folder)] if folder is not None else sys.path)
         if spec is not None and spec.origin is not None and spec.origin.endswith(".py"):
             return folder, Path(spec.origin)
     places = ", ".join(str(folder) for folder in folders)
@@ -179,6 +176,28 @@ def _add(found: dict[str, Any], prefix: str, parts: list[ast.expr]) -> None:
     name = _literal(parts[0])
     if isinstance(name, str) and name:
         found[prefix + name] = _literal(parts[1]) if len(parts) > 1 else None
+
+
+def _topics(body: ast.AST, node_name: str) -> tuple[str, ...]:
+    """Return the full names of the topics for which publishers are made."""
+    found: list[str] = []
+    for node in ast.walk(body):
+        if not isinstance(node, ast.Call) or getattr(node.func, "attr", "") != "create_publisher":
+            continue
+        keyword = next((k.value for k in node.keywords if k.arg == "topic"), None)
+        given = node.args[1] if len(node.args) > 1 else keyword
+        topic = _literal(given) if given is not None else None
+        if not isinstance(topic, str) or not topic:
+            continue
+        if topic.startswith("~/"):
+            if not node_name:
+                continue
+            topic = f"{node_name}/{topic[2:]}"
+        topic = f"/{topic.lstrip('/')}"
+        with suppress(ValueError):
+            check_topic(topic)
+            found.append(topic)
+    return tuple(dict.fromkeys(found))
 
 
 def _literal(node: ast.expr) -> Any:

@@ -27,6 +27,7 @@ _REMAP_TO = re.compile(_RULE_NAME, re.ASCII)
 
 _MODULE = r"[^\W\d]\w*(?:\.[^\W\d]\w*)*"
 _TARGET = re.compile(rf"{_MODULE}:{_MODULE}")
+_FILE_TARGET = re.compile(rf"(?:\./)?((?:[^\W\d]\w*/)*[^\W\d]\w*)\.py:({_MODULE})")
 _MODULE_NAME = re.compile(_MODULE)
 _EXECUTABLE = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z0-9_.-]+", re.ASCII)
 _COMPONENT = re.compile(r"[A-Za-z0-9_.-]+/[A-Za-z_]\w*(?:(?:::|[.:])[A-Za-z_]\w*)*", re.ASCII)
@@ -93,11 +94,21 @@ def check_target(target: str) -> None:
         )
 
 
+def dotted_target(target: str) -> str:
+    """Return ``path/to/file.py:Class`` as ``path.to.file:Class``, which is the same module seen
+    from the job's folder; another text as it is."""
+    found = _FILE_TARGET.fullmatch(target)
+    return target if found is None else f"{found[1].replace('/', '.')}:{found[2]}"
+
+
 def _as_target(text: str) -> str:
     """Say how to write what was probably meant: a dotted name, or the path of a module."""
-    path, _, attribute = text.replace("/", ".").partition(":")
+    path, _, attribute = text.partition(":")
     if path.endswith(".py"):
-        module = path[: -len(".py")].strip(".")
+        folder, _, file = path.removesuffix(".py").rpartition("/")
+        if path.startswith(("/", "../")) and attribute:
+            return f"; add {folder or '/'} to search_path and write {file}:{attribute}"
+        module = path.removesuffix(".py").replace("/", ".").strip(".")
         return f"; a module is named with dots: {module}:{attribute or 'Class'}"
     module, dot, last = text.rpartition(".")
     return f"; write {module}:{last}" if dot and _TARGET.fullmatch(f"{module}:{last}") else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from rsltrace.job.values.checks import attach, text
-from rsltrace.job.values.names import check_target
+from rsltrace.job.values.names import check_target, dotted_target
 from rsltrace.job.values.problem import Problem, describe
 
 Target = str | Callable[..., object]
@@ -22,12 +22,13 @@ def target_text(target: Target) -> str:
 
 
 def check_callable_target(value: object) -> Target:
-    """Check a class or function, given itself or as ``module:attribute``."""
+    """Check a class or function, given itself, as ``module:attribute`` or as the path of a file
+    in the job's folder, ``file.py:attribute``, which is read as that of its module."""
     if callable(value):
         return value
     if not isinstance(value, str):
         raise Problem(f"expected module:Class or module:function, got {describe(value)}")
-    return text(check_target)(value)
+    return text(check_target)(dotted_target(value))
 
 
 attach(check_callable_target, schema={"type": "string", "pattern": check_target.pattern})  # type: ignore[attr-defined]

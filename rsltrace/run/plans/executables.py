@@ -7,19 +7,24 @@ that nobody has built would install as such. All run as they are, in this proces
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from operator import attrgetter
 from pathlib import Path
 from types import ModuleType
 
 from rsltrace.doors.processes.programs import is_compiled, is_python, why_not_run
+from rsltrace.doors.rclpy.boundary.early_init import NeedsItsProcess, before_its_process
+from rsltrace.doors.rclpy.boundary.installation import boundary
 from rsltrace.errors import JobError, nearest
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.plans.main_programs import MainProgram, module_program, script_program
 from rsltrace.run.plans.target import load_target
+from rsltrace.run.process import user_modules
 from rsltrace.workspace.imports import (
     unbuilt_executables,
     unbuilt_fault,
@@ -62,15 +67,48 @@ class Mains:
         return getattr(spec.main, "__name__", type(spec.main).__name__), spec.main
 
     def _load(self, target: str, where: str) -> Callable[[], object]:
-        with self._copied(re.split("[.:]", target)[0]):
-            function: Callable[[], object] = load_target(target, where=where)
+        """Import a main's module, or leave that to its program if it uses rclpy's contexts."""
+        package = re.split("[.:]", target)[0]
+        again = package in self._packages
+        before = set(sys.modules)
+        try:
+            with self._copied(package), self._without_process():
+                function: Callable[[], object] = load_target(target, where=where)
+        except NeedsItsProcess:
+            folders = [str(self._job.resolve(folder)) for folder in self._job.search_path]
+            for name in user_modules(folders).keys() - before:
+                del sys.modules[name]
+            return ImportedMain(target, again=again)
         return function
+
+    def _without_process(self) -> AbstractContextManager[None]:
+        """Let rclpy be that of no process while a module is imported. In a native run it is the
+        process of the main already."""
+        return nullcontext() if boundary().is_free else before_its_process()
 
     def _copied(self, package: str) -> AbstractContextManager[None]:
         """Let a package be imported once more if somebody else has it already."""
         again = package in self._packages
         self._packages.add(package)
         return _own_copy(package) if again else nullcontext()
+
+
+class ImportedMain:
+    """A main whose module is imported when it starts, in its own program."""
+
+    def __init__(self, target: str, *, again: bool) -> None:
+        """``again``: another one has the module, too."""
+        self._target = target
+        self._again = again
+
+    def __call__(self) -> object:
+        """Import the module and call the function, as a console script does."""
+        module, _, name = self._target.partition(":")
+        package = module.partition(".")[0]
+        again, self._again = self._again, True  # a program that is restarted imports it once more
+        with _own_copy(package) if again else nullcontext():
+            function = attrgetter(name)(importlib.import_module(module))
+        return function()
 
 
 @contextmanager
@@ -169,7 +207,7 @@ def find_executable(target: str, *, where: str) -> str | Callable[[], object]:
         listed = ", ".join(sorted(compiled)[:10])
         has += f"; once it is built (colcon build): {listed}"
     if fault := unbuilt_fault(package):
-        has += f"; its setup.py, asked without setuptools, failed: {fault}"
+        has += f"; {fault}"
     it = _near(name, {*available, *compiled}, "it")
     raise JobError(f"package {package!r} has no executable {name!r}{it} {has}", where=where)
 

@@ -14,6 +14,7 @@ from rsltrace.doors.rclpy.actions.client import ActionClientHandle
 from rsltrace.doors.rclpy.actions.goal_handle import GoalHandle
 from rsltrace.doors.rclpy.actions.server import ActionServerHandle
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, UnknownArgumentsError
+from rsltrace.doors.rclpy.boundary.early_init import check_process
 from rsltrace.doors.rclpy.handles.clock import ClockEventHandle, ClockHandle
 from rsltrace.doors.rclpy.handles.context import ContextHandle
 from rsltrace.doors.rclpy.handles.destroyable import Destroyable, set_invalid_handle
@@ -181,6 +182,7 @@ class Boundary:
     # -- entities --------------------------------------------------------------------------------
 
     def Context(self, arguments: list[str], domain_id: int) -> ContextHandle:  # noqa: N802
+        check_process()
         try:
             context = ContextHandle(self.real, self.stacks, arguments, domain_id)
         except UnknownArgumentsError as error:
