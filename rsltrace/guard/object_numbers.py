@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import enum
 import itertools
+import re
+import sys
 import types
 import weakref
 from collections import Counter
@@ -28,6 +30,8 @@ _CHARACTERS_MAX = 1000
 _ARRAY_BYTES_MAX = 1 << 16
 _PLAIN = (str, bytes, int, float, bool, complex, type(None))
 _GENERIC = (types.GenericAlias, types.UnionType)
+_FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}
+"""What is under way, and where it keeps its variables."""
 _BUILT_IN = (types.BuiltinMethodType, types.MethodWrapperType)
 _address = object.__hash__  # as id(), but no audit hook is told of it
 
@@ -102,6 +106,13 @@ class ObjectNumbers:
         elif kind in _GENERIC:
             parts.append(kind.__name__)
             self._describe([getattr(thing, "__origin__", None), thing.__args__], parts, depth + 1)
+        elif kind in _FRAMES:
+            frame = getattr(thing, _FRAMES[kind])
+            held = {} if frame is None else dict(frame.f_locals)
+            self._describe([thing.__qualname__, held], parts, depth + 1)
+        elif _is_task(kind):
+            padded = re.sub(r"[0-9]+", lambda number: number[0].zfill(12), thing.get_name())
+            parts.append(f"task {padded}")  # they are counted when they are made
         elif kind in _BUILT_IN and not isinstance(thing.__self__, types.ModuleType):
             parts.append(f"{kind.__name__} {thing.__name__}")
             self._describe(thing.__self__, parts, depth + 1)
@@ -181,6 +192,11 @@ class ShownNumbers:
 def _meant(thing: Any) -> Any:
     """Return what a weak reference refers to, whose hash it has; another object is itself."""
     return thing() if isinstance(thing, weakref.ref) else thing
+
+
+def _is_task(kind: type) -> bool:
+    asyncio = sys.modules.get("asyncio")
+    return asyncio is not None and issubclass(kind, asyncio.Task)
 
 
 def _bound_in(function: types.FunctionType) -> list[Any]:

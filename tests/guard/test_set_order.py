@@ -17,7 +17,7 @@ from rsltrace.trace.reader import Trace
 pytestmark = pytest.mark.ros
 
 SOURCE = """
-import array, collections, copy, dataclasses, functools, heapq, itertools, json, operator, os
+import array, asyncio, collections, concurrent.futures, copy, dataclasses, functools, heapq, itertools, json, operator, os
 import pickle, random, statistics, string, sys, types, typing, weakref
 import numpy as np
 from rclpy.node import Node
@@ -70,6 +70,23 @@ def tasks():
 
 def collect(*things, **named):
     return names(things)
+
+async def later(number):
+    await asyncio.sleep(0.01 * (number % 2))
+    return number
+
+async def waited():
+    done, _ = await asyncio.wait([asyncio.ensure_future(later(n)) for n in range(6)])
+    return [task.result() for task in done]
+
+async def completed():
+    return [await one for one in asyncio.as_completed([later(n) for n in range(6)])]
+
+def pooled():
+    with concurrent.futures.ThreadPoolExecutor(4) as pool:
+        calls = [pool.submit(pow, n, 2) for n in range(9)]
+        done = concurrent.futures.wait(calls).done
+    return [one.result() for one in (*done, *concurrent.futures.as_completed(calls))]
 
 def added(things):
     found = []
@@ -236,6 +253,9 @@ names(array.array("i", [t.rank for t in s]))
 names(typing.cast(set, s))
 eval("[t.name for t in s]", {"s": s})
 (lambda d: exec("a, *b = s\\nr = list(s)\\nr.extend(s)\\nr[1:2] = s", d) or names(d["r"]))({"s": s})
+asyncio.run(waited())
+asyncio.run(completed())
+pooled()
 added(s)
 taken_apart(s)
 names(vars(types.SimpleNamespace(s=s))["s"])
