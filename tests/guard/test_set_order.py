@@ -17,7 +17,8 @@ from rsltrace.trace.reader import Trace
 pytestmark = pytest.mark.ros
 
 SOURCE = """
-import array, asyncio, collections, concurrent.futures, copy, dataclasses, functools, heapq, itertools, json, operator, os
+import array, asyncio, collections, concurrent.futures, copy, dataclasses, functools, heapq
+import itertools, json, operator, os
 import pickle, random, statistics, string, sys, types, typing, weakref
 import numpy as np
 from rclpy.node import Node
