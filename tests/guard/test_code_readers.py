@@ -17,7 +17,7 @@ import rsltrace.guard.virtual.original_code as original_code
 from rsltrace.doors.rclpy.hints import hint_for
 from rsltrace.guard.virtual.user_modules import rewritten
 from rsltrace.model.finding import Source
-from tests.guard.conftest import node_code
+from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
 
@@ -139,11 +139,12 @@ def test_variables_that_a_library_reads_are_told_as_one(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    site = tmp_path / "site-packages" / "loguru"  # by name, a library
+    site = tmp_path / "site-packages" / "loguru"
     site.mkdir(parents=True)
     (site / "__init__.py").write_text(
         "import os\ndef read():\n    return [os.environ.get(f'LIB_{n}') for n in range(30)]\n"
     )
+    list_as_wheel(site.parent, "loguru")
     monkeypatch.syspath_prepend(str(site.parent))
     (tmp_path / "m.py").write_text(
         node_code("import os, loguru\nloguru.read()\nos.environ.get('MINE')")
