@@ -93,6 +93,10 @@ def _call(module: Module, node: ast.Call, names: Names) -> Iterator[Place]:
     scope = module.scope_of(node)
     names.passed.clear()
     name = names.of(node.func, scope)
+    if isinstance(node.func, ast.Attribute) and node.func.attr == "__hash__":
+        if not _inside_hash(module, node):
+            yield Place(node, "__hash__()", rules.HASH)
+        return
     if name is None:
         if isinstance(node.func, ast.Attribute):
             rule = METHODS.get(node.func.attr)

@@ -133,7 +133,7 @@ _COLLECTOR = Rule(
 ORDER = Rule(
     "order",
     _V,
-    "texts are gone through in order; a set of objects is a finding of the run",
+    "its order is the same in every run; objects that hold the same are a finding",
     "sorted(…), or a dict or a list instead of the set",
     source=Source.ORDER,
 )

@@ -22,34 +22,22 @@ _OPERATORS = (ast.BitOr, ast.BitAnd, ast.BitXor, ast.Sub)
 
 _UNORDERED = {
     *(f"builtins.{name}" for name in "sorted min max len any all set frozenset bool".split()),
+    *(f"statistics.{name}" for name in "mean fmean median pstdev pvariance stdev variance".split()),
     "math.fsum",
 }
-"""They give the same in whatever order the members come."""
+"""They give the same in whatever order the members come, unless a key makes some alike."""
 _ORDERED = {
-    "builtins.list",
-    "builtins.tuple",
-    "builtins.enumerate",
-    "builtins.zip",
-    "builtins.map",
-    "builtins.filter",
-    "builtins.iter",
-    "builtins.sum",
-    "builtins.dict",
-    "builtins.str",
-    "builtins.repr",
-    "builtins.print",
-    "itertools.chain",
-    "itertools.product",
-    "itertools.combinations",
-    "itertools.permutations",
-    "itertools.islice",
-    "itertools.cycle",
+    *(
+        f"builtins.{name}"
+        for name in "list tuple enumerate zip map filter iter sum dict str repr print".split()
+    ),
+    *(f"builtins.{name}" for name in "format bytes bytearray dict.fromkeys".split()),
     "functools.reduce",
-    "collections.deque",
-    "collections.OrderedDict",
-    "numpy.array",
-    "numpy.fromiter",
+    "pickle.dump",
+    "pickle.dumps",
 }
+_ORDERED_IN = ("collections.", "heapq.", "itertools.", "numpy.", "random.", "statistics.")
+"""Modules whose functions go through what they are given."""
 _KEEPING = {"extend", "join", "writelines", "extendleft", "fromlist"}
 _INSENSITIVE_CALLS = {"add", "discard", "remove"}
 
@@ -140,6 +128,10 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
         return parent.iter is node and _comprehension_matters(parent, scope, names)
     if isinstance(parent, ast.Call):
         return node in parent.args and _call_matters(parent, scope, names)
+    if isinstance(parent, ast.AugAssign):
+        return isinstance(parent.op, ast.Add)  # to a list
+    if isinstance(parent, ast.Assign):
+        return any(map(_takes_apart, parent.targets))
     if isinstance(parent, ast.Attribute):
         used = scope.module.parents.get(parent)
         called = isinstance(used, ast.Call) and used.func is parent
@@ -152,11 +144,18 @@ def order_matters(node: ast.expr, scope: Scope, names: Names) -> bool:
     return isinstance(parent, ast.YieldFrom)
 
 
+def _takes_apart(target: ast.expr) -> bool:
+    """Whether an assignment gives the members of a set to several: ``a, b = s``, ``r[1:] = s``."""
+    if isinstance(target, ast.Subscript):
+        return isinstance(target.slice, ast.Slice)
+    return isinstance(target, (ast.Tuple, ast.List))
+
+
 def _call_matters(call: ast.Call, scope: Scope, names: Names) -> bool:
-    name = names.of(call.func, scope)
+    name = names.of(call.func, scope) or ""
     if name in _UNORDERED:
-        return False
-    if name in _ORDERED:
+        return any(word.arg == "key" for word in call.keywords)
+    if name in _ORDERED or name.startswith(_ORDERED_IN):
         return not _ends_unordered(call, scope, names)
     return isinstance(call.func, ast.Attribute) and call.func.attr in _KEEPING
 
@@ -175,6 +174,7 @@ def _ends_unordered(node: ast.AST, scope: Scope, names: Names) -> bool:
         isinstance(user, ast.Call)
         and node in user.args
         and names.of(user.func, scope) in _UNORDERED
+        and not any(word.arg == "key" for word in user.keywords)
     )
 
 

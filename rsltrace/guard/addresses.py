@@ -5,8 +5,15 @@ from __future__ import annotations
 import os
 import re
 import sys
-from types import FrameType, MethodType
-from weakref import WeakSet
+from types import (
+    BuiltinMethodType,
+    FrameType,
+    GenericAlias,
+    MethodType,
+    MethodWrapperType,
+    UnionType,
+)
+from weakref import ReferenceType, WeakSet
 
 from rsltrace.guard.frames import code_of
 from rsltrace.guard.guard import Guard, engaged
@@ -16,6 +23,12 @@ _ADDRESS = re.compile(r"\S* at 0x(?!52[0-9a-f]{10}\b)[0-9a-f]{6,}")
 """An address in a text; not what the guard shows in place of one."""
 _ALIKE = object.__hash__
 _SEEDED = os.environ.get("PYTHONHASHSEED", "random") == "random"
+_OF_PARTS = (tuple.__hash__, frozenset.__hash__)
+"""What makes a hash of those of its elements; types that are derived have them, too."""
+_POINTING = frozenset((BuiltinMethodType, GenericAlias, MethodType, MethodWrapperType, UnionType))
+"""Types that make hashes of addresses in a way of their own."""
+_TAKING = frozenset(("__hash__", "__rsltrace_hash__", "id"))
+"""What a method that makes a hash of an address has among its names."""
 
 
 def is_by_address(thing: object) -> bool:
@@ -25,13 +38,16 @@ def is_by_address(thing: object) -> bool:
         return False
     if kind in (str, bytes):
         return _SEEDED
-    if kind in (tuple, frozenset):
-        return any(map(is_by_address, thing))  # type: ignore[call-overload]
-    if kind is MethodType:
-        return is_by_address(thing.__self__)  # type: ignore[attr-defined]
     if thing is None:
         return sys.version_info < (3, 12)
-    return getattr(kind, "__hash__", None) is _ALIKE or kind in _by_address
+    method = getattr(kind, "__hash__", None)
+    if method in _OF_PARTS:
+        return any(map(is_by_address, thing))  # type: ignore[call-overload]
+    if isinstance(thing, ReferenceType):
+        return is_by_address(thing())
+    if method is _ALIKE or kind in _POINTING or kind in _by_address:
+        return True
+    return not _TAKING.isdisjoint(getattr(getattr(method, "__code__", None), "co_names", ()))
 
 
 def hashed_by_address(frame: FrameType) -> None:

@@ -8,7 +8,6 @@ did.
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable
 from fnmatch import fnmatchcase
 from types import FrameType
@@ -16,6 +15,7 @@ from typing import Any
 from weakref import WeakSet
 
 from rsltrace.errors import GuardError
+from rsltrace.guard import engagement
 from rsltrace.guard.callers import (
     KINDS,
     OURS,
@@ -39,7 +39,6 @@ from rsltrace.guard.recorded_answers import RecordedAnswers, decoded, encoded_an
 from rsltrace.guard.redirect import copy_of
 from rsltrace.model.finding import DEFAULT_MODES, Finding, Mode, Policy, Source
 
-_thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
 _process_id = copy_of(os.getpid)  # type: ignore[arg-type]
 _guards: WeakSet[Guard] = WeakSet()
 
@@ -140,7 +139,7 @@ class Guard:
         self.modes = policy.modes if one_policy and not any(policy.allowed.values()) else None
         self.makes_clocks = self.modes is not None and self.modes[Source.CLOCK] is Mode.VIRTUAL
         self.makes_chance = self.modes is not None and self.modes[Source.RANDOM] is Mode.VIRTUAL
-        self.thread = _thread_id()
+        self.thread = engagement.thread_id()
         self.process = _process_id()
         _guards.add(self)
         self._event = -1
@@ -426,36 +425,5 @@ ADVICE = {
 }
 """What to do instead, by source."""
 
-_engaged: list[Guard] = []
-
-
-def engaged() -> Guard | None:
-    """Return the guard in charge of the calling thread (and of no child process), or None."""
-    if _engaged:
-        guard = _engaged[-1]
-        if guard.thread == _thread_id():
-            return guard
-    return None
-
-
-class engage:  # noqa: N801  (used like a function)
-    """Put ``guard`` in charge of what this thread does within (None: nobody)."""
-
-    __slots__ = ("_before", "_guard")
-
-    def __init__(self, guard: Guard | None) -> None:
-        self._guard = guard
-        self._before: list[Guard] = []
-
-    def __enter__(self) -> None:
-        if self._guard is None:
-            self._before = _engaged[:]
-            _engaged.clear()
-        else:
-            _engaged.append(self._guard)
-
-    def __exit__(self, *error: object) -> None:
-        if self._guard is None:
-            _engaged[:] = self._before
-        else:
-            _engaged.remove(self._guard)
+engaged: Callable[[], Guard | None] = engagement.engaged
+engage = engagement.engage

@@ -13,10 +13,12 @@ from rsltrace.guard.recorded.sockets import recorded_sockets
 from rsltrace.guard.virtual.clocks import virtual_clocks
 from rsltrace.guard.virtual.directory_listings import sorted_listings
 from rsltrace.guard.virtual.module_caches import fresh_module_caches
+from rsltrace.guard.virtual.object_hashes import watched_hashes
 from rsltrace.guard.virtual.object_texts import numbered_texts
 from rsltrace.guard.virtual.own_process_id import own_process_ids
 from rsltrace.guard.virtual.processors import same_processors
 from rsltrace.guard.virtual.randomness import virtual_randomness
+from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.watched.functions import watched_calls
 
 _REPLACEMENTS = (
@@ -25,6 +27,8 @@ _REPLACEMENTS = (
     virtual_randomness,
     sorted_listings,
     numbered_texts,
+    watched_hashes,
+    ordered_sets,
     own_process_ids,
     watched_calls,
     same_processors,

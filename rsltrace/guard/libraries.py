@@ -1,19 +1,24 @@
 """Which installed packages are libraries, and which are the user's own, installed or not.
 
 Where a package lies does not tell: a colcon workspace and pip put the user's packages into a
-``site-packages`` folder, among all others. So libraries are known by name: ROS's own, and those
-that many programs use and that are large. Whatever else is installed is taken for the user's.
-Installed is what lies in such a folder, or in one of the import path that holds what pip writes of
-its packages (``pip install --target``).
+``site-packages`` folder, among all others. How it came there does: a library comes as a wheel, of
+which pip keeps a list (``RECORD``). The user's come from a folder of sources (``direct_url.json``),
+from colcon, which leaves no such list, or as a wheel of a package of ROS (``package.xml``) that is
+not ROS's own. Installed is what lies in such a folder, or in one of the import path that holds what
+pip writes of its packages (``pip install --target``).
 """
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import lru_cache
+
+from rsltrace.guard.engagement import engage
 
 _SITES = (f"{os.sep}site-packages{os.sep}", f"{os.sep}dist-packages{os.sep}")
 
@@ -35,60 +40,24 @@ TARGETS = tuple(_targets())
 """Such folders as the process began with: ``PYTHONPATH``, mostly."""
 INSTALLED = (*_SITES, *TARGETS)
 """A path that has one of these in it is of an installed package, be it a library's or not."""
-_ROS = f"{os.sep}opt{os.sep}ros{os.sep}"
+_OTHERS = (f"{os.sep}opt{os.sep}ros{os.sep}", "/usr/lib/python3/dist-packages/")
+"""Folders of the system's package manager, which installs no packages of the user's."""
 _INTERFACES = frozenset(("msg", "srv", "action"))
+_DISTRIBUTION = ".dist-info"
+_PACKAGE_OF_ROS = re.compile(rb"share/ament_index/resource_index/packages/([^,/\n]+)")
 
-_OF_ROS = (
-    "ament_",
-    "fastcdr",
-    "fastrtps",
-    "launch",
-    "rcl",
-    "rcutils",
-    "rmw",
-    "ros2",
-    "ros_wheels",
-    "rosbag2_",
-    "rosidl",
-    "rpyutils",
-    "rqt",
-)
-_KNOWN = frozenset(
+_BUILT_FROM_SOURCES = frozenset(
     """
-    absl accelerate aiofiles aiohappyeyeballs aiohttp aiosignal altair annotated_types anyio
-    apsw argcomplete arrow asgiref ast_serialize astropy asttokens attr attrs autobahn av babel
-    backports bleak bokeh boto3 botocore bs4 casadi certifi cffi chardet charset_normalizer
-    click cloudpickle colorama colorlog contourpy coverage cryptography cv2 cvxopt cvxpy cycler
-    dash dask dateutil debugpy decorator deepdiff dill distributed distro distutils django
-    docutils dotenv duckdb ecos evdev exceptiongroup execnet fast_sugiyama fastapi ffmpeg
-    filelock filterpy flask flatbuffers fontTools freezegun frozenlist fsspec gevent git google
-    greenlet grimp grpc gtsam gym gymnasium h11 h5py httpcore httpx huggingface_hub humanize
-    hypothesis idna imageio importlib_metadata importlib_resources iniconfig ipykernel IPython
-    isympy jax jaxlib jedi jinja2 joblib jsonpickle jsonschema jsonschema_specifications keras
-    keyboard kiwisolver lark librosa librt lightning linkify_it llvmlite loguru lxml lz4
-    markdown markdown_it markupsafe matplotlib mcap mcap_ros2 mdit_py_plugins mdurl meshcat
-    meshio mock more_itertools mpl_toolkits mpmath msgpack mujoco multidict multiprocess mypy
-    mypy_extensions mypyc netifaces networkx nltk nose notebook numba numexpr numpy onnx
-    onnxruntime open3d openai OpenGL OpenSSL opentelemetry orjson osqp outcome packaging paho
-    pandas paramiko parso patsy pexpect pickleshare PIL pinocchio pip pkg_resources platformdirs
-    plotly pluggy polars prompt_toolkit propcache proto psutil psycopg2 ptyprocess pure_eval py
-    pyarrow pyasn1 pybullet pycparser pydantic pydantic_core pydantic_settings pygame pyglet
-    pygments pylab pymavlink pynput pyparsing pyperf PyQt5 PyQt6 pyrealsense2 PySide2 PySide6
-    pytest pytest_asyncio pytest_cov pytest_mock pytest_timeout pytz pyudev pyvista qpsolvers
-    quaternion redis referencing regex requests rerun rerun_bindings rerun_cli rich rosbags rpds
-    ruamel ruff safetensors scipy scs seaborn serial setuptools shapely shellingham six skimage
-    sklearn smbus sniffio socketio sortedcontainers sounddevice soupsieve sqlalchemy sqlite3
-    stack_data starlette statsmodels sympy tabulate tenacity tensorboard tensorflow termcolor
-    textual textual_serve threadpoolctl tokenizers toml tomli toolz torch torchaudio torchvision
-    tornado tqdm traitlets transformers transforms3d trimesh trio triton trustme twisted
-    typeguard typer typing_extensions typing_inspection tzdata tzlocal ujson ultralytics urllib3
-    usb uvicorn uvloop virtualenv wcwidth websocket websockets werkzeug wheel wrapt xdist Xlib
-    xxhash yaml yarl zipp zmq zope zstandard
-    cv_bridge image_geometry laser_geometry message_filters osrf_pycommon python_qt_binding
-    sensor_msgs_py sros2 tf2_geometry_msgs tf2_kdl tf2_py tf2_ros tf2_sensor_msgs
-    tf_transformations urdf_parser_py
+    ament_index_python cv_bridge image_geometry laser_geometry launch launch_pytest launch_ros
+    launch_testing launch_testing_ros launch_xml launch_yaml message_filters osrf_pycommon
+    python_qt_binding rclpy ros2bag ros2cli ros2component ros2interface ros2launch ros2lifecycle
+    ros2node ros2param ros2pkg ros2run ros2service ros2topic rosbag2_py rosidl_adapter rosidl_cli
+    rosidl_generator_c rosidl_generator_cpp rosidl_generator_py rosidl_parser rosidl_pycommon
+    rosidl_runtime_py rpyutils rqt_gui rqt_gui_py rqt_py_common sensor_msgs_py sros2
+    tf2_geometry_msgs tf2_kdl tf2_py tf2_ros tf2_sensor_msgs tf_transformations urdf_parser_py
     """.split()
 )
+"""Of ROS itself: who builds it from its sources has it in a workspace like packages of his own."""
 
 
 def is_library(file: str) -> bool:
@@ -96,21 +65,84 @@ def is_library(file: str) -> bool:
     for installed in INSTALLED:
         place = file.rfind(installed)
         if place >= 0:
-            parts = file[place + len(installed) :].split(os.sep, 2)
+            end = place + len(installed)
+            parts = file[end:].split(os.sep, 2)
             return (
-                _is_known(parts[0])
-                or file.startswith(_ROS)
+                file.startswith(_OTHERS)
                 or (len(parts) == 3 and parts[1] in _INTERFACES)
+                or _is_library(file[:end], parts[0].partition(".")[0])
             )
     return False
 
 
 @lru_cache(maxsize=4096)
-def _is_known(name: str) -> bool:
-    name = name.partition(".")[0].lstrip("_")
-    return (
-        name in _KNOWN or name.startswith(_OF_ROS) or name.startswith(("distutils", "hypothesis"))
-    )
+def _is_library(folder: str, name: str) -> bool:
+    """Return whether what lies by that name in a folder is a library."""
+    if name in _BUILT_FROM_SOURCES:
+        return True
+    with engage(None):
+        owners = _owners(folder, name)
+        return bool(owners) and not any(
+            _is_from_folder(path) or _is_of_workspace(path, record) for path, record in owners
+        )
+
+
+def _owners(folder: str, name: str) -> list[tuple[str, bytes]]:
+    """Return the distributions that have installed what lies by a name in a folder, each with its
+    list of files. Those of the same name are looked at first, then those of one like it."""
+    every = _distributions(folder)
+    alike = name.lower().lstrip("_")
+    named = [every[one] for one in (alike, f"ros_{alike}") if one in every]
+    similar = [path for one, path in every.items() if alike in one]
+    for some in (named, similar, every.values()):
+        owners = list(_having(name, some))
+        if owners:
+            return owners
+    return []
+
+
+@lru_cache(maxsize=64)
+def _distributions(folder: str) -> dict[str, str]:
+    """Return where a folder has what pip writes of its distributions, by their names."""
+    with suppress(OSError):
+        names = [name for name in os.listdir(folder) if name.endswith(_DISTRIBUTION)]
+        return {_name_of(name): os.path.join(folder, name) for name in names}
+    return {}
+
+
+def _having(name: str, distributions: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    marks = tuple(b"\n" + os.fsencode(name) + after for after in (b"/", b"."))
+    for path in distributions:
+        record = b"\n" + _content(path, "RECORD")
+        if any(mark in record for mark in marks):
+            yield path, record
+
+
+def _name_of(distribution: str) -> str:
+    return distribution.partition("-")[0].lower().replace("-", "_").replace(".", "_")
+
+
+def _content(path: str, name: str) -> bytes:
+    with suppress(OSError), open(os.path.join(path, name), "rb") as file:
+        return file.read()
+    return b""
+
+
+def _is_from_folder(path: str) -> bool:
+    """Whether a distribution was installed from a folder of sources. (conda says so of all.)"""
+    if _content(path, "INSTALLER").strip() == b"conda":
+        return False
+    with suppress(ValueError):
+        return "dir_info" in json.loads(_content(path, "direct_url.json") or b"{}")
+    return False
+
+
+def _is_of_workspace(path: str, record: bytes) -> bool:
+    """Whether a distribution is a package of ROS; ROS's own are named ``ros-PACKAGE``."""
+    own = _name_of(os.path.basename(path)).removeprefix("ros_")
+    packages = {os.fsdecode(found) for found in _PACKAGE_OF_ROS.findall(record)}
+    is_own = packages == {own} and _name_of(os.path.basename(path)) != own
+    return bool(packages) and not is_own
 
 
 __all__ = ["INSTALLED", "TARGETS", "is_library"]

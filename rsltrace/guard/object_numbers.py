@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import enum
 import itertools
+import re
+import sys
 import types
 import weakref
 from collections import Counter
@@ -27,6 +29,10 @@ _PARTS_MAX = 500
 _CHARACTERS_MAX = 1000
 _ARRAY_BYTES_MAX = 1 << 16
 _PLAIN = (str, bytes, int, float, bool, complex, type(None))
+_GENERIC = (types.GenericAlias, types.UnionType)
+_FRAMES = {types.GeneratorType: "gi_frame", types.CoroutineType: "cr_frame"}
+"""What is under way, and where it keeps its variables."""
+_BUILT_IN = (types.BuiltinMethodType, types.MethodWrapperType)
 _address = object.__hash__  # as id(), but no audit hook is told of it
 
 
@@ -58,9 +64,13 @@ class ObjectNumbers:
 
     def _number(self, thing: Any) -> int | None:
         kept = self._kept.get(_address(thing))
+        if kept is None and isinstance(thing, weakref.ref):
+            thing = thing()
+            kept = self._kept.get(_address(thing))
         return kept[1] if kept is not None and kept[0]() is thing else None
 
     def _keep(self, thing: Any) -> None:
+        thing = _meant(thing)
         if isinstance(thing, (*_PLAIN, types.MethodType)):
             return
         key, kept = _address(thing), self._kept
@@ -74,13 +84,14 @@ class ObjectNumbers:
         except TypeError:
             pass  # it takes no weak reference, so it is looked at each time
 
-    def _text_of(self, thing: Any) -> str:
+    def _text_of(self, thing: Any, depth: int = 0) -> str:
         parts: list[str] = []
-        self._describe(thing, parts, 0)
+        self._describe(thing, parts, depth)
         return ",".join(parts)
 
     def _describe(self, thing: Any, parts: list[str], depth: int) -> None:
         """Write down what tells an object apart, without asking its own code."""
+        thing = _meant(thing)
         kind = type(thing)
         if len(parts) >= _PARTS_MAX:
             return
@@ -91,6 +102,19 @@ class ObjectNumbers:
                 parts.append(str(len(thing)))
         elif kind is types.MethodType:
             parts.append(f"method {thing.__func__.__qualname__}")
+            self._describe(thing.__self__, parts, depth + 1)
+        elif kind in _GENERIC:
+            parts.append(kind.__name__)
+            self._describe([getattr(thing, "__origin__", None), thing.__args__], parts, depth + 1)
+        elif kind in _FRAMES:
+            frame = getattr(thing, _FRAMES[kind])
+            held = {} if frame is None else dict(frame.f_locals)
+            self._describe([thing.__qualname__, held], parts, depth + 1)
+        elif _is_task(kind):
+            padded = re.sub(r"[0-9]+", lambda number: number[0].zfill(12), thing.get_name())
+            parts.append(f"task {padded}")  # they are counted when they are made
+        elif kind in _BUILT_IN and not isinstance(thing.__self__, types.ModuleType):
+            parts.append(f"{kind.__name__} {thing.__name__}")
             self._describe(thing.__self__, parts, depth + 1)
         elif isinstance(thing, (type, types.FunctionType, types.BuiltinFunctionType)):
             line = thing.__code__.co_firstlineno if isinstance(thing, types.FunctionType) else 0
@@ -115,7 +139,11 @@ class ObjectNumbers:
             return
         if kind is partial:
             thing, kind = [thing.func, thing.args, thing.keywords], list
-        if kind in (list, tuple):
+        if isinstance(thing, (set, frozenset)):
+            parts.append(str(len(thing)))
+            parts.extend(sorted(self._text_of(one, depth + 1) for one in thing))
+            return
+        if isinstance(thing, (list, tuple)):
             parts.append(str(len(thing)))
             held: Iterable[tuple[Any, Any]] = enumerate(thing)
         elif isinstance(thing, Mapping) and kind in (dict, types.MappingProxyType):
@@ -159,6 +187,16 @@ class ShownNumbers:
                 return None
             kept[key] = (lambda: thing), number
         return number
+
+
+def _meant(thing: Any) -> Any:
+    """Return what a weak reference refers to, whose hash it has; another object is itself."""
+    return thing() if isinstance(thing, weakref.ref) else thing
+
+
+def _is_task(kind: type) -> bool:
+    asyncio = sys.modules.get("asyncio")
+    return asyncio is not None and issubclass(kind, asyncio.Task)
 
 
 def _bound_in(function: types.FunctionType) -> list[Any]:

@@ -29,6 +29,21 @@ class N(Node):
 """
 
 
+def list_as_wheel(site: Path, name: str, distribution: str = "", **more: str) -> None:
+    """Write beside a module or package what pip writes of one that came as a wheel.
+
+    ``more`` has the texts of further files (``direct_url``), and lines for the list of files
+    (``record``).
+    """
+    info = site / f"{distribution or name}-1.0.dist-info"
+    info.mkdir(parents=True)
+    file = f"{name}.py" if (site / f"{name}.py").exists() else f"{name}/__init__.py"
+    (info / "RECORD").write_text(f"{info.name}/INSTALLER,,\n{file},,\n{more.pop('record', '')}")
+    (info / "INSTALLER").write_text(more.pop("installer", "pip") + "\n")
+    for kind, text in more.items():
+        (info / f"{kind}.json").write_text(text)
+
+
 def node_code(tick: str, *, imports: str = "", module: str = "", init: str = "pass") -> str:
     """Return a module with a node that runs ``tick`` twice a second."""
 

@@ -15,9 +15,9 @@ import pytest
 
 import rsltrace.guard.virtual.original_code as original_code
 from rsltrace.doors.rclpy.hints import hint_for
-from rsltrace.guard.virtual.set_order import rewritten
+from rsltrace.guard.virtual.user_modules import rewritten
 from rsltrace.model.finding import Source
-from tests.guard.conftest import node_code
+from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
 
@@ -51,7 +51,7 @@ def total(pairs):
     return sum(a * b for a, b in {{*pairs}})
 def nested(x):
     a, b = x, x
-    return [max(n, a) for n in {{1, b}}]
+    return [max(n, a) for n in {{1, b}}] if x.__hash__() else 0
 code = "import pickle, sys; print([f(9) if f.__name__ == 'nested' else f([(2, 3)])"
 code += " for f in pickle.loads(sys.stdin.buffer.read())])"
 functions = {library}.dumps([total, nested]{more})
@@ -118,7 +118,7 @@ def test_numba_compiles_what_was_written(tmp_path: Path) -> None:
 
 def test_an_error_in_compiled_code_names_the_switch(tmp_path: Path) -> None:
     names: dict[str, Any] = {}
-    exec(rewritten(b"def f(s):\n    return [x for x in s]\n", str(tmp_path / "m.py")), names)
+    exec(rewritten(b"def f(s):\n    return s.__hash__()\n", str(tmp_path / "m.py")), names)
     with pytest.raises(NameError, match="__rsltrace_") as failed:
         FunctionType(names["f"].__code__, {"__builtins__": {}})([1])
     assert "guard: {order: allow}" in hint_for(failed.value)
@@ -128,12 +128,12 @@ def test_an_error_in_compiled_code_names_the_switch(tmp_path: Path) -> None:
 
 
 def test_allowed_order_leaves_the_code_as_it_is(said: Callable[..., Any]) -> None:
-    code = node_code("for _ in set(): pass\nself.say(N.tick.__code__.co_names)")
+    code = node_code("f'{self.__hash__}'\nself.say(N.tick.__code__.co_names)")
     job = "nodes: [{node: 'm:N'}]\n"
     (plain,) = said(code, job=job + "guard: {order: allow}")[0]
     (ours,) = said(code, job=job)[0]
     assert not [name for name in plain if "rsltrace" in name]
-    assert [name for name in ours if "rsltrace" in name] == ["__rsltrace_each__"]
+    assert [name for name in ours if "rsltrace" in name] == ["__rsltrace_hash__"]
 
 
 def test_variables_that_a_library_reads_are_told_as_one(
@@ -141,11 +141,12 @@ def test_variables_that_a_library_reads_are_told_as_one(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    site = tmp_path / "site-packages" / "loguru"  # by name, a library
+    site = tmp_path / "site-packages" / "loguru"
     site.mkdir(parents=True)
     (site / "__init__.py").write_text(
         "import os\ndef read():\n    return [os.environ.get(f'LIB_{n}') for n in range(30)]\n"
     )
+    list_as_wheel(site.parent, "loguru")
     monkeypatch.syspath_prepend(str(site.parent))
     (tmp_path / "m.py").write_text(
         node_code("import os, loguru\nloguru.read()\nos.environ.get('MINE')")

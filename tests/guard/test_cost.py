@@ -83,6 +83,4 @@ def test_a_callback_that_does_nothing_nasty_costs_nothing(tmp_path: Path) -> Non
         }
 
     assert more("events") == {}, "audit hooks are told of it"
-    # The example makes a text of a number in one of its callbacks, and numbers have no order.
-    assert set(more("calls")) <= {"set_order.py:shown"}
-    assert more("calls")["set_order.py:shown"] == 100, "the calls are counted"
+    assert more("calls") == {}

@@ -1,9 +1,10 @@
-"""The user's packages are the user's wherever they are installed; libraries are known by name."""
+"""The user's packages are the user's wherever they are installed; how they came there tells."""
 
 from __future__ import annotations
 
 import gc
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -15,7 +16,7 @@ import pytest
 from rsltrace.guard.callers import is_user_file
 from rsltrace.guard.object_numbers import ObjectNumbers
 from rsltrace.model.finding import Source
-from tests.guard.conftest import node_code
+from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
 
@@ -107,25 +108,93 @@ def test_a_package_with_a_finder_of_its_own(
     assert said_[0][0] == ["alpha", "bravo", "charlie", "delta", "echo"]
 
 
+_MARKER = "../../../share/ament_index/resource_index/packages/"
+_FOLDER = json.dumps({"url": "file:///home/me/src", "dir_info": {}})
+_ARCHIVE = json.dumps({"url": "file:///home/me/x.whl", "archive_info": {}})
+WAYS = {
+    "a wheel": ("numpydantic", {}, True),
+    "a wheel of another name": ("cv2", {"distribution": "opencv_python"}, True),
+    "a wheel that begins as ROS does": ("rclpy_utils", {}, True),
+    "a wheel of the user's own disk": ("helper", {"direct_url": _ARCHIVE}, True),
+    "a wheel of ROS": (
+        "tf2_web",
+        {"distribution": "ros_tf2_web", "record": f"{_MARKER}tf2_web,,\n"},
+        True,
+    ),
+    "conda": ("scikits", {"installer": "conda", "direct_url": _FOLDER}, True),
+    "a folder": ("my_robot", {"direct_url": _FOLDER}, False),
+    "a wheel of a package of ROS": (
+        "ros2_planner",
+        {"record": f"{_MARKER}ros2_planner,,\n"},
+        False,
+    ),
+    "of ROS by its name only": ("ros_arm", {"record": f"{_MARKER}ros_arm,,\n"}, False),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("site", ["venv/lib/python3.11/site-packages", "usr/local/dist-packages"])
+def test_how_a_package_was_installed_tells_whose_it_is(tmp_path: Path, way: str, site: str) -> None:
+    name, more, is_library = WAYS[way]
+    folder = tmp_path / site
+    (folder / name).mkdir(parents=True)
+    list_as_wheel(folder, name, **more)
+    list_as_wheel(folder, "another", "opencv")
+    assert is_user_file(str(folder / name / "node.py")) != is_library
+    assert is_user_file(str(folder / "another.py")) is False
+    assert is_user_file(str(folder / "unlisted" / "node.py"))
+
+
+@pytest.mark.parametrize("name", ["ros2_planner", "launch_robot", "rclpy_utils", "rqt_mine"])
+def test_what_colcon_has_installed_is_the_users(name: str) -> None:
+    assert is_user_file(f"/ws/install/{name}/lib/python3.12/site-packages/{name}/node.py")
+
+
 def test_who_is_a_library() -> None:
     for file in (
         "/ws/install/my_robot/lib/python3.12/site-packages/my_robot/node.py",
-        "/usr/lib/python3/dist-packages/helper.py",
-        "/venv/lib/python3.11/site-packages/numpydantic/x.py",
         "/home/me/src/my_robot/node.py",
     ):
         assert is_user_file(file), file
     for file in (
         "/opt/ros/jazzy/lib/python3.12/site-packages/anything/x.py",
-        "/venv/lib/python3.11/site-packages/numpy/core/x.py",
-        "/venv/lib/python3.11/site-packages/_pytest/main.py",
-        "/venv/lib/python3.11/site-packages/rosidl_parser/x.py",
+        "/usr/lib/python3/dist-packages/helper.py",
+        "/ros/install/rosidl_parser/lib/python3.12/site-packages/rosidl_parser/x.py",
         "/ws/install/my_msgs/lib/python3.12/site-packages/my_msgs/msg/_thing.py",
-        "/venv/lib/python3.11/site-packages/threadpoolctl.py",
         sys.modules["json"].__file__,
+        *(sys.modules[name].__file__ for name in ("numpy", "_pytest", "yaml", "rclpy", "click")),
     ):
         assert file is not None
         assert not is_user_file(file), file
+
+
+def test_packages_that_pip_has_installed(tmp_path: Path) -> None:
+    """A wheel in a folder (``--target``), the sources in another, and an editable package."""
+    pytest.importorskip("setuptools", minversion="71", reason="needs setuptools")
+    source = tmp_path / "source"
+    (source / "planner_of_mine").mkdir(parents=True)
+    (source / "planner_of_mine" / "__init__.py").write_text("")
+    (source / "pyproject.toml").write_text(
+        '[project]\nname = "planner-of-mine"\nversion = "1.0"\n'
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+    )
+    pip = [sys.executable, "-m", "pip", "-q", "--disable-pip-version-check"]
+    no_index = ["--no-build-isolation", "--no-deps", "--no-index"]
+    wheels = tmp_path / "wheels"
+    subprocess.run([*pip, "wheel", *no_index, "-w", wheels, source], check=True, timeout=300)
+    (wheel,) = wheels.glob("*.whl")
+    for what, is_users in (([wheel], False), ([source], True), (["-e", source], True)):
+        target = tmp_path / ("site-packages" + str(len(what)) + str(is_users)) / "site-packages"
+        subprocess.run(
+            [*pip, "install", *no_index, "--target", target, *what], check=True, timeout=300
+        )
+        probe = f"import sys; sys.path.insert(0, {str(target)!r}); import site\n"
+        probe += f"site.addsitedir({str(target)!r})\nimport planner_of_mine as p\n"
+        probe += "from rsltrace.guard.callers import is_user_file\nprint(is_user_file(p.__file__))"
+        done = subprocess.run(
+            [sys.executable, "-c", probe], capture_output=True, text=True, check=True, timeout=300
+        )
+        assert done.stdout.strip() == str(is_users), what
 
 
 def method_of(name: str) -> Callable[[], str]:
@@ -208,8 +277,6 @@ def test_order():
 def test_modules_that_pytest_compiles(
     tmp_path: Path, capfd: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    import subprocess
-
     (tmp_path / "test_things.py").write_text(TESTS)
     words = "[-q, -s, -p, 'no:cacheprovider', --rootdir=., test_things.py]"
     (tmp_path / "job.yaml").write_text(

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from rsltrace.model.finding import Source
-from tests.guard.conftest import node_code
+from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
 
@@ -113,10 +113,11 @@ def test_a_folder_that_pip_installed_into_is_of_libraries(tmp_path: Path) -> Non
     from rsltrace.trace.reader import Trace
 
     libs = tmp_path / "libs"
-    (libs / "lib_in_target-1.0.dist-info").mkdir(parents=True)
+    libs.mkdir()
     cache = tmp_path / "cache"
     code = _LIBRARY.format(cache=str(cache), join="pass")
     (libs / "lib_in_target.py").write_text(code + "os.path.realpath(__file__)\n")
+    list_as_wheel(libs, "lib_in_target")
     (tmp_path / "m.py").write_text(node_code(_TICK.format(name="lib_in_target")))
     (tmp_path / "job.yaml").write_text("nodes: [{node: 'm:N'}]\nstop: {duration: 1.2s}\n")
     digests = []

@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from rsltrace.guard.virtual.set_order import rewritten
+from rsltrace.guard.virtual import user_modules
+from rsltrace.guard.virtual.user_modules import rewritten
 from tests.guard.conftest import node_code
 
 pytestmark = pytest.mark.ros
@@ -97,9 +98,7 @@ out = (B().take(), A().more(1, b=2), e(), list(g()), m, A.__doc__, dict(a=1), su
     plain: dict[str, Any] = {}
     exec(compile(source, "x.py", "exec"), plain)
     other: dict[str, Any] = {}
-    import rsltrace.guard.virtual.set_order as ordering
-
-    with ordering.ordered_sets(frozenset(), {}):
+    with user_modules.user_modules(frozenset(), {}):
         exec(rewritten(source.encode(), "x.py"), other)
     assert other["out"] == plain["out"]
 

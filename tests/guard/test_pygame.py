@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.guard.conftest import node_code
+from tests.guard.conftest import list_as_wheel, node_code
 
 pytestmark = pytest.mark.ros
 
@@ -65,6 +65,7 @@ def test_a_game_loop_takes_simulated_time(
         package.mkdir(parents=True)
         (package / "__init__.py").write_text("from pygame import time\n")
         (package / "time.py").write_text(STAND_IN)
+        list_as_wheel(package.parent, "pygame")
         monkeypatch.syspath_prepend(str(package.parent))
     code = node_code("self.ticked += 1", init="self.ticked = 0") + GAME
     first, second = said(code, job="nodes: [{main: 'm:main'}]")

@@ -15,6 +15,7 @@ import pytest
 from rsltrace.guard.watched.functions import watched_calls
 from rsltrace.job import Job, NodeSpec
 from rsltrace.run.process import search_path
+from tests.guard.conftest import list_as_wheel
 
 pytestmark = pytest.mark.ros
 
@@ -54,7 +55,7 @@ class Reader(Node):
 """
 
 LIBRARY_NAME = "toolz"
-"""Of a library by its name (``rsltrace.guard.libraries``); this one only draws when imported."""
+"""Of a library, of which this is another: it only draws when imported."""
 LIBRARY = """
 import os, random, secrets, time
 DRAWN = (os.urandom(8), random.random(), random.Random().random(), secrets.token_hex(), time.time())
@@ -99,6 +100,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[dict[st
     installed = folder / "lib" / "site-packages"
     installed.mkdir(parents=True)
     (installed / f"{LIBRARY_NAME}.py").write_text(LIBRARY)
+    list_as_wheel(installed, LIBRARY_NAME)
     (folder / "cold.py").write_text(NODE)
     for name, nodes in JOBS.items():
         job = {"nodes": nodes, "stop": {"duration": "0.35s"}, "guard": {"pin": False}}
@@ -222,7 +224,8 @@ from rsltrace import Trace, load_job, record
 
 record(load_job(sys.argv[1]), sys.argv[2])
 ours = sys.modules["rsltrace.middleware.events.dispatcher"]  # was loaded in the run, and stays
-assert type(ours.__loader__).__module__ != "rsltrace.guard.virtual.set_order", "it is not user code"
+loader = type(ours.__loader__).__module__
+assert loader != "rsltrace.guard.virtual.user_modules", "it is not user code"
 with Trace.open(sys.argv[2]) as trace:
     assert list(trace.metadata("rsltrace:sources")) == ["cold"], trace.metadata("rsltrace:sources")
 """

@@ -24,6 +24,7 @@ from rclpy.node import Node
 import rsltrace
 from rsltrace.loop.stop import Stop
 from rsltrace.run import Observer, run, watchdog
+from tests.guard.conftest import list_as_wheel
 
 pytestmark = pytest.mark.ros
 
@@ -136,6 +137,8 @@ def test_the_import_of_a_library_may_take_its_time(
     folder = tmp_path / ("src" if name == "my_own_package" else "site-packages")
     folder.mkdir()
     (folder / f"{name}.py").write_text(LIBRARY)
+    if folder.name == "site-packages":
+        list_as_wheel(folder, name)
     monkeypatch.syspath_prepend(str(folder))
     here = ModuleType("looks_of_this_test")
     here.looks = busy  # type: ignore[attr-defined]

@@ -37,8 +37,8 @@ _STANDS_STILL = (
 _INITIALIZED = "Context.init() must only be called once"
 
 _COMPILED = (
-    "\n  The guard has compiled this code so that it goes through sets in order; "
-    "to run it as it is, write 'guard: {order: allow}' in the job"
+    "\n  The guard goes through sets in an order of its own; "
+    "to leave them as they are, write 'guard: {order: allow}' in the job"
 )
 
 _NAMED_LIKE_ONE = re.compile(r"_(msgs|interfaces|srvs|services|actions)$")

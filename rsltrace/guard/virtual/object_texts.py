@@ -14,27 +14,15 @@ from contextlib import ExitStack, contextmanager
 from types import AsyncGeneratorType, CoroutineType, FunctionType, GeneratorType
 from typing import Any
 
-from rsltrace.guard.extension_types import exchange
+from rsltrace.guard.extension_types import exchange_special
 from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import Guard, engage, engaged
 from rsltrace.model.finding import Mode, Source
 
-_WORDS_BEFORE_REPR = 11
-_REPR_AT = _WORDS_BEFORE_REPR * ctypes.sizeof(ctypes.c_void_p)
-"""Where a type of CPython keeps the function that makes its text, at least since 3.8; checked."""
 _as_method = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.py_object)(
     ("PyInstanceMethod_New", ctypes.pythonapi)
 )
 _SHOWN_ALIKE = (FunctionType, GeneratorType, CoroutineType, AsyncGeneratorType)
-
-
-class _HasNone:
-    pass
-
-
-class _HasOne:
-    def __repr__(self) -> str:
-        return ""
 
 
 def _numbered(real: Callable[[Any], str]) -> Callable[[Any], str]:
@@ -69,34 +57,9 @@ def _shown(guard: Guard, thing: Any) -> str | None:
 def numbered_texts() -> Iterator[None]:
     """Exchange what makes texts with addresses; which guard numbers is asked at each call."""
     with ExitStack() as stack:
-        slots = {kind: _slot(kind).value for kind in (object, *_SHOWN_ALIKE)}
-        by_name = _slot(_HasOne).value
-        if slots[object] == _slot(_HasNone).value != by_name != _slot(int).value:
-            for kind, slot in slots.items():
-                exchange(stack, kind, "__repr__", _numbered)
-                for one in _all_below(kind):
-                    if _slot(one).value == slot:
-                        stack.callback(_set_slot, one, slot)
-                        _set_slot(one, by_name)
+        for kind in (object, *_SHOWN_ALIKE):
+            exchange_special(stack, kind, "__repr__", _numbered)
         yield
-
-
-def _slot(kind: type) -> ctypes.c_void_p:
-    return ctypes.c_void_p.from_address(id(kind) + _REPR_AT)
-
-
-def _set_slot(kind: type, value: int | None) -> None:
-    _slot(kind).value = value
-
-
-def _all_below(kind: type) -> set[type]:
-    """Return a type with all that are derived from it."""
-    found, waiting = {kind}, [kind]
-    while waiting:
-        new: set[type] = set(type.__subclasses__(waiting.pop())) - found
-        found |= new
-        waiting += new
-    return found
 
 
 __all__ = ["numbered_texts"]

@@ -1,4 +1,4 @@
-"""Gives code that was compiled with sets in order as it would be without, to those who read code.
+"""Gives code that was compiled with calls of ours as it would be without, to those who read code.
 
 numba compiles the instructions of a function, dill and cloudpickle send them to other processes:
 none of them can do with calls of ours. Whoever reads the source file sees the original anyway.
@@ -22,7 +22,7 @@ _SETS = frozenset(("set", "frozenset"))
 
 
 def keep_source(path: str, source: bytes) -> None:
-    """Remember the source of a module whose sets are put in order."""
+    """Remember the source of a module of user code."""
     _sources[path] = source
 
 
@@ -58,8 +58,9 @@ def _original_for_numba(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
                 original = original_of(code)
             if original is not code:
                 thing.__code__ = original
+            if code.co_filename in _sources:
                 _tell_of_sets(original)
-                return original
+            return original
         return code
 
     return get_code_object

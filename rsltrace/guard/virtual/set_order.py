@@ -1,157 +1,120 @@
-"""Sets in an order of their own: user modules ask here before they go through a set.
+"""Sets in an order of their own, whoever goes through them.
 
 A set of texts is in the order of their hashes, which differ from process to process; a set of
-objects in that of their addresses. Python offers no hook for that, so the modules of user code are
-compiled with one: wherever a loop, a comprehension or one of a few functions goes through a value,
-it is passed through ``ordered`` first. Line numbers stay.
+objects in that of their addresses. Whatever goes through a set, a loop as well as ``sorted``,
+``Counter`` or ``itertools.chain``, asks its type for an iterator. So the types are told for the
+time of a run to ask ``__iter__`` by name (as every class does that has one of its own), and find
+one of ours there. What walks the table of a set itself is told in the same way: ``pop``,
+``dict.fromkeys``, pickling, and, from Python 3.13 on, lists that are made of sets.
+
+Rejected: compiling user modules with a call of ours at each loop. A function that goes through a
+set in C, or in a library, was none the wiser.
 """
 
 from __future__ import annotations
 
-import ast
-import builtins
-import importlib.machinery
+import io
+import operator
+import pickle
+import reprlib
 import sys
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from types import CodeType, FrameType, ModuleType
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from itertools import chain
+from types import FrameType
 from typing import Any
 
 from rsltrace.guard import frames
 from rsltrace.guard.addresses import is_by_address
-from rsltrace.guard.callers import is_installed, is_own, is_user_file
-from rsltrace.guard.frames import caller
-from rsltrace.guard.guard import Guard, engaged
-from rsltrace.guard.libraries import is_library
-from rsltrace.guard.library_imports import importing
-from rsltrace.guard.virtual.clocks import numpy_now
-from rsltrace.guard.virtual.original_code import keep_source
+from rsltrace.guard.callers import KINDS, OURS
+from rsltrace.guard.extension_types import exchange, exchange_special
+from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.guard import Guard, engage, engaged
+from rsltrace.guard.redirect import redirect
 from rsltrace.model.finding import Mode, Source
 
 _ORDER, _ALLOW, _VIRTUAL = Source.ORDER, Mode.ALLOW, Mode.VIRTUAL
-_ORDERED = "__rsltrace_ordered__"
-_EACH = "__rsltrace_each__"
-_SHOWN = "__rsltrace_shown__"
-_POP = "__rsltrace_pop__"
-_NOW = "__rsltrace_now__"
-_GOES_THROUGH = frozenset(
-    "list tuple sum iter enumerate map filter zip max min dict deque join fromkeys extend "
-    "fromiter".split()
-)
-_SHOWS = frozenset("str repr print format".split())
+_TYPES: tuple[type, ...] = (set, frozenset)
 _NUMBERS = frozenset((int, float, bool))
 """Their places in a set are the same in every process."""
 _TEXTS = frozenset((str,))
+_TUPLES = frozenset((tuple,))
 _PLAIN = (str, bytes, int, float, bool, type(None))
+_PICKLED_SETS = (pickle.EMPTY_SET, b"__builtin__\nset\n", b"builtins\nset\n")
+"""What stands for a set in what is pickled, by protocol; elsewhere it may mean anything."""
+LISTS_READ_SETS = sys.version_info >= (3, 13)
+"""Whether Python makes lists of sets without asking these for an iterator."""
+
+_through_set, _through_frozen = set.__iter__, frozenset.__iter__
+"""What goes through a set, and a frozen one, as Python does."""
 
 
-def ordered(thing: Any) -> Any:
-    """Return what stands for ``thing`` where its elements are asked for: a set in an order that
-    stays."""
-    kind = type(thing)
-    if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
-        return thing
-    if len(thing) < 2 or _NUMBERS.issuperset(map(type, thing)):
-        return thing
-    guard = engaged()
-    if guard is None:
-        return thing
-    in_order = _order(guard, thing, caller())
-    return thing if in_order is None else _Watched(thing, in_order)
+def _iterating(real: Callable[[Any], Iterator[Any]]) -> Callable[[Any], Iterator[Any]]:
+    def __iter__(self: Any, /) -> Iterator[Any]:  # noqa: N807
+        if len(self) > 1:
+            guard = engaged()
+            if guard is not None and not _NUMBERS.issuperset(map(type, real(self))):
+                try:
+                    frame = frames.next_caller()
+                except frames.INTERRUPTED:
+                    frame = frames.lost_caller()
+                in_order = _order(guard, self, frame)
+                if in_order is not None:
+                    return _through(self, in_order)
+        return real(self)
+
+    return __iter__
 
 
-def each(thing: Any) -> Any:
-    """Return what a loop over ``thing`` should go through, once: ``ordered`` for less."""
-    kind = type(thing)
-    if kind is not set and kind is not frozenset and kind is not weakref.WeakSet:
-        return thing
-    if len(thing) < 2 or _NUMBERS.issuperset(map(type, thing)):
-        return thing
-    guard = engaged()
-    if guard is None:
-        return thing
-    try:
-        frame = frames.next_caller()
-    except frames.INTERRUPTED:
-        frame = frames.lost_caller()
-    in_order = _order(guard, thing, frame)
-    return thing if in_order is None else _through(thing, in_order)
-
-
-def _order(guard: Guard, thing: Any, frame: FrameType) -> list[Any] | None:
+def _ordered(thing: Any) -> list[Any] | None:
     """Return the elements of a set in an order that stays, or None if they are left as they are."""
+    if len(thing) < 2 or _NUMBERS.issuperset(map(type, _plainly(thing))):
+        return None
+    guard = engaged()
+    return None if guard is None else _order(guard, thing, caller())
+
+
+def _plainly(thing: Any) -> Iterator[Any]:
+    """Go through a set as Python does."""
+    return _through_frozen(thing) if isinstance(thing, frozenset) else _through_set(thing)
+
+
+def _order(guard: Guard, thing: Any, frame: FrameType | None) -> list[Any] | None:
+    """Do ``_ordered`` for code of the user and what that calls: ``frame`` is where it is asked."""
+    if frame is None or KINDS[code_of(frame).co_filename] == OURS or guard.user_of(frame) is None:
+        return None
     mode = guard.mode(_ORDER, frame)
-    are_texts = _TEXTS.issuperset(map(type, thing))
-    if mode is _ALLOW or not (are_texts or any(map(_has_no_order, thing))):
+    if mode is _ALLOW:
+        return None
+    items = [*_plainly(thing)]
+    are_texts = _TEXTS.issuperset(map(type, items))
+    if not are_texts and (_are_tuples_of_numbers(items) or not any(map(_has_no_order, items))):
         return None
     if mode is _VIRTUAL:
-        in_order = sorted(thing) if are_texts else _in_order(guard, thing)
+        in_order = sorted(items) if are_texts else _in_order(guard, items)
         if in_order is not None:  # else: objects that nothing tells apart but their addresses
             guard.count(_ORDER, "order of a set", frame)
             return in_order
-    kinds = ", ".join(sorted({type(item).__qualname__ for item in thing}))
-    call = f"order of a {type(thing).__name__} of {kinds}"
-    guard.watched(_ORDER, call, f"{len(thing)} elements", frame)
+    kinds = ", ".join(sorted(dict.fromkeys(type(_meant(one)).__qualname__ for one in items)))
+    guard.watched(
+        _ORDER, f"order of a {type(thing).__name__} of {kinds}", f"{len(items)} elements", frame
+    )
     return None
 
 
-def _in_order(guard: Guard, thing: Any) -> list[Any] | None:
+def _are_tuples_of_numbers(items: list[Any]) -> bool:
+    return _TUPLES.issuperset(map(type, items)) and _NUMBERS.issuperset(
+        map(type, chain.from_iterable(items))
+    )
+
+
+def _in_order(guard: Guard, items: list[Any]) -> list[Any] | None:
     try:
-        return sorted(thing, key=_key)
+        return sorted(items, key=_key)
     except TypeError:
-        return guard.numbers.in_order(thing)
-
-
-def shown(thing: Any) -> Any:
-    """Return what a text of ``thing`` should be made of: a set's elements in order."""
-    if type(thing) is not set and type(thing) is not frozenset:
-        return thing
-    in_order = ordered(thing)
-    if not isinstance(in_order, _Watched):
-        return thing
-    inside = "{" + ", ".join(map(repr, in_order.items)) + "}"
-    return _Text(inside if type(thing) is set else f"frozenset({inside})")
-
-
-def pop(owner: Any, *arguments: Any) -> Any:
-    """Do ``owner.pop(...)``; of a set, take the first element in order."""
-    if type(owner) is set and not arguments:
-        in_order = ordered(owner)
-        if isinstance(in_order, _Watched):
-            first = in_order.items[0]
-            owner.remove(first)
-            return first
-    return owner.pop(*arguments)
-
-
-class _Text(str):
-    """A text that is its own ``repr``, as the text of a set is."""
-
-    def __repr__(self) -> str:
-        return str(self)
-
-
-def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
-    size = len(thing)
-    for item in in_order:
-        if len(thing) != size:
-            raise RuntimeError("Set changed size during iteration")
-        yield item
-
-
-class _Watched:
-    """The elements of a set in order; like a set, it notices when that changes on the way."""
-
-    def __init__(self, of: Any, items: list[Any]) -> None:
-        self.items = items
-        self._of = of
-
-    def __iter__(self) -> Iterator[Any]:
-        return _through(self._of, self.items)
-
-    def __len__(self) -> int:
-        return len(self.items)
+        with engage(None):
+            return guard.numbers.in_order(items)
 
 
 def _has_no_order(item: object) -> bool:
@@ -168,200 +131,118 @@ def _key(item: Any) -> tuple[str, Any]:
     raise TypeError
 
 
-# -- compiling user modules with the calls above -------------------------------------------------
+def _meant(item: Any) -> Any:
+    return item() if isinstance(item, weakref.ref) else item
 
 
-class _Rewriter(ast.NodeTransformer):
-    def _call(self, function: str, node: ast.expr, *more: ast.expr) -> ast.expr:
-        name = ast.Name(function, ast.Load())
-        call = ast.Call(name, [node, *more], [])
-        return ast.fix_missing_locations(ast.copy_location(call, node))
-
-    def visit_For(self, node: ast.For) -> ast.AST:
-        self.generic_visit(node)
-        if not _is_harmless(node.iter):
-            node.iter = self._call(_EACH, node.iter)
-        return node
-
-    def visit_comprehension(self, node: ast.comprehension) -> ast.AST:
-        self.generic_visit(node)
-        if not node.is_async and not _is_harmless(node.iter):
-            node.iter = self._call(_EACH, node.iter)
-        return node
-
-    def visit_Starred(self, node: ast.Starred) -> ast.AST:
-        self.generic_visit(node)
-        if isinstance(node.ctx, ast.Load):
-            node.value = self._call(_ORDERED, node.value)
-        return node
-
-    def visit_FormattedValue(self, node: ast.FormattedValue) -> ast.AST:
-        self.generic_visit(node)
-        node.value = self._call(_SHOWN, node.value)
-        return node
-
-    def visit_Assign(self, node: ast.Assign) -> ast.AST:
-        self.generic_visit(node)
-        if any(isinstance(target, (ast.Tuple, ast.List)) for target in node.targets):
-            node.value = self._call(_ORDERED, node.value)
-        return node
-
-    def visit_Call(self, node: ast.Call) -> ast.AST:
-        self.generic_visit(node)
-        function = node.func
-        name = getattr(function, "id", None) or getattr(function, "attr", None)
-        if isinstance(function, ast.Attribute) and name == "pop" and not node.keywords:
-            popped = ast.Call(ast.Name(_POP, ast.Load()), [function.value, *node.args], [])
-            return ast.fix_missing_locations(ast.copy_location(popped, node))
-        if name == "datetime64" and node.args and _says_now(node.args[0]):
-            node.args.insert(0, function)
-            node.func = ast.copy_location(ast.Name(_NOW, ast.Load()), function)
-            return ast.fix_missing_locations(node)
-        if name in _GOES_THROUGH or name in _SHOWS:
-            wrap = _ORDERED if name in _GOES_THROUGH else _SHOWN
-            node.args = [
-                a if isinstance(a, ast.Starred) or _is_harmless(a) else self._call(wrap, a)
-                for a in node.args
-            ]
-        return node
+def _through(thing: Any, in_order: list[Any]) -> Iterator[Any]:
+    """Go through elements in order; like a set, notice when it changes on the way."""
+    size = len(thing)
+    for item in in_order:
+        if len(thing) != size:
+            raise RuntimeError("Set changed size during iteration")
+        yield item
 
 
-def _says_now(node: ast.expr) -> bool:
-    return isinstance(node, ast.Constant) and node.value in ("now", "today")
+def _popping(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def pop(self: Any, /) -> Any:
+        in_order = _ordered(self)
+        if in_order is None:
+            return real(self)
+        self.remove(in_order[0])
+        return in_order[0]
+
+    return pop
 
 
-def _is_harmless(node: ast.expr) -> bool:
-    """Whether an expression cannot be a set, as far as one can see."""
-    if isinstance(node, (ast.Constant, ast.List, ast.Tuple, ast.Dict, ast.Lambda, ast.ListComp)):
-        return True
-    return isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("range", "sorted", "len")
+def _from_keys(real: Any) -> Any:
+    def fromkeys(cls: Any, iterable: Iterable[Any], value: Any = None, /) -> Any:
+        return real.__get__(None, cls)(ordered(iterable), value)
+
+    return classmethod(fromkeys)
 
 
-def order_sets(tree: ast.Module) -> None:
-    """Put sets in order wherever the code of a module goes through one."""
-    _Rewriter().visit(tree)
+def _dumping(real: Callable[..., bytes]) -> Callable[..., bytes]:
+    def dumps(obj: Any, *arguments: Any, **options: Any) -> bytes:
+        data = real(obj, *arguments, **options)
+        guard = engaged()
+        if guard is None or not any(mark in data for mark in _PICKLED_SETS):
+            return data
+        if guard.user_of(caller()) is None:
+            return data
+        file = io.BytesIO()
+        pickle._Pickler(file, *arguments, **options).dump(obj)
+        return file.getvalue()
+
+    return dumps
 
 
-def rewritten(source: bytes, path: str) -> CodeType:
-    """Return a module's code with sets in order."""
-    tree = ast.parse(source, path)
-    order_sets(tree)
-    keep_source(path, source)
-    code: CodeType = compile(tree, path, "exec", dont_inherit=True)
-    return code
+def _dumping_into(real: Callable[..., None]) -> Callable[..., None]:
+    def dump(obj: Any, file: Any, *arguments: Any, **options: Any) -> None:
+        if engaged() is None:
+            real(obj, file, *arguments, **options)
+        else:
+            file.write(pickle.dumps(obj, *arguments, **options))
+
+    return dump
 
 
-def code_of_script(source: bytes, path: str) -> CodeType:
-    """Return the code of a program that is not imported, with sets in order while a guard sees to
-    that.
-
-    :raises SyntaxError, ValueError: if it is not Python.
-    """
-    if any(type(finder) is _Finder and finder.orders for finder in sys.meta_path):
-        return rewritten(source, path)
-    code: CodeType = compile(source, path, "exec", dont_inherit=True)
-    return code
+def ordered(thing: Any) -> Any:
+    """Return what stands for ``thing`` for those who would go through a set without asking it."""
+    return [*iter(thing)] if type(thing) in _TYPES else thing
 
 
-class _Loader(importlib.machinery.SourceFileLoader):
-    """Loads a module of user code (``ordered``: with its sets in order) or of what is installed."""
-
-    def __init__(self, instead_of: Any, *, ordered: bool, library: bool) -> None:
-        super().__init__(instead_of.name, instead_of.path)
-        self._ordered = ordered
-        self._library = library
-
-    def get_code(self, fullname: str) -> CodeType | None:
-        if not self._ordered:
-            return super().get_code(fullname)
-        path = self.get_filename(fullname)
-        return rewritten(self.get_data(path), path)
-
-    def exec_module(self, module: ModuleType) -> None:
-        with importing(library=self._library):
-            super().exec_module(module)
+# -- from Python 3.13 on -------------------------------------------------------------------------
 
 
-class _Finder:
-    """Finds modules of user code, and those of libraries, which have their own import time."""
+def _making(real: Callable[..., Any]) -> Callable[..., Any]:
+    def make(*arguments: Any, **options: Any) -> Any:
+        return real(*map(ordered, arguments), **options)
 
-    def __init__(
-        self,
-        packages: frozenset[str],
-        on_loaded: Mapping[str, Callable[[], None]],
-        orders: bool,
-    ) -> None:
-        self._packages = packages
-        self._on_loaded = on_loaded
-        self.orders = orders
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Return a module's spec, with a loader of ours if it is not one of Python's or ROS's."""
-        if name in sys.builtin_module_names or is_own(name):
-            return None
-        spec = self._found_otherwise(name, path, target)
-        if spec is None or type(spec.loader) is not importlib.machinery.SourceFileLoader:
-            return None
-        file = spec.origin or ""
-        of_node = name.partition(".")[0] in self._packages
-        if of_node or is_user_file(file):
-            library = is_installed(file) and not of_node
-            spec.loader = _Loader(spec.loader, ordered=self.orders, library=library)
-        elif is_library(file):
-            spec.loader = _Loader(spec.loader, ordered=False, library=True)
-        if name in self._on_loaded:
-            _tell(spec.loader, self._on_loaded[name])
-        return spec
-
-    def _found_otherwise(
-        self, name: str, path: Sequence[str] | None, target: ModuleType | None
-    ) -> importlib.machinery.ModuleSpec | None:
-        """Ask those who would be asked without us: editable packages have finders of their own."""
-        for finder in sys.meta_path:
-            find_spec = getattr(finder, "find_spec", None)
-            if finder is not self and find_spec is not None:
-                spec: importlib.machinery.ModuleSpec | None = find_spec(name, path, target)
-                if spec is not None:
-                    return spec
-        return None
+    return make
 
 
-def _tell(loader: Any, on_loaded: Callable[[], None]) -> None:
-    """Have a loader say when it has loaded its module."""
-    real = loader.exec_module
+def _reducing(real: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    def __reduce__(self: Any, /) -> Any:  # noqa: N807
+        kind, elements, state = real(self)
+        in_order = _ordered(self)
+        return kind, elements if in_order is None else (in_order,), state
 
-    def exec_module(module: ModuleType) -> None:
-        real(module)
-        on_loaded()
+    return __reduce__
 
-    loader.exec_module = exec_module
+
+def _showing(real: Callable[[Any], str]) -> Callable[[Any], str]:
+    @reprlib.recursive_repr("set(...)")
+    def __repr__(self: Any, /) -> str:  # noqa: N807
+        in_order = _ordered(self)
+        if in_order is None:
+            return real(self)
+        inside = "{" + ", ".join(map(repr, in_order)) + "}"
+        return inside if type(self) is set else f"{type(self).__name__}({inside})"
+
+    return __repr__
 
 
 @contextmanager
-def ordered_sets(
-    packages: frozenset[str],
-    on_loaded: Mapping[str, Callable[[], None]],
-    *,
-    orders: bool = True,
-) -> Iterator[None]:
-    """Let user modules that are imported from now on go through sets in order, if ``orders``.
-
-    ``on_loaded`` has libraries, by name, and what to do as soon as they are loaded.
-    """
-    helpers: dict[str, Callable[..., Any]] = {
-        _ORDERED: ordered,
-        _EACH: each,
-        _SHOWN: shown,
-        _POP: pop,
-        _NOW: numpy_now,
-    }
-    finder = _Finder(packages, on_loaded, orders)
-    for name, function in helpers.items():
-        setattr(builtins, name, function)  # for good: modules may outlive the run
-    sys.meta_path.insert(0, finder)
-    try:
+def ordered_sets() -> Iterator[None]:
+    """Let sets be gone through in order; which guard wants it is asked at each."""
+    with ExitStack() as stack:
+        for kind in _TYPES:
+            exchange_special(stack, kind, "__iter__", _iterating)
+        exchange(stack, set, "pop", _popping)
+        exchange(stack, dict, "fromkeys", _from_keys)
+        redirect(stack, pickle.dumps, _dumping)
+        redirect(stack, pickle.dump, _dumping_into)
+        if LISTS_READ_SETS:
+            for function in (sorted, operator.iadd):
+                redirect(stack, function, _making)
+            exchange_special(stack, list, "__init__", _making)
+            for name in ("extend", "__iadd__"):
+                exchange(stack, list, name, _making)
+            for kind in _TYPES:
+                exchange_special(stack, kind, "__repr__", _showing)
+                exchange(stack, kind, "__reduce__", _reducing)
         yield
-    finally:
-        sys.meta_path.remove(finder)
+
+
+__all__ = ["LISTS_READ_SETS", "ordered", "ordered_sets"]

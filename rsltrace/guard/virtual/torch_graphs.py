@@ -9,8 +9,9 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from rsltrace.guard.virtual import set_order
 from rsltrace.guard.virtual.clocks import numpy_now
+from rsltrace.guard.virtual.object_hashes import hash_method
+from rsltrace.guard.virtual.set_order import ordered
 
 COMPILES = "torch._dynamo"
 """The module of torch that reads code."""
@@ -20,8 +21,8 @@ def _as_it_is(thing: Any) -> Any:
     return thing
 
 
-def _pop(owner: Any, *arguments: Any) -> Any:
-    return owner.pop(*arguments)
+def _hash_method(owner: Any) -> Any:
+    return owner.__hash__
 
 
 def _call(function: Any, text: str, *more: Any) -> Any:
@@ -29,10 +30,8 @@ def _call(function: Any, text: str, *more: Any) -> Any:
 
 
 _MEANT = {
-    set_order.ordered: _as_it_is,
-    set_order.each: _as_it_is,
-    set_order.shown: _as_it_is,
-    set_order.pop: _pop,
+    ordered: _as_it_is,
+    hash_method: _hash_method,
     numpy_now: _call,
 }
 _known: list[object] = []

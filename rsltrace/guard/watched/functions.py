@@ -18,9 +18,8 @@ from functools import partial
 from types import BuiltinFunctionType
 from typing import Any
 
-from rsltrace.guard.addresses import hashed_by_address, is_by_address
 from rsltrace.guard.asked_files import NOT_NEWS, asking_module, is_installed
-from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.frames import caller
 from rsltrace.guard.guard import engaged
 from rsltrace.guard.redirect import redirect
 from rsltrace.guard.watched.audit_hook import report_audit_events
@@ -104,24 +103,6 @@ _RECORDED: dict[str, Callable[[Any], Any]] = {
 """What makes of a recorded answer what the function gives."""
 
 
-def _hashing(real: Callable[[Any], int]) -> Any:
-    def hash_of(thing: Any, /) -> int:
-        value = real(thing)
-        if is_by_address(thing):
-            guard = engaged()
-            frame = caller()
-            if guard is None:
-                return value
-            if code_of(frame).co_name == "__hash__":
-                hashed_by_address(frame)  # matters where a set of such objects is gone through
-            elif guard.is_user(frame):
-                kind = type(thing).__qualname__
-                guard.watched(Source.ADDRESS, f"hash() of {kind}", value, frame)
-        return value
-
-    return hash_of
-
-
 def _watched_functions() -> Iterator[tuple[Source, str, Any]]:
     def builtin(module: Any, *names: str) -> Iterator[tuple[str, Any]]:
         for name in names:
@@ -166,6 +147,5 @@ def watched_calls() -> Iterator[None]:
         import sqlite3  # a node may import it at any time; then it must be watched already
 
         redirect(stack, sqlite3.connect, _connecting)
-        redirect(stack, hash, _hashing)
         stack.enter_context(environment_watched())
         yield

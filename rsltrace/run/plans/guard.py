@@ -20,12 +20,12 @@ from rsltrace.guard.pin import pinned_place
 from rsltrace.guard.virtual.clocks import opencv_clock
 from rsltrace.guard.virtual.original_code import READERS, show_original
 from rsltrace.guard.virtual.pygame_clock import pygame_clock
-from rsltrace.guard.virtual.pytest_modules import REWRITES, ordered_in_pytest
+from rsltrace.guard.virtual.pytest_modules import REWRITES, rewritten_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
-from rsltrace.guard.virtual.set_order import ordered_sets
 from rsltrace.guard.virtual.tbb_threads import one_tbb_thread
 from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
 from rsltrace.guard.virtual.torch_streams import torch_streams
+from rsltrace.guard.virtual.user_modules import user_modules
 from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
 from rsltrace.job import Job, NodeSpec, policy_of
 from rsltrace.model.finding import Finding, GuardCount, Mode, Source
@@ -176,12 +176,12 @@ def install_guard(stack: ExitStack, job: Job) -> RunGuard:
         }
         orders = _orders_sets(job)
         if orders:
-            at_once[REWRITES] = lambda: ordered_in_pytest(stack)
+            at_once[REWRITES] = lambda: rewritten_in_pytest(stack)
         for name, begin in at_once.items():
             if name in sys.modules:
                 begin()
         on_loaded = {"torch": made.torch_loaded, **at_once}
-        stack.enter_context(ordered_sets(packages_of(job.nodes), on_loaded, orders=orders))
+        stack.enter_context(user_modules(packages_of(job.nodes), on_loaded, rewrites=orders))
     return made
 
 

@@ -14,7 +14,7 @@ from types import CodeType
 
 from rsltrace.doors.rclpy.hints import cannot_import, import_raised
 from rsltrace.errors import JobError
-from rsltrace.guard.virtual.set_order import code_of_script
+from rsltrace.guard.virtual.user_modules import code_of_script
 from rsltrace.middleware.events.failure import text_of
 from rsltrace.model.regular_file import read_regular
 from rsltrace.run.process import run_as_main

@@ -1,0 +1,43 @@
+"""Which guard is in charge of the calling thread, if any."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from rsltrace.guard.redirect import copy_of
+
+thread_id = copy_of(threading.get_ident)  # type: ignore[arg-type]
+_engaged: list[Any] = []
+
+
+def engaged() -> Any:
+    """Return the guard in charge of the calling thread (and of no child process), or None."""
+    if _engaged:
+        guard = _engaged[-1]
+        if guard.thread == thread_id():
+            return guard
+    return None
+
+
+class engage:  # noqa: N801  (used like a function)
+    """Put ``guard`` in charge of what this thread does within (None: nobody)."""
+
+    __slots__ = ("_before", "_guard")
+
+    def __init__(self, guard: Any) -> None:
+        self._guard = guard
+        self._before: list[Any] = []
+
+    def __enter__(self) -> None:
+        if self._guard is None:
+            self._before = _engaged[:]
+            _engaged.clear()
+        else:
+            _engaged.append(self._guard)
+
+    def __exit__(self, *error: object) -> None:
+        if self._guard is None:
+            _engaged[:] = self._before
+        else:
+            _engaged.remove(self._guard)

@@ -1,0 +1,66 @@
+"""Hashes of objects that are made of their addresses: reported to who looks at one.
+
+That a set or a dictionary asks for them is nobody's business: neither shows them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from types import FrameType, MethodWrapperType
+from typing import Any
+
+from rsltrace.guard.addresses import hashed_by_address, is_by_address
+from rsltrace.guard.frames import caller, code_of
+from rsltrace.guard.guard import engaged
+from rsltrace.guard.redirect import redirect
+from rsltrace.model.finding import Source
+
+_of_object = object.__hash__
+
+
+def _seen(thing: object, value: int, frame: FrameType) -> int:
+    """Report a hash that code asked for, if addresses are in it."""
+    guard = engaged()
+    if guard is not None and is_by_address(thing):
+        if code_of(frame).co_name == "__hash__":
+            hashed_by_address(frame)  # matters where a set of such objects is gone through
+        elif guard.is_user(frame):
+            kind = type(thing).__qualname__
+            guard.watched(Source.ADDRESS, f"hash() of {kind}", value, frame)
+    return value
+
+
+def _hashing(real: Callable[[Any], int]) -> Any:
+    def hash_of(thing: Any, /) -> int:
+        return _seen(thing, real(thing), caller())
+
+    return hash_of
+
+
+def _objects_hash(thing: Any, /) -> int:
+    return _seen(thing, _of_object(thing), caller())
+
+
+def _bound_hash(real: Callable[[], int], /) -> int:
+    return _seen(real.__self__, real(), caller())  # type: ignore[attr-defined]
+
+
+def hash_method(owner: Any) -> Any:
+    """Return what ``owner.__hash__`` is, or what does the same and reports it."""
+    real = owner.__hash__
+    if real is _of_object:
+        return _objects_hash
+    return partial(_bound_hash, real) if type(real) is MethodWrapperType else real
+
+
+@contextmanager
+def watched_hashes() -> Iterator[None]:
+    """Report what the built-in ``hash`` gives."""
+    with ExitStack() as stack:
+        redirect(stack, hash, _hashing)
+        yield
+
+
+__all__ = ["hash_method", "watched_hashes"]
