@@ -9,8 +9,10 @@ import pytest
 from click.testing import CliRunner
 
 from rsltrace import Trace, load_job, record
+from rsltrace.bag.qos import parse_qos
 from rsltrace.cli.main import cli
 from rsltrace.errors import JobError
+from rsltrace.launch.values import yaml_value
 from tests.trace.make import write_run
 
 HARM = (
@@ -117,3 +119,27 @@ def test_a_jobs_own_checks_obey_the_same(folder: Path, harm: str) -> None:
         assert "job.yaml:4:12: never: " in said
     with pytest.raises(JobError):
         record(load_job("job.yaml"), folder / "x.mcap")
+
+
+@pytest.mark.parametrize(
+    "tag",
+    [
+        "!!python/object/apply:os.system ['touch PWNED']",
+        "!!python/object/new:pathlib.Path [PWNED]",
+        "!!python/name:os.system",
+        "!!python/module:antigravity",
+    ],
+)
+def test_tags_of_yaml_make_no_objects(folder: Path, tag: str) -> None:
+    """In metadata and QoS profiles of bags, parameter files, launch files, jobs."""
+    text = f"rosbag2_bagfile_information: {tag}\n"
+    assert yaml_value(text) == text
+    with pytest.raises(ValueError, match="not YAML"):
+        parse_qos(f"- history: {tag}\n")
+    bag = folder / "bag"
+    bag.mkdir()
+    (bag / "metadata.yaml").write_text(text)
+    (bag / "bag_0.mcap").write_bytes(b"")
+    (folder / "job.yaml").write_text(f"nodes: {tag}\n")
+    assert _harmless(folder, ["info", "bag"])[0] == 2
+    assert _harmless(folder, ["check", "job.yaml"])[0] != 0

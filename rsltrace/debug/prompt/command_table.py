@@ -190,7 +190,7 @@ def _node(shell: Prompt) -> str:
 
 @_add("print", "p", usage="EXPRESSION", topic="looking")
 def _print(shell: Prompt, rest: str) -> None:
-    """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now, event.
+    """Evaluate Python: attributes of this node, node("ekf"), fields of its message, msg, now.
 
     This is Python, methods of nodes included, in a copy of the run: whatever it does changes
     nothing here. Conditions (break, watch, when) have a language of their own, which only looks.
