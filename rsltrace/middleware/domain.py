@@ -20,7 +20,7 @@ from rsltrace.middleware.qos.policies import DEFAULT_QOS, Qos
 from rsltrace.middleware.services import Client, Service
 from rsltrace.middleware.subscription import Subscription
 from rsltrace.middleware.timer import Timer
-from rsltrace.middleware.transport import Transport, Watcher
+from rsltrace.middleware.transport import MessageFilter, Transport, Watcher
 
 
 class Domain:
@@ -43,6 +43,15 @@ class Domain:
         whole = self.transport.watch(topic, watcher)
         for publisher in self.graph.publishers(topic):
             publisher.watcher = whole
+
+    def filter(self, topic: str, function: MessageFilter | None) -> None:
+        """Let a function decide what is published on a topic, whoever publishes; None: none."""
+        filters = self.transport.filters
+        filters.pop(topic, None)
+        if function is not None:
+            filters[topic] = function
+        for publisher in self.graph.publishers(topic):
+            publisher.filter = function
 
     # -- participants without a client library ---------------------------------------------------
 

@@ -16,6 +16,7 @@ from rsltrace.middleware.subscription import Delivery, Subscription
 from rsltrace.middleware.transport import Transport
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import OutputKind
+from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 
 
@@ -23,7 +24,8 @@ class Publisher(DomainEntity):
     """Sends a topic.
 
     ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job
-    with delay models, and are None in others. ``watcher`` sees every message.
+    with delay models, and are None in others. ``filter`` decides what is sent of each message,
+    ``watcher`` sees what was.
     """
 
     kind = EntityKind.PUBLISHER
@@ -46,6 +48,7 @@ class Publisher(DomainEntity):
             self.links = []
         self._count = 0
         self._channel: int | None = None
+        self.filter = transport.filters.get(topic)
         self.watcher = transport.watchers.get(topic)
         self._history: deque[Delivery] | None = None
         if self.qos.durability is Durability.TRANSIENT_LOCAL:
@@ -58,6 +61,12 @@ class Publisher(DomainEntity):
 
     def send(self, data: bytes, content_hash: int | None = None) -> None:
         """Send canonical CDR bytes; ``content_hash`` if not all of them are content."""
+        if self.filter is not None:
+            filtered = self.filter(self, data)
+            if filtered is None:
+                return
+            if filtered is not data:
+                data, content_hash = filtered, self._content_hash(filtered)
         dispatcher = self.dispatcher
         loop = dispatcher.loop
         now_ns = loop.now_ns
@@ -99,6 +108,9 @@ class Publisher(DomainEntity):
             self._offers.sent()
         if self.watcher is not None:
             self.watcher(self, data)
+
+    def _content_hash(self, data: bytes) -> int:
+        return hash64(log_content(data) if self.output_kind == OutputKind.LOG else data)
 
     def _open_channel(self) -> int:
         self._channel = self._transport.channel(

@@ -13,6 +13,10 @@ from rsltrace.middleware.links import Network
 Watcher = Callable[[Any, bytes], None]
 """Is called with the publisher and the canonical bytes of each message on a topic."""
 
+MessageFilter = Callable[[Any, bytes], bytes | None]
+"""Is called with the publisher and the canonical bytes of a message that is about to be published,
+and returns those that are published in their place; None: the message is not published."""
+
 
 class Transport:
     """How what is sent gets to others. ``network`` is None in a run without models of links;
@@ -23,6 +27,7 @@ class Transport:
         self.network: Network | None = None
         self.faults: dict[str, TopicFaults] = {}
         self.watchers: dict[str, Watcher] = {}
+        self.filters: dict[str, MessageFilter] = {}
         self._channels: dict[tuple[str, str], int] = {}
 
     def watch(self, topic: str, watcher: Watcher) -> Watcher:

@@ -7,7 +7,7 @@ belongs to a context that is down can be destroyed, and hardly anything else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.doors.rclpy.handles.destroyable import Handle
@@ -66,10 +66,9 @@ class ContextHandle(Handle):
         for node in graph.nodes:
             if getattr(node, "context", None) is self:
                 for publisher in graph.publishers_of(node):
-                    publisher.publish = publisher.publish_raw = self._refuse  # type: ignore[attr-defined]
+                    publisher.refuse(self._refuse)  # type: ignore[attr-defined]
 
-    def _refuse(self, message: object) -> None:
-        """Stand in for the methods of publishers, so that no publication has to ask first."""
+    def _refuse(self, message: object) -> NoReturn:
         raise self._real.RCLError("Failed to publish: publisher's context is invalid")
 
     def require(self, task: str) -> None:
