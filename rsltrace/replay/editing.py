@@ -112,13 +112,19 @@ class Editing(EventObserver):
     def after_event(self) -> None:
         """Make what is due before the next event, and let those run that have waited enough."""
         for edit in [edit for edit in self._pending if self._is_due(edit)]:
-            if not edit.of_event:
-                if not isinstance(edit.action, SetParameter):  # it is an event: see before_event
-                    self._try(edit, self._between)
-            elif edit.index is not None and edit.index < self._loop.events:
-                if self._dispatcher.event.handle is not self._setting:
-                    self._fail(edit, "this is no callback, but what a main or thread did")
+            if edit.of_event:
+                self._check_is_to_come(edit)
+            elif not isinstance(edit.action, SetParameter):  # it is an event: see before_event
+                self._try(edit, self._between)
         self._deferred.release()
+
+    def _check_is_to_come(self, edit: Edit) -> None:
+        """End the run if the event of an edit is over, unless an edit was an event of that number
+        itself: then the next one is meant."""
+        if edit.index is None or edit.index >= self._loop.events:
+            return
+        if self._dispatcher.event.handle is not self._setting:
+            self._fail(edit, "this is no callback, but what a main or thread did")
 
     def _is_due(self, edit: Edit) -> bool:
         if edit.index is not None:
