@@ -38,6 +38,7 @@ class Dispatcher:
         self.recorder: Recorder | None = None
         self.unrecorded = 0
         self.door: Door
+        self._pending = self.entities.pending
         self._observers: list[EventObserver] = []
         self._before: tuple[EventObserver, ...] = ()
         self._after: tuple[EventObserver, ...] = ()
@@ -76,11 +77,10 @@ class Dispatcher:
     def _with(self, hook: str) -> tuple[EventObserver, ...]:
         return tuple(one for one in self._observers if overrides(one, hook))
 
-    def _is_to_happen(self, call: EventCall, observers: tuple[EventObserver, ...]) -> bool:
+    def _is_to_happen(self, call: EventCall) -> bool:
         """Ask observers before an event; the first that does not want it is the last one asked."""
-        for observer in observers:
+        for observer in self._before:
             if not observer.before_event(call):
-                call.end()
                 return False
         return True
 
@@ -97,18 +97,18 @@ class Dispatcher:
         cause_event: int,
         cause_output: int,
         input_hash: int,
+        is_decided: bool = False,
     ) -> None:
-        """Run one event: call ``callback(*args)`` and record what came of it."""
-        observers = self._before
-        if observers:
+        """Run one event: call ``callback(*args)`` and record what came of it. If it ``is_decided``,
+        observers have been asked."""
+        if self._before and not is_decided:
             call = EventCall(
                 handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
             )
-            if not self._is_to_happen(call, observers):
-                return
-            (
-                handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
-            ) = call.values()  # fmt: skip
+            if self._is_to_happen(call):
+                self.execute(*call.values(), True)
+            call.end()
+            return
         event = self.event
         event.handle = handle
         event.entity = entity
@@ -125,8 +125,6 @@ class Dispatcher:
         if event.on_end is not None:
             on_end, event.on_end = event.on_end, None
             on_end()
-        if observers:
-            call.end()
 
     def _raised(self, error: BaseException, handle: Dispatchable) -> None:
         """Let a door decide what becomes of an exception.
@@ -141,7 +139,7 @@ class Dispatcher:
 
     def end_event(self) -> None:
         """Record the event under way, which may be a later part of the one ``execute`` began."""
-        if self.entities.pending:
+        if self._pending:
             self.entities.settle(self.recorder)
         event = self.event
         loop = self.loop
@@ -189,7 +187,7 @@ class Dispatcher:
     def has_outputs(self) -> bool:
         """Return whether the event under way has had outputs."""
         outputs = self.unrecorded if self.recorder is None else self.recorder.outputs
-        return bool(outputs or self.entities.pending)
+        return bool(outputs or self._pending)
 
     @contextlib.contextmanager
     def outside_events(self) -> Iterator[None]:

@@ -45,8 +45,9 @@ class EntityBook:
     def settle(self, recorder: Recorder | None) -> None:
         """Write down the entities created in this event, now that their owners are known."""
         waiting, self.unowned = self.unowned, []
-        created, self.pending = self.pending, []
-        for one in [*waiting, *created]:
+        created = [*waiting, *self.pending]
+        self.pending.clear()
+        for one in created:
             if not one.settle():
                 self.unowned.append(one)
             elif one.announced and (recorder is not None or self.observers):
