@@ -9,6 +9,7 @@ from __future__ import annotations
 from bisect import insort
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import takewhile
 from math import inf
 from typing import TYPE_CHECKING, Any
 
@@ -286,8 +287,10 @@ class DeferredEvents:
         self._run_next(due)
 
     def _run_next(self, count: int) -> None:
+        tasks = self._loop.tasks
+        before = sum(1 for _ in takewhile(lambda one: isinstance(one, _LaterEvent), tasks))
         for _, _, item in reversed(self._waiting[:count]):
-            self._loop.tasks.appendleft(item)
+            tasks.insert(before, item)
         del self._waiting[:count]
         if count and not self._waiting:
             self._loop.idle.remove(self._release_first)

@@ -79,10 +79,7 @@ class Dispatcher:
 
     def _is_to_happen(self, call: EventCall) -> bool:
         """Ask observers before an event; the first that does not want it is the last one asked."""
-        for observer in self._before:
-            if not observer.before_event(call):
-                return False
-        return True
+        return all(observer.before_event(call) for observer in self._before)
 
     # -- events ------------------------------------------------------------------------------------
 
