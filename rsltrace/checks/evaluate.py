@@ -220,6 +220,11 @@ class _Start:
 
     stamp_ns: int
 
+    @property
+    def start_ns(self) -> int:
+        """The same."""
+        return self.stamp_ns
+
     def nodes(self) -> dict[str, object]:
         """Return none."""
         return {}

@@ -31,6 +31,11 @@ class TraceEvent:
         self.output_hash = event.output_hash
 
     @property
+    def start_ns(self) -> int:
+        """The simulated time at which the run started."""
+        return self._trace.start_ns
+
+    @property
     def entity_name(self) -> str:
         """The name of what ran: a topic, a service, a timer's callback."""
         found = self._trace.entities.get(self.entity)

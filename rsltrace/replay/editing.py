@@ -83,7 +83,7 @@ class Editing(EventObserver):
             return self.error
         return EditError(
             f"{late[0].text!r} was not made: the run was over before, after {self._loop.events} "
-            f"events, at {format_seconds(self._loop.now_ns)} s"
+            f"events, at {format_seconds(self._loop.now_ns - self._session.start_ns)} s"
         )
 
     def attach(self, session: Session) -> None:
@@ -130,8 +130,8 @@ class Editing(EventObserver):
     def _is_due(self, edit: Edit) -> bool:
         if edit.index is not None:
             return self._loop.events >= edit.index
-        assert edit.time_ns is not None
-        return self._loop.now_ns >= edit.time_ns
+        assert edit.time is not None
+        return self._loop.now_ns >= edit.time.stamp_ns(self._session.start_ns)
 
     def _try(self, edit: Edit, make: Callable[..., Any], *args: Any) -> Any:
         """Make an edit, or end the run and say why not."""

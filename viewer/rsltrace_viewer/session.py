@@ -15,6 +15,7 @@ from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
+from rsltrace.words.times import TimeInRun
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.history import History, Marks
@@ -402,9 +403,9 @@ class Session:
         self.place = max(min(place, self.view.count - 1), 0)
         self.effects = None
 
-    def place_at_time(self, stamp_ns: int) -> int:
+    def place_at_time(self, time: TimeInRun) -> int:
         """Return the place of the first event at a time or later."""
-        return self.view.place_of(self.a.index_at(stamp_ns))
+        return self.view.place_of(self.a.index_at(time.stamp_ns(self.a.trace.start_ns)))
 
     # Words.
 

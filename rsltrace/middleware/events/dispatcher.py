@@ -94,7 +94,7 @@ class Dispatcher:
         cause_event: int,
         cause_output: int,
         input_hash: int,
-        is_decided: bool = False,
+        is_decided: int = False,
     ) -> None:
         """Run one event: call ``callback(*args)`` and record what came of it. If it ``is_decided``,
         observers have been asked."""
@@ -103,7 +103,7 @@ class Dispatcher:
                 handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
             )
             if self._is_to_happen(call):
-                self.execute(*call.values(), True)
+                self.execute(*call.values(), is_decided=True)
             call.end()
             return
         event = self.event

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import completions
 from rsltrace_viewer.model.query.parser import parse
 from rsltrace_viewer.session import Session
@@ -35,7 +35,13 @@ def question_of(kind: str, session: Session) -> Question:
             check_query,
             complete,
         ),
-        "time": Question("time", "go to time", "seconds, or 20ms, 3us, 500ns", "", parse_stamp),
+        "time": Question(
+            "time",
+            "go to time",
+            "seconds after the start, or 20ms, 3us; @ and a simulated time",
+            "",
+            parse_time_in_run,
+        ),
         "index": Question(
             "index", "go to event", f"0 to {max(session.a.count - 1, 0)}", "", parse_index
         ),
