@@ -103,7 +103,7 @@ class Dispatcher:
                 handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
             )
             if self._is_to_happen(call):
-                self.execute(*call.values(), is_decided=True)
+                self.execute(*call.values(), True)
             call.end()
             return
         event = self.event

@@ -46,6 +46,9 @@ class ObserverOrder(IntEnum):
     DEBUGGER = 12
 
 
+ExecuteArguments = tuple[Any, int, Any, int, Callable[..., object], tuple[Any, ...], int, int, int]
+
+
 class EventCall:
     """An event that is about to run; an observer may change what runs.
 
@@ -89,7 +92,7 @@ class EventCall:
         self.input_hash = input_hash
         self.on_end: list[Callable[[], None]] = []
 
-    def values(self) -> tuple[Any, ...]:
+    def values(self) -> ExecuteArguments:
         """Return what ``Dispatcher.execute`` takes."""
         return (
             self.handle,
