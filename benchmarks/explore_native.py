@@ -23,12 +23,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rsltrace.debug.conditions.names import Names
+from rsltrace.debug.conditions.view import Sent
+
 from rsltrace import Job, load_job
 from rsltrace.checks.conditions import condition, opposite, plain, topic_of
 from rsltrace.checks.evaluate import title
 from rsltrace.checks.properties import Eventually, Never, Property, Rate
-from rsltrace.debug.conditions.names import Names
-from rsltrace.debug.conditions.view import Sent
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S
 

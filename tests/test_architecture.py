@@ -6,6 +6,7 @@ import ast
 import re
 import subprocess
 import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import grimp
@@ -110,6 +111,147 @@ def test_files_that_the_guard_knows_by_their_path_are_there() -> None:
     for file in (callers._CALLS_BACK, callers._THREADS, *callers._STANDS_IN):
         assert Path(file).is_file()
     assert Path(callers._DOOR).is_dir()
+
+
+def parsed() -> dict[str, ast.Module]:
+    """Return the product's modules by their paths."""
+    root = Path(__file__).parents[1]
+    return {
+        str(path.relative_to(root)): ast.parse(path.read_text(encoding="utf-8"))
+        for folder in ("rsltrace", "viewer")
+        for path in (root / folder).rglob("*.py")
+    }
+
+
+def method_names(modules: Iterable[ast.Module]) -> set[str]:
+    """Return the names of all methods, but not of properties."""
+    return {
+        one.name
+        for module in modules
+        for kind in ast.walk(module)
+        if isinstance(kind, ast.ClassDef)
+        for one in kind.body
+        if isinstance(one, (ast.FunctionDef, ast.AsyncFunctionDef))
+        if not any("property" in ast.unparse(d) or "setter" in ast.unparse(d)
+                   for d in one.decorator_list)
+    }  # fmt: skip
+
+
+def data_names(modules: Iterable[ast.Module]) -> set[str]:
+    """Return the names of fields, of properties, and of what objects set of their own."""
+    nodes = [node for module in modules for node in ast.walk(module)]
+    fields = {
+        one.target.id
+        for kind in nodes
+        if isinstance(kind, ast.ClassDef)
+        for one in kind.body
+        if isinstance(one, ast.AnnAssign) and isinstance(one.target, ast.Name)
+    }
+    properties = {
+        one.name
+        for one in nodes
+        if isinstance(one, ast.FunctionDef)
+        if any("property" in ast.unparse(decorator) for decorator in one.decorator_list)
+    }
+    own = {
+        attribute
+        for node in nodes
+        for owner, attribute, _ in assigned(node)
+        if isinstance(owner, ast.Name) and owner.id == "self"
+    }
+    slots = {
+        text
+        for kind in nodes
+        if isinstance(kind, ast.Assign) and ast.unparse(kind.targets[0]) == "__slots__"
+        for text in ast.literal_eval(kind.value)
+    }
+    return fields | properties | own | slots
+
+
+def assigned(node: ast.AST) -> Iterator[tuple[ast.expr, str, ast.expr]]:
+    """Yield object, attribute and value of each attribute that a statement sets."""
+    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
+        if len(node.args) == 3 and isinstance(node.args[1], ast.Constant):
+            yield node.args[0], str(node.args[1].value), node.args[2]
+        return
+    targets: list[tuple[ast.expr, ast.expr]] = []
+    if isinstance(node, ast.Assign):
+        targets = [(target, node.value) for target in node.targets]
+    elif isinstance(node, ast.AnnAssign) and node.value is not None:
+        targets = [(node.target, node.value)]
+    while targets:
+        target, value = targets.pop()
+        if isinstance(target, (ast.Tuple, ast.List)):
+            same = isinstance(value, (ast.Tuple, ast.List)) and len(value.elts) == len(target.elts)
+            values = value.elts if same else [value] * len(target.elts)  # type: ignore[attr-defined]
+            targets += zip(target.elts, values, strict=True)
+        elif isinstance(target, ast.Attribute):
+            yield target.value, target.attr, value
+
+
+def replaced_methods(modules: dict[str, ast.Module]) -> set[tuple[str, str]]:
+    """Return file and method wherever a function takes the place of a method of another object."""
+    methods = method_names(modules.values())
+    callables = methods - data_names(modules.values())
+    found = set()
+    for file, module in modules.items():
+        functions = [n for n in ast.walk(module) if isinstance(n, (ast.FunctionDef, ast.Lambda))]
+        names = {one.name for one in functions if isinstance(one, ast.FunctionDef)}
+        for node in ast.walk(module):
+            for owner, attribute, value in assigned(node):
+                is_function = (
+                    attribute in callables
+                    or isinstance(value, ast.Lambda)
+                    or (isinstance(value, ast.Name) and value.id in names)
+                    or (isinstance(value, ast.Attribute) and value.attr in callables)
+                    or (isinstance(value, ast.Call) and "partial" in ast.unparse(value.func))
+                )
+                own = isinstance(owner, ast.Name) and owner.id == "self"
+                if is_function and attribute in methods and not own:
+                    found.add((file, attribute))
+    return found
+
+
+_NO_METHODS_OF_OURS = {
+    ("rsltrace/doors/rclpy/boundary/quick_publish.py", "publish"): "of rclpy's Publisher",
+    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "__init__"): "of asyncio's loops",
+    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "_watcher"): "of asyncio's policies",
+    ("rsltrace/doors/rclpy/stacks/asyncio_loops.py", "step"): "a slot of RecordedPoll",
+    ("rsltrace/doors/rclpy/handles/logs.py", "_line"): "a field of a message",
+    ("rsltrace/explore/report/page.py", "tail"): "the text after an element of XML",
+    ("rsltrace/doors/rclpy/stacks/exit_handlers.py", "register"): "of the module atexit",
+    ("rsltrace/doors/rclpy/stacks/exit_handlers.py", "unregister"): "of the module atexit",
+    ("rsltrace/doors/rclpy/stacks/threads.py", "__init__"): "of the user's thread classes",
+    ("rsltrace/guard/virtual/set_order.py", "exec_module"): "of Python's loaders",
+    ("rsltrace/launch/python_file.py", "include"): "a slot of LaunchContext",
+}
+"""What has the name of a method, and why it is none of the product's objects'."""
+
+
+def test_no_method_of_another_object_is_replaced() -> None:
+    """Whoever watches or steers a run is an observer (``middleware/events/observer.py``)."""
+    modules = parsed()
+    found = replaced_methods(modules)
+    assert found <= set(_NO_METHODS_OF_OURS), sorted(found - set(_NO_METHODS_OF_OURS))
+    assert found >= set(_NO_METHODS_OF_OURS), "no longer there: take it out of the list"
+    root = Path(__file__).parents[1]
+    assert not [file for file in modules if "method-assign" in (root / file).read_text("utf-8")]
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "dispatcher.end_event = self.after",
+        "a, dispatcher.end_event = 1, lambda: None",
+        "setattr(dispatcher, 'end_event', partial(print, 1))",
+        "def ended(): ...\ndispatcher.end_event = ended",
+    ],
+)
+def test_a_replaced_method_is_found(code: str) -> None:
+    ours = "class Dispatcher:\n  def end_event(self): ...\n  def after(self): ...\n"
+    assert replaced_methods({"a.py": ast.parse(ours), "b.py": ast.parse(code)}) == {
+        ("b.py", "end_event")
+    }
 
 
 RUNS_CODE = {

@@ -62,7 +62,11 @@ _BEFORE, _AFTER = "before.mcap", "after.mcap"
 )
 @click.option("--force", is_flag=True, help="Replace traces that are in DIR.")
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option(
+    "--until",
+    metavar="T",
+    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
+)
 @click.option("--no-pin", is_flag=True, help="Keep hash seed, addresses and so on as they are.")
 @click.option(
     "--timeout",

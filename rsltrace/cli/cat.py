@@ -24,27 +24,30 @@ from rsltrace.model.printable import printable
 from rsltrace.terminal import line_writer
 from rsltrace.trace.reader import Trace
 from rsltrace.trace.segments import event_of, output_of
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import TimeInRun, parse_time_in_run
 
 _NAMES_MAX = 12
 
 if TYPE_CHECKING:
-    _IntParam = click.ParamType[int]
+    _TimeParam = click.ParamType[TimeInRun]
 else:
-    _IntParam = click.ParamType  # not generic before click 8.2
+    _TimeParam = click.ParamType  # not generic before click 8.2
 
 
-class _Time(_IntParam):
-    """A simulated time: seconds, or a number with a unit, exactly as in a job."""
+class _Time(_TimeParam):
+    """A time of the run: seconds, or a number with a unit as in a job; or ``@`` and a simulated
+    time."""
 
     name = "time"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return nanoseconds, or end with a usage error."""
-        if isinstance(value, int):
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> TimeInRun:
+        """Return the time, or end with a usage error."""
+        if isinstance(value, TimeInRun):
             return value
         try:
-            return parse_stamp(str(value))
+            return parse_time_in_run(str(value))
         except ValueError as error:
             self.fail(str(error), param, ctx)
 
@@ -83,14 +86,12 @@ class _Time(_IntParam):
 )
 @click.option(
     "--from",
-    "from_ns",
+    "first",
     type=_Time(),
     metavar="T",
-    help="Only from simulated time T on (seconds, or 90s, 5ms, …).",
+    help="Only from time T of the run on (seconds, or 90s, 5ms, …; @T: from simulated time T on).",
 )
-@click.option(
-    "--to", "to_ns", type=_Time(), metavar="T", help="Only up to simulated time T, T included."
-)
+@click.option("--to", "last", type=_Time(), metavar="T", help="Only up to time T, T included.")
 @click.option(
     "--where",
     metavar="CONDITION",
@@ -107,8 +108,8 @@ def cat(
     nodes: tuple[str, ...],
     entities: tuple[str, ...],
     kinds: tuple[str, ...],
-    from_ns: int | None,
-    to_ns: int | None,
+    first: TimeInRun | None,
+    last: TimeInRun | None,
     where: str | None,
     limit: int | None,
 ) -> None:
@@ -125,7 +126,7 @@ def cat(
     if payloads and not as_json:
         raise click.UsageError("--payloads needs --json")
     with Trace.open(trace) as opened:
-        choice = _choice(opened, topics, nodes, entities, kinds, from_ns, to_ns)
+        choice = _choice(opened, topics, nodes, entities, kinds, first, last)
         condition = None if where is None else TraceCondition(where, opened)
         events = _events(opened, choice, condition)
         write = line_writer()
@@ -156,8 +157,8 @@ def _choice(
     nodes: tuple[str, ...],
     entities: tuple[str, ...],
     kinds: tuple[str, ...],
-    from_ns: int | None,
-    to_ns: int | None,
+    first: TimeInRun | None,
+    last: TimeInRun | None,
 ) -> _Choice:
     everything = list(trace.entities.values())
     wanted: set[int] | None = None
@@ -177,8 +178,8 @@ def _choice(
         entities=None if wanted is None else np.array(sorted(wanted), dtype=np.uint32),
         touching=touching,
         kinds=np.array(labels, dtype=np.uint8) if kinds else None,
-        from_ns=0 if from_ns is None else from_ns,
-        to_ns=2**64 - 1 if to_ns is None else to_ns,
+        from_ns=0 if first is None else first.stamp_ns(trace.start_ns),
+        to_ns=2**64 - 1 if last is None else last.stamp_ns(trace.start_ns),
     )
 
 

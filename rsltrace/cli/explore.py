@@ -114,7 +114,11 @@ def _fork_after(
     show_default=True,
     help="Search with other random choices.",
 )
-@click.option("--until", metavar="T", help="Stop runs at simulated time T (seconds, or 90s, 5ms).")
+@click.option(
+    "--until",
+    metavar="T",
+    help="Stop at time T of each run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
+)
 @click.option(
     "--fork-after",
     metavar="T",

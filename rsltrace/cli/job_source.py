@@ -146,8 +146,10 @@ def all_overrides(
     if seed is not None:
         found.append(("--seed", f"seed={seed}"))
     if until is not None:
-        time = f"{until}s" if until[-1:].isdigit() else until
-        found.append(("--until", f"stop.time={json.dumps(time)}"))
+        key = "time" if until.startswith("@") else "duration"
+        time = until.removeprefix("@")
+        time = f"{time}s" if time[-1:].isdigit() else time
+        found.append(("--until", f"stop.{key}={json.dumps(time)}"))
     return found
 
 

@@ -50,7 +50,11 @@ if TYPE_CHECKING:
     help="Replace an existing trace (never one it reads), and bag, once the new one is whole.",
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option(
+    "--until",
+    metavar="T",
+    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
+)
 @click.option(
     "--replay",
     type=click.Path(path_type=Path),

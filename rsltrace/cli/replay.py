@@ -24,7 +24,6 @@ from rsltrace.diff.options import DiffOptions
 from rsltrace.errors import ReplayError
 from rsltrace.guard.pin import unpin
 from rsltrace.model.printable import printable
-from rsltrace.model.stamp import format_seconds
 from rsltrace.terminal import say, tell
 
 if TYPE_CHECKING:
@@ -40,7 +39,8 @@ _SHOWN_MAX = 12
 @click.option(
     "--until",
     metavar="INDEX|TIME",
-    help="Stop after this event (812) or simulated time (60s, 2.5), with success.",
+    help="Stop after this event (812) or time of the run (60s, 2.5; @60s: simulated time 60 s), "
+    "with success.",
 )
 @click.option(
     "--from",
@@ -285,7 +285,7 @@ def _print(result: ReplayResult) -> None:
         say(f"\nnext: {_next(result)}")
         return
     say(result.sentence)
-    say(f"digest {result.digest}  events {result.verified}  sim {format_seconds(result.end_ns)}")
+    say(f"digest {result.digest}  events {result.verified}  sim {result.sim_seconds}")
 
 
 def _print_branch(result: ReplayResult) -> None:
@@ -296,7 +296,7 @@ def _print_branch(result: ReplayResult) -> None:
     else:
         say(f"the first {result.verified} events are those of {result.trace}")
         print_diffs([result.diff], "text", DiffOptions(), None)
-    say(f"digest {result.digest}  ended: {result.ended}, at {format_seconds(result.end_ns)} s")
+    say(f"digest {result.digest}  ended: {result.ended}, at {result.sim_seconds} s")
 
 
 def _next(result: ReplayResult) -> str:

@@ -80,7 +80,11 @@ class Given:
     help="How many runs at a time.",
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Use this seed instead of the job's.")
-@click.option("--until", metavar="T", help="Stop at simulated time T (seconds, or 90s, 5ms, …).")
+@click.option(
+    "--until",
+    metavar="T",
+    help="Stop at time T of the run (seconds, or 90s, 5ms, …; @T: at simulated time T).",
+)
 @click.option("--no-pin", is_flag=True, help="Show what pinning the process hides.")
 @click.option(
     "--perturbations",

@@ -27,13 +27,19 @@ if TYPE_CHECKING:
     from rsltrace_viewer.terminal.rerun_follower import RerunFollower
     from rsltrace_viewer.terminal.screenshot import Shown
 
+    from rsltrace.words.times import TimeInRun
+
 _SIZE = re.compile(r"(\d{1,3})[xX×](\d{1,3})")
 _PORT = 8321
 
 
 @click.command()
 @click.argument("traces", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--at", metavar="EVENT|TIME", help="Start at an event (1200) or a time (1.5s).")
+@click.option(
+    "--at",
+    metavar="EVENT|TIME",
+    help="Start at an event (1200) or a time of the run (1.5s; @1.5s: simulated time).",
+)
 @click.option("--filter", "filter_text", default="", metavar="TEXT", help="Show only some events.")
 @click.option("--light", is_flag=True, help="Dark on light.")
 @click.option("--follow", is_flag=True, help="Follow a trace that is still being recorded.")
@@ -134,10 +140,12 @@ def _recordings(
     from rsltrace_viewer.model.recordings.filter import read_filter
     from rsltrace_viewer.terminal.recordings.app import RecordingApp, open_recordings
 
+    from rsltrace.words.times import START
+
     session = open_recordings(paths)
     start = None
     if at is not None:
-        start = (int(at), 0) if at.isdecimal() else (None, _time(at, "a message"))
+        start = (int(at), START) if at.isdecimal() else (None, _time(at, "a message"))
     return RecordingApp(
         session,
         light=light,
@@ -230,15 +238,15 @@ def _choose(*, exporting: bool, light: bool) -> tuple[Path, ...]:
 def _place(session: Any, at: str) -> int:
     if at.isdecimal():
         return int(session.view.place_of(min(int(at), max(session.a.count - 1, 0))))
-    stamp_ns = _time(at, "an event")
-    return int(session.place_at_time(stamp_ns)) if not session.empty else 0
+    time = _time(at, "an event")
+    return int(session.place_at_time(time)) if not session.empty else 0
 
 
-def _time(at: str, what: str) -> int:
-    from rsltrace.words.times import parse_stamp
+def _time(at: str, what: str) -> TimeInRun:
+    from rsltrace.words.times import parse_time_in_run
 
     try:
-        return parse_stamp(at)
+        return parse_time_in_run(at)
     except ValueError as error:
         raise click.BadParameter(f"{error}; or the number of {what}", param_hint="--at") from None
 

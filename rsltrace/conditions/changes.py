@@ -9,16 +9,17 @@ from rsltrace.conditions.expressions import Expression
 from rsltrace.conditions.view import EventView, Moment
 from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import format_seconds
+from rsltrace.words.times import TimeInRun
 
 _NOT_THERE = "(not there)"
 
 
 class AtTime(Armed):
-    """Before the first event at a simulated time or after it."""
+    """Before the first event at a time of the run or after it."""
 
-    def __init__(self, time_ns: int, moment: Moment) -> None:
-        self._time_ns = time_ns
-        self._is_past = moment.stamp_ns >= time_ns
+    def __init__(self, time: TimeInRun, moment: Moment) -> None:
+        self._time_ns = time.stamp_ns(moment.start_ns)
+        self._is_past = moment.stamp_ns >= self._time_ns
 
     def before(self, view: EventView) -> str:
         """Compare with the event's time; nodes may be constructed at another."""

@@ -46,7 +46,7 @@ from rsltrace.conditions.view import Moment
 from rsltrace.errors import ConditionError, did_you_mean
 from rsltrace.model.finding import Source
 from rsltrace.words.matching import LOG_LEVELS, is_named
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 
 _HEAD = re.compile(r"([A-Za-z_]+)(?:\s*[:=]\s*|\s+|\Z)")
 _MESSAGE = re.compile(r"([/A-Za-z_*?~][^\s:]*)\s*:(?!:)\s*")
@@ -121,11 +121,11 @@ class _Reader:
         if rest is not None:  # 2.5 s
             value = self._text[self._at : rest.end()]
         try:
-            time_ns = parse_stamp(value)
+            time = parse_time_in_run(value)
         except ValueError as error:
             raise self._wrong(str(error), len(value)) from None
         self._at += len(value)
-        return self._end(partial(AtTime, time_ns), before=True)
+        return self._end(partial(AtTime, time), before=True)
 
     def _node(self) -> Condition:
         name = self._name(self._names.nodes, "node")

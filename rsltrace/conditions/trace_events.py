@@ -30,6 +30,11 @@ class StartOfTrace:
 
     stamp_ns: int
 
+    @property
+    def start_ns(self) -> int:
+        """The same."""
+        return self.stamp_ns
+
     def nodes(self) -> dict[str, object]:
         """Return none."""
         return {}
@@ -47,6 +52,11 @@ class TraceEvent:
         self.entity = event.entity
         self.stamp_ns = event.stamp_ns
         self.output_hash = event.output_hash
+
+    @property
+    def start_ns(self) -> int:
+        """The simulated time at which the run started."""
+        return self._trace.start_ns
 
     @property
     def entity_name(self) -> str:

@@ -25,7 +25,12 @@ class Sent:
 
 
 class Moment(Protocol):
-    """A run that stands still. ``stamp_ns`` is simulated time."""
+    """A run that stands still. ``stamp_ns`` is simulated time, ``start_ns`` that at which the run
+    started."""
+
+    @property
+    def start_ns(self) -> int:
+        """The simulated time at which the run started."""
 
     @property
     def stamp_ns(self) -> int:

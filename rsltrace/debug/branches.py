@@ -19,7 +19,7 @@ from rsltrace.model.regular_file import in_the_way
 from rsltrace.replay.edits import parse_edit
 
 _ERROR = "rsltrace: error: "
-_HAS_PLACE = re.compile(r"\s*(t=)?[0-9][^:\"'(]*:")
+_HAS_PLACE = re.compile(r"\s*(t=)?@?[0-9][^:\"'(]*:")
 
 
 class Branches:

@@ -1,6 +1,6 @@
 """The simulation's side of a debugging session: runs between events, stops, answers, forks.
 
-It stands where an event has ended (``Dispatcher.end_event``), or where a callback is about to be
+It is an observer of events, and stands where one has ended, or where a callback is about to be
 called. To stop is to read requests there instead of going back to the loop; whatever stack that is
 on stays as it is.
 """
@@ -29,6 +29,7 @@ from rsltrace.errors import DebugError, RsltraceError
 from rsltrace.forking import end_process, fork_beside, why_not
 from rsltrace.guard.guard import engage
 from rsltrace.guard.redirect import copy_of
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.model.event import EventKind
 from rsltrace.trace.format import EVENT_REST
 
@@ -48,8 +49,10 @@ class Copy(NamedTuple):
     end: socket.socket
 
 
-class Engine:
+class Engine(EventObserver):
     """One process of a debugged run, and where it stands."""
+
+    order = ObserverOrder.DEBUGGER
 
     def __init__(
         self,
@@ -81,46 +84,45 @@ class Engine:
         self._hit: Message | None = None
         self._copied_at = -1
         self._calls: dict[greenlet, Call] = {}
-        """What each stack has called that is not yet over."""
+        """What each stack has called last that is not yet over."""
         self._is_unasked = False
         """Whether a callback goes on of which nobody knows yet if that makes an event."""
         self._apart_calls: Callable[..., None] | None = None
         """What calls callbacks in a copy made for a debugger."""
-        dispatcher = session.world.domain.dispatcher
-        self._end_event = dispatcher.end_event
-        self._execute = dispatcher.execute
-        dispatcher.end_event = self._ended  # type: ignore[method-assign]
-        dispatcher.execute = self._executed  # type: ignore[method-assign, assignment]
-        dispatcher.on_resume = self._resumed
+        session.world.domain.dispatcher.add_observer(self)
         ledger.on_difference = self._differs
 
     # -- where it is called ------------------------------------------------------------------------
 
-    def _ended(self) -> None:
-        """Stand in for ``Dispatcher.end_event``."""
-        self._end_event()
+    def after_event(self) -> None:
+        """See whether to stop after an event."""
         if self.ledger.events >= self._mark:
             self._attend()
 
-    def _executed(self, handle: Any, entity: int, node: Any, kind: int, *rest: Any) -> None:
-        """Stand in for ``Dispatcher.execute``."""
+    def before_event(self, call: EventCall) -> bool:
+        """See whether to stop before an event."""
         here = getcurrent()
         outer = self._calls.get(here)
-        self._calls[here] = self.view.call = call_of(*rest[:2])
+        self._calls[here] = self.view.call = call_of(call.callback, call.args)
         self._is_unasked = False
         if self._goal.asks_before:
             event = self.event
-            event.handle, event.entity, event.node, event.kind = handle, entity, node, kind
+            event.handle, event.entity = call.handle, call.entity
+            event.node, event.kind = call.node, call.kind
             self._about_to_run()
         if self._apart_calls is not None:
-            rest = (self._apart_calls, rest[:2], *rest[2:])
-        self._execute(handle, entity, node, kind, *rest)
-        if outer is None:
-            del self._calls[here]
-        else:
-            self._calls[here] = outer  # which spins, and has run this one
+            call.callback, call.args = self._apart_calls, (call.callback, call.args)
 
-    def _resumed(self) -> None:
+        def ended() -> None:
+            if outer is None:
+                del self._calls[here]
+            else:
+                self._calls[here] = outer  # which spins, and has run this one
+
+        call.on_end.append(ended)
+        return True
+
+    def resumed(self) -> None:
         """See, on the stack of a callback that goes on, whether to stop before it does."""
         self.view.call = self._calls.get(getcurrent(), NO_CALL)
         self._is_unasked = False

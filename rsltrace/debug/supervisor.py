@@ -122,8 +122,22 @@ class Supervisor:
     def _finish(self, request: Message) -> Message:
         return self._forward(until_ns=self.tree.position["stamp_ns"])
 
+    def _place(self, place: int | str) -> Message:
+        """Return the goal of an index (an int, or digits) or a time of the run."""
+        text = str(place).strip()
+        if text.isascii() and text.isdigit():
+            return {"until": int(text)}
+        from rsltrace.words.times import parse_time_in_run
+
+        try:
+            return {"until_ns": parse_time_in_run(text).stamp_ns(self.tree.start_ns)}
+        except ValueError as error:
+            raise DebugError(
+                f"{text!r} is neither an index (812) nor a time (2.5s): {error}"
+            ) from None
+
     def _run_to(self, request: Message) -> Message:
-        goal = _place(request["to"])
+        goal = self._place(request["to"])
         here = self._index if "until" in goal else int(self.tree.position["stamp_ns"])
         if next(iter(goal.values())) < here:
             raise DebugError(f"{request['to']} is behind: go_to goes back")
@@ -144,7 +158,7 @@ class Supervisor:
         return answer
 
     def _go_to(self, request: Message) -> Message:
-        return self.tree.go_to(_place(request["to"]))
+        return self.tree.go_to(self._place(request["to"]))
 
     def _reverse_next(self, request: Message) -> Message:
         return self.tree.go_back({"node": self._node(request)})
@@ -214,19 +228,6 @@ def _count(request: Message) -> int:
     if count < 1:
         raise DebugError(f"{count} events are no step")
     return count
-
-
-def _place(place: int | str) -> Message:
-    """Return the goal of an index (an int, or digits) or a simulated time."""
-    text = str(place).strip()
-    if text.isascii() and text.isdigit():
-        return {"until": int(text)}
-    from rsltrace.words.times import parse_stamp
-
-    try:
-        return {"until_ns": parse_stamp(text)}
-    except ValueError as error:
-        raise DebugError(f"{text!r} is neither an index (812) nor a time (2.5s): {error}") from None
 
 
 def _said(error: RsltraceError) -> Message:

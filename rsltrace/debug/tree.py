@@ -42,6 +42,7 @@ class Tree:
     def __init__(self, spec: dict[str, Any], client: Lines, waiting: deque[Message]) -> None:
         self.family = Family()
         self.position: Message = {}
+        self.start_ns = 0
         self._spec = {**spec, "supervisor": os.getpid()}
         self._client = client
         self._waiting = waiting
@@ -65,13 +66,14 @@ class Tree:
         :raises DebugError: it cannot be run; ``kind`` says why.
         """
         root, ready = self._new_root()
+        self.start_ns = int(ready["start_ns"])
         try:
             self._cursor = self._copy_of(root)
         except Refused as error:
             self._no_checkpoints(str(error))
             self._cursor = root
         else:
-            self._checkpoints.add(Checkpoint(0, int(ready["start_ns"]), root))
+            self._checkpoints.add(Checkpoint(0, self.start_ns, root))
         self.position = self._ask(self._cursor, {"do": "position"})
         return {key: value for key, value in ready.items() if key != "notice"}
 

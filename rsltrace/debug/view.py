@@ -37,6 +37,7 @@ class View:
     """
 
     def __init__(self, session: Session, ledger: Ledger) -> None:
+        self.start_ns = session.start_ns
         self._domain = session.world.domain
         self._event = self._domain.event
         self._ledger = ledger

@@ -280,7 +280,7 @@ class EventLoop:
 
     def _run_idle(self) -> bool:
         """Let those who poll have a look, now that nothing else is ready. True: go on."""
-        woken = [poll() for poll in self.idle]  # all of them, not just up to the first
+        woken = [poll() for poll in tuple(self.idle)]  # all of them, not just up to the first
         return any(woken)
 
     def _ask_conditions(self, next_ns: int | None) -> Stop | None:

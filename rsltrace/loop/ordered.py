@@ -69,7 +69,10 @@ class _Waiting:
         self.places.append(self._place(item))
 
     def appendleft(self, item: Dispatchable) -> None:
-        self.places.insert(0, self._place(item))
+        self.insert(0, item)
+
+    def insert(self, index: int, item: Dispatchable) -> None:
+        self.places.insert(index, self._place(item))
 
     def extend(self, items: Iterable[Dispatchable]) -> None:
         for item in items:

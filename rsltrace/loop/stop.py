@@ -45,10 +45,11 @@ class _StopAt:
         self._stop = stop
 
     def __call__(self, progress: Progress) -> Stop | None:
-        time_ns = self.quiet_until_ns
-        over = progress.now_ns >= time_ns or (
-            progress.next_ns is not None and progress.next_ns > time_ns
-        )
+        now_ns, next_ns, time_ns = progress.now_ns, progress.next_ns, self.quiet_until_ns
+        if next_ns is None:
+            over = now_ns >= time_ns
+        else:  # what is due now is of a step that is not over
+            over = max(now_ns, next_ns) > time_ns
         return self._stop if over else None
 
 

@@ -20,7 +20,7 @@ from rsltrace.middleware.qos.policies import DEFAULT_QOS, Qos
 from rsltrace.middleware.services import Client, Service
 from rsltrace.middleware.subscription import Subscription
 from rsltrace.middleware.timer import Timer
-from rsltrace.middleware.transport import Transport, Watcher
+from rsltrace.middleware.transport import MessageFilter, TopicObservers, Transport, Watcher
 
 
 class Domain:
@@ -40,9 +40,19 @@ class Domain:
 
     def watch(self, topic: str, watcher: Watcher) -> None:
         """Call ``watcher(publisher, canonical bytes)`` for every message on a topic."""
-        whole = self.transport.watch(topic, watcher)
-        for publisher in self.graph.publishers(topic):
-            publisher.watcher = whole
+        self._observers(topic).watchers.append(watcher)
+
+    def filter(self, topic: str, function: MessageFilter | None) -> None:
+        """Let a function decide what is published on a topic, whoever publishes; None: none."""
+        self._observers(topic).filter = function
+
+    def _observers(self, topic: str) -> TopicObservers:
+        found = self.transport.observers.get(topic)
+        if found is None:
+            found = self.transport.observers[topic] = TopicObservers()
+            for publisher in self.graph.publishers(topic):
+                publisher.observers = found
+        return found
 
     # -- participants without a client library ---------------------------------------------------
 

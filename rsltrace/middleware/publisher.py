@@ -16,6 +16,7 @@ from rsltrace.middleware.subscription import Delivery, Subscription
 from rsltrace.middleware.transport import Transport
 from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import OutputKind
+from rsltrace.trace.cdr import log_content
 from rsltrace.trace.chain import hash64
 
 
@@ -23,7 +24,8 @@ class Publisher(DomainEntity):
     """Sends a topic.
 
     ``subscriptions`` are the connected ones in creation order; ``links`` lead to them in a job
-    with delay models, and are None in others. ``watcher`` sees every message.
+    with delay models, and are None in others. ``observers`` are those of
+    its topic's messages, if there are any.
     """
 
     kind = EntityKind.PUBLISHER
@@ -46,7 +48,7 @@ class Publisher(DomainEntity):
             self.links = []
         self._count = 0
         self._channel: int | None = None
-        self.watcher = transport.watchers.get(topic)
+        self.observers = transport.observers.get(topic)
         self._history: deque[Delivery] | None = None
         if self.qos.durability is Durability.TRANSIENT_LOCAL:
             self._history = deque(maxlen=self.qos.keep)
@@ -58,6 +60,13 @@ class Publisher(DomainEntity):
 
     def send(self, data: bytes, content_hash: int | None = None) -> None:
         """Send canonical CDR bytes; ``content_hash`` if not all of them are content."""
+        observers = self.observers
+        if observers is not None and observers.filter is not None:
+            filtered = observers.filter(self, data)
+            if filtered is None:
+                return
+            if filtered is not data:
+                data, content_hash = filtered, self._content_hash(filtered)
         dispatcher = self.dispatcher
         loop = dispatcher.loop
         now_ns = loop.now_ns
@@ -100,8 +109,12 @@ class Publisher(DomainEntity):
             self._history.append((now_ns, 0, 0, None, data, event, position, digest, now_ns, count))
         if self._offers is not None:
             self._offers.sent()
-        if self.watcher is not None:
-            self.watcher(self, data)
+        if observers is not None:
+            for watch in observers.watchers:
+                watch(self, data)
+
+    def _content_hash(self, data: bytes) -> int:
+        return hash64(log_content(data) if self.output_kind == OutputKind.LOG else data)
 
     def _open_channel(self) -> int:
         self._channel = self._transport.channel(

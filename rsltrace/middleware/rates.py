@@ -7,12 +7,11 @@ far, that of a timer its own; of what no timer has caused (bags, drivers), its n
 from __future__ import annotations
 
 from array import array
-from collections.abc import Callable
 from typing import Any
 
 from rsltrace.middleware.entity import Runnable
 from rsltrace.middleware.events.dispatcher import Dispatcher
-from rsltrace.middleware.events.event import Owner
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.middleware.receiver import Receiver
 
 _UNKNOWN = -1
@@ -23,15 +22,16 @@ def follows_chains(policy: object) -> bool:
     return bool(getattr(policy, "follows_chains", False))
 
 
-class Rates:
+class Rates(EventObserver):
     """Follows which period each event goes back to."""
+
+    order = ObserverOrder.RATES
 
     def __init__(self, dispatcher: Dispatcher) -> None:
         self._loop = dispatcher.loop
-        self._execute = dispatcher.execute
         self._of_events = array("q")
         self._of_entities: dict[int, int] = {}
-        dispatcher.execute = self._followed  # type: ignore[method-assign]
+        dispatcher.add_observer(self)
 
     def period(self, item: Any, what: Runnable) -> int | None:
         """Return the period (ns) of something that may run; its latest arrival counts, too."""
@@ -48,25 +48,12 @@ class Rates:
         known = event < len(self._of_events) and self._of_events[event] != _UNKNOWN
         return self._of_events[event] if known else None
 
-    def _followed(
-        self,
-        handle: Any,
-        entity: int,
-        node: Owner | None,
-        kind: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        cause_event: int,
-        cause_output: int,
-        input_hash: int,
-    ) -> None:
-        """Stand in for ``Dispatcher.execute``: take note of the event's period, then run it."""
-        period_ns = self._of_entities.get(entity)
+    def before_event(self, call: EventCall) -> bool:
+        """Take note of the event's period."""
+        period_ns = self._of_entities.get(call.entity)
         if period_ns is None:
-            period_ns = self._of_event(cause_event)
+            period_ns = self._of_event(call.cause_event)
         missing = self._loop.events - len(self._of_events)
         self._of_events.extend((_UNKNOWN,) * missing)
         self._of_events.append(_UNKNOWN if period_ns is None else period_ns)
-        self._execute(
-            handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
-        )
+        return True

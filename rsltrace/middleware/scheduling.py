@@ -3,7 +3,6 @@ and execution times, which keep workers busy and hold back what a callback sends
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Any, Protocol
@@ -15,6 +14,7 @@ from rsltrace.loop.policy import Candidate, Policy
 from rsltrace.middleware.entity import Runnable
 from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.events.event import OutsideEvent, Owner
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.middleware.participant import Participant
 from rsltrace.middleware.rates import Rates, follows_chains
 from rsltrace.model.draw import Draw, encode_draw
@@ -78,23 +78,18 @@ class Schedulable(Protocol):
 
 
 class Scheduling:
-    """Describes to the loop what may run, and gives callbacks their durations."""
+    """Describes to the loop what may run."""
 
     def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
-        self._dispatcher = dispatcher
-        self._loop = loop
         self._plan = plan
         self._workers: dict[object, Workers] = {}
-        self._durations: dict[int, Sampler | None] = {}
-        self._counts: dict[tuple[str, str, str], int] = {}
         loop.policy = plan.policy
         loop.place = self.place
         self._rates: Rates | None = None
         if follows_chains(plan.policy):
             self._rates = Rates(dispatcher)
         if plan.execution:
-            self._execute = dispatcher.execute
-            dispatcher.execute = self._timed  # type: ignore[method-assign]
+            dispatcher.add_observer(ExecutionTimes(dispatcher, loop, plan))
 
     # -- what may run --------------------------------------------------------------------------
 
@@ -132,35 +127,37 @@ class Scheduling:
             workers = self._workers[key] = Workers(str(key), count)
         return workers
 
-    # -- how long it takes ---------------------------------------------------------------------
 
-    def _timed(
-        self,
-        handle: Any,
-        entity: int,
-        node: Owner | None,
-        kind: int,
-        callback: Callable[..., object],
-        args: tuple[Any, ...],
-        cause_event: int,
-        cause_output: int,
-        input_hash: int,
-    ) -> None:
-        """Stand in for ``Dispatcher.execute``: draw how long the callback takes, then run it."""
+class ExecutionTimes(EventObserver):
+    """Gives callbacks their durations."""
+
+    order = ObserverOrder.EXECUTION_TIMES
+
+    def __init__(self, dispatcher: Dispatcher, loop: OrderedLoop, plan: SchedulingPlan) -> None:
+        self._dispatcher = dispatcher
+        self._loop = loop
+        self._plan = plan
+        self._durations: dict[int, Sampler | None] = {}
+        self._counts: dict[tuple[str, str, str], int] = {}
+
+    def before_event(self, call: EventCall) -> bool:
+        """Draw how long the callback takes, and charge it with that when it is over."""
         event, charge = self._dispatcher.event, self._loop.charge
         duration = None
-        if kind in _TAKES_TIME and not isinstance(handle, OutsideEvent):
-            duration = self._duration_of(handle, entity, node)
+        if call.kind in _TAKES_TIME and not isinstance(call.handle, OutsideEvent):
+            duration = self._duration_of(call.handle, call.entity, call.node)
         duration_ns = 0 if duration is None else duration(self._loop.now_ns)
         if duration is not None:
-            self._dispatcher.draw(entity, encode_draw(Draw.EXECUTION, duration_ns))
+            self._dispatcher.draw(call.entity, encode_draw(Draw.EXECUTION, duration_ns))
         before, event.busy_ns = event.busy_ns, duration_ns
-        self._execute(
-            handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
-        )
-        event.busy_ns = before
-        event.took_ns = duration_ns
-        charge.duration_ns += duration_ns
+
+        def ended() -> None:
+            event.busy_ns = before
+            event.took_ns = duration_ns
+            charge.duration_ns += duration_ns
+
+        call.on_end.append(ended)
+        return True
 
     def _duration_of(self, handle: Any, entity: int, node: Owner | None) -> Sampler | None:
         if entity in self._durations:

@@ -13,6 +13,19 @@ from rsltrace.middleware.links import Network
 Watcher = Callable[[Any, bytes], None]
 """Is called with the publisher and the canonical bytes of each message on a topic."""
 
+MessageFilter = Callable[[Any, bytes], bytes | None]
+"""Is called with the publisher and the canonical bytes of a message that is about to be published,
+and returns those that are published in their place; None: the message is not published."""
+
+
+class TopicObservers:
+    """Who sees every message of a topic: ``filter`` decides what is published, ``watchers`` are
+    told what was."""
+
+    def __init__(self) -> None:
+        self.filter: MessageFilter | None = None
+        self.watchers: list[Watcher] = []
+
 
 class Transport:
     """How what is sent gets to others. ``network`` is None in a run without models of links;
@@ -22,14 +35,8 @@ class Transport:
         self.dispatcher = dispatcher
         self.network: Network | None = None
         self.faults: dict[str, TopicFaults] = {}
-        self.watchers: dict[str, Watcher] = {}
+        self.observers: dict[str, TopicObservers] = {}
         self._channels: dict[tuple[str, str], int] = {}
-
-    def watch(self, topic: str, watcher: Watcher) -> Watcher:
-        """Add a watcher of a topic; return what is to be called for all of its watchers."""
-        first = self.watchers.get(topic)
-        self.watchers[topic] = watcher if first is None else _both(first, watcher)
-        return self.watchers[topic]
 
     def channel(
         self, topic: str, type: MessageType, qos_yaml: str = "", *, with_hash: bool = False
@@ -50,11 +57,3 @@ class Transport:
             )
             self._channels[topic, type.name] = channel
         return channel
-
-
-def _both(first: Watcher, second: Watcher) -> Watcher:
-    def watch(publisher: Any, data: bytes) -> None:
-        first(publisher, data)
-        second(publisher, data)
-
-    return watch

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from rsltrace.errors import EditError, did_you_mean
+from rsltrace.middleware.events.observer import EventCall
 from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import Edit, SetMessage, change, path_text
 from rsltrace.trace.chain import hash64
-
-Event = tuple[Any, ...]
-"""What ``Dispatcher.execute`` gets."""
 
 
 def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
@@ -24,34 +22,32 @@ def changed_data(endpoint: Any, edit: Edit, data: bytes) -> bytes:
     return _recoded(codec_for(class_of(endpoint)), edit, data)
 
 
-def received(edit: Edit, event: Event) -> Event:
-    """Return an event that is about to run, with another message.
+def receive_edited(edit: Edit, call: EventCall) -> None:
+    """Let an event that is about to run receive another message.
 
     :raises EditError: it receives none, or that cannot be edited so.
     """
     from rsltrace.doors.rclpy.wire.codec import codec_for
 
-    handle, entity, node, kind, callback, args, cause, output, digest = event
+    handle, kind, args = call.handle, call.kind, call.args
     is_coroutine = hasattr(handle, "task")
     if is_coroutine:
         part = arrived_for_action(handle, kind)
         if part is not None:
-            digest = _change_arrival(part, edit)
-            return handle, entity, node, kind, callback, args, cause, output, digest
+            call.input_hash = _change_arrival(part, edit)
+            return
         args = tuple(one for one in _begun_with(handle, kind) if _is_message(one))[:1]
     if kind == EventKind.BAG or (args and isinstance(args[0], bytes)):
         data = changed_data(handle, edit, args[0])
-        digest = hash64(data)
-        rest = (digest,) if kind == EventKind.BAG else args[1:]
-        return handle, entity, node, kind, callback, (data, *rest), cause, output, digest
+        call.input_hash = hash64(data)
+        rest = (call.input_hash,) if kind == EventKind.BAG else args[1:]
+        call.args = (data, *rest)
+        return
     if not args or not _is_message(args[0]):
         raise EditError(f"{handle.describe()} ({EventKind(kind).label}) receives no message")
     _change_message(args[0], edit)
     message: Any = type(args[0])
-    digest = hash64(codec_for(message).serialize(args[0]))
-    if is_coroutine:
-        args = ()
-    return handle, entity, node, kind, callback, args, cause, output, digest
+    call.input_hash = hash64(codec_for(message).serialize(args[0]))
 
 
 def arrived_for_action(handle: Any, kind: int) -> Any:

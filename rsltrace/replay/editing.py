@@ -6,16 +6,22 @@ is, so the same edits of the same run give the same branch.
 
 from __future__ import annotations
 
+from bisect import insort
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import takewhile
+from math import inf
 from typing import TYPE_CHECKING, Any
 
 from rsltrace.errors import EditError, did_you_mean
+from rsltrace.loop.loop import Dispatchable, EventLoop
 from rsltrace.loop.stop import Stop
+from rsltrace.middleware.events.dispatcher import Dispatcher
 from rsltrace.middleware.events.event import OutsideEvent
-from rsltrace.model.event import NO_EVENT, EventKind
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
+from rsltrace.model.event import EventKind
 from rsltrace.model.stamp import format_seconds
-from rsltrace.replay.edited_messages import arrived_for_action, changed_data, received
+from rsltrace.replay.edited_messages import arrived_for_action, changed_data, receive_edited
 from rsltrace.replay.edits import (
     Defer,
     Delay,
@@ -35,11 +41,13 @@ _CAN_BE_DROPPED = (*_CAN_COME_LATER, EventKind.CLIENT, EventKind.ACTION, EventKi
 FAILED = Stop("an edit could not be made", 2)
 
 
-class Editing:
+class Editing(EventObserver):
     """The edits of one run. ``error`` says which of them could not be made, and why.
 
     ``on_new`` is called before the first edit, from number ``known`` on, that is made.
     """
+
+    order = ObserverOrder.EDITS
 
     def __init__(
         self,
@@ -54,6 +62,8 @@ class Editing:
         self._armed: dict[str, list[Edit]] = {}
         self._on_new: Callable[[], None] | None = on_new
         self.error: EditError | None = None
+        self._setting: OutsideEvent | None = None
+        """The event that an edit is itself, while it is under way."""
         self._session: Session
 
     @property
@@ -73,53 +83,55 @@ class Editing:
             return self.error
         return EditError(
             f"{late[0].text!r} was not made: the run was over before, after {self._loop.events} "
-            f"events, at {format_seconds(self._loop.now_ns)} s"
+            f"events, at {format_seconds(self._loop.now_ns - self._session.start_ns)} s"
         )
 
     def attach(self, session: Session) -> None:
         """Make the edits in an open session from now on."""
         self._session = session
         self._loop = session.loop
-        self._dispatcher = dispatcher = session.world.domain.dispatcher
-        self._execute, self._end_event = dispatcher.execute, dispatcher.end_event
-        dispatcher.execute = self._edited  # type: ignore[method-assign, assignment]
-        dispatcher.end_event = self._ended  # type: ignore[method-assign]
+        self._dispatcher = session.world.domain.dispatcher
+        self._deferred = DeferredEvents(session.loop)
+        self._dispatcher.add_observer(self)
 
-    def _edited(self, *event: Any) -> None:
-        """Stand in for ``Dispatcher.execute``: an event is about to run."""
-        if not self._pending:
-            self._execute(*event)
-            return
+    def before_event(self, call: EventCall) -> bool:
+        """Make the edits that are due before an event, and those of the event itself."""
+        if not self._pending or call.handle is self._setting:
+            return True
         due = [edit for edit in self._pending if self._is_due(edit)]
         for edit in due:
             if not edit.of_event:
                 self._try(edit, self._between)
-        changed: tuple[Any, ...] | None = event
-        if event[3] == EventKind.BAG:  # a topic's next message may be the one of this very event
-            changed = (*event[:4], event[0].send, *event[5:])
+        happens = True
         for edit in due:
-            if edit.of_event and changed is not None and self.error is None:
-                changed = self._try(edit, self._event, changed)
-        if changed is not None and self.error is None:
-            self._execute(*changed)
-        elif hasattr(event[0], "task"):  # a coroutine that nobody is going to begin
-            getattr(event[0].task._handler, "close", int)()
+            if edit.of_event and happens and self.error is None:
+                happens = bool(self._try(edit, self._event, call))
+        if self.error is not None and hasattr(call.handle, "task"):
+            call.handle.task._handler.close()  # a coroutine that nobody is going to begin
+        return happens and self.error is None
 
-    def _ended(self) -> None:
-        """Stand in for ``Dispatcher.end_event``: what is due before the next event is made."""
-        self._end_event()
+    def after_event(self) -> None:
+        """Make what is due before the next event, and let those run that have waited enough."""
         for edit in [edit for edit in self._pending if self._is_due(edit)]:
-            if not edit.of_event:
-                if not isinstance(edit.action, SetParameter):  # an event of its own: see _edited
-                    self._try(edit, self._between)
-            elif edit.index is not None and edit.index < self._loop.events:
-                self._fail(edit, "this is no callback, but what a main or thread did")
+            if edit.of_event:
+                self._check_is_to_come(edit)
+            elif not isinstance(edit.action, SetParameter):  # it is an event: see before_event
+                self._try(edit, self._between)
+        self._deferred.release()
+
+    def _check_is_to_come(self, edit: Edit) -> None:
+        """End the run if the event of an edit is over, unless an edit was an event of that number
+        itself: then the next one is meant."""
+        if edit.index is None or edit.index >= self._loop.events:
+            return
+        if self._dispatcher.event.handle is not self._setting:
+            self._fail(edit, "this is no callback, but what a main or thread did")
 
     def _is_due(self, edit: Edit) -> bool:
         if edit.index is not None:
             return self._loop.events >= edit.index
-        assert edit.time_ns is not None
-        return self._loop.now_ns >= edit.time_ns
+        assert edit.time is not None
+        return self._loop.now_ns >= edit.time.stamp_ns(self._session.start_ns)
 
     def _try(self, edit: Edit, make: Callable[..., Any], *args: Any) -> Any:
         """Make an edit, or end the run and say why not."""
@@ -158,9 +170,11 @@ class Editing:
                 raise EditError(f"{action.node} has no attribute {first!r}{near}")
             change(node, action.path, action.operator, action.value)
         else:
-            handle = OutsideEvent(lambda: f"the edit {edit.text!r}")
-            event = (handle, 0, None, EventKind.OUTSIDE, self._set_parameter)
-            self._execute(*event, (edit, node, action), NO_EVENT, 0, 0)
+            self._setting = handle = OutsideEvent(lambda: f"the edit {edit.text!r}")
+            self._dispatcher.run_outside(
+                handle, EventKind.OUTSIDE, 0, None, partial(self._set_parameter, edit, node, action)
+            )
+            self._setting = None
 
     def _set_parameter(self, edit: Edit, node: Any, action: SetParameter) -> None:
         """Set a parameter; what is wrong with it is no exception of a node's."""
@@ -178,35 +192,32 @@ class Editing:
 
     def _arm(self, edit: Edit, topic: str) -> None:
         """Wait for the next message on a topic, whoever publishes it."""
-        publishers = list(self._session.world.domain.graph.publishers(topic))
-        if not publishers:
+        domain = self._session.world.domain
+        if not domain.graph.publishers(topic):
             return  # nobody yet
         self._pending.remove(edit)
         self._armed.setdefault(topic, []).append(edit)
 
-        def send(publisher: Any, data: bytes, content_hash: int | None = None) -> None:
-            for one in publishers:
-                one.__dict__.pop("send", None)
+        def edited(publisher: Any, data: bytes) -> bytes | None:
+            domain.filter(topic, None)
+            result: bytes | None = data
             for armed in self._armed.pop(topic, ()):
-                if isinstance(armed.action, Drop) or data is None:
-                    return
-                data = self._try(armed, partial(changed_data, publisher), data)
-                content_hash = None
-            if data is not None:
-                publisher.send(data, content_hash)
+                if result is None or isinstance(armed.action, Drop):
+                    return None
+                result = self._try(armed, partial(changed_data, publisher), result)
+            return result
 
-        for publisher in publishers:
-            publisher.send = partial(send, publisher)  # type: ignore[method-assign]
+        domain.filter(topic, edited)
 
     # -- the event that is about to run ----------------------------------------------------------
 
-    def _event(self, edit: Edit, event: tuple[Any, ...]) -> tuple[Any, ...] | None:
-        """Return what is to run instead of an event; None if nothing is, or not now."""
+    def _event(self, edit: Edit, call: EventCall) -> bool:
+        """Make an edit of an event; return whether it happens now."""
         self._pending.remove(edit)
-        handle, _, node, kind = event[:4]
-        action = edit.action
+        handle, kind, action = call.handle, call.kind, edit.action
         if isinstance(action, SetMessage):
-            return received(edit, event)
+            receive_edited(edit, call)
+            return True
         name = f"{handle.describe()} ({EventKind(kind).label})"
         waits = hasattr(handle, "task")  # a coroutine
         if isinstance(action, Drop):
@@ -218,34 +229,18 @@ class Editing:
                 handle.task._handler.close()
                 handle.task.cancel()
                 handle.dispatch()  # which ends it
-            return None
+            return False
         if kind not in _CAN_COME_LATER or waits or isinstance(handle, OutsideEvent):
             raise EditError(f"{name} cannot run later; a subscription, timer or service can")
-        if getattr(node, "mailbox", None) is not None:
+        if getattr(call.node, "mailbox", None) is not None:
             raise EditError(f"{name} cannot run later: an executor of its program runs it")
-        later = _Later(self._dispatcher, event)
+        later = _LaterEvent(self._dispatcher, call)
         if isinstance(action, Delay):
             self._loop.schedule_release(self._loop.now_ns + action.delay_ns, lambda _: later)
         else:
             assert isinstance(action, Defer)
-            self._loop.schedule_release(self._loop.now_ns, lambda _: later.once())
-            if action.count is not None:
-                self._after(action.count, later)
-        return None
-
-    def _after(self, count: int, later: _Later) -> None:
-        """Make an event ready as soon as so many others have run."""
-        goal = self._loop.events + count
-        end_event = self._dispatcher.end_event
-
-        def ended() -> None:
-            end_event()
-            if self._loop.events >= goal:
-                self._dispatcher.end_event = end_event  # type: ignore[method-assign]
-                if later.once() is not None:
-                    self._loop.ready.appendleft(later)
-
-        self._dispatcher.end_event = ended  # type: ignore[method-assign]
+            self._deferred.add(later, action.count)
+        return False
 
 
 def _set_parameter(node: Any, action: SetParameter) -> None:
@@ -263,21 +258,63 @@ def _set_parameter(node: Any, action: SetParameter) -> None:
             raise EditError(f"{action.node} refuses {action.name} = {value!r}: {result.reason}")
 
 
-class _Later:
+class DeferredEvents:
+    """Events that others run before: so many of them, or all that are due at the present time.
+
+    They wait in order of the event before which they run, those that let all others go first at
+    the end, and else in the order in which they were deferred. The first runs next when it is time
+    for it, or when nothing else can run at the present time: so no event is lost.
+    """
+
+    def __init__(self, loop: EventLoop) -> None:
+        self._loop = loop
+        self._waiting: list[tuple[float, int, Dispatchable]] = []
+        self._count = 0
+
+    def add(self, item: Dispatchable, others: int | None) -> None:
+        """Let ``others`` events run before ``item``; None: all."""
+        if not self._waiting:
+            self._loop.idle.append(self._release_first)
+        self._count += 1  # no two are the same, so items are not compared
+        before = inf if others is None else self._loop.events + others
+        insort(self._waiting, (before, self._count, item))
+
+    def release(self) -> None:
+        """Have those run next for which it is time."""
+        due = 0
+        while due < len(self._waiting) and self._waiting[due][0] <= self._loop.events:
+            due += 1
+        self._run_next(due)
+
+    def _run_next(self, count: int) -> None:
+        tasks = self._loop.tasks
+        before = sum(1 for _ in takewhile(lambda one: isinstance(one, _LaterEvent), tasks))
+        for _, _, item in reversed(self._waiting[:count]):
+            tasks.insert(before, item)
+        del self._waiting[:count]
+        if count and not self._waiting:
+            self._loop.idle.remove(self._release_first)
+
+    def _release_first(self) -> bool:
+        """Have the first run now that nothing else is ready; True: go on."""
+        loop = self._loop
+        if loop.idle[-1] != self._release_first:  # others have a look first
+            loop.idle.remove(self._release_first)
+            loop.idle.append(self._release_first)
+            return True
+        if loop.ready or loop.tasks or (loop.scheduled and loop.scheduled[0][0] <= loop.now_ns):
+            return False
+        self._run_next(1)
+        return True
+
+
+class _LaterEvent:
     """An event that runs later than it would have."""
 
-    def __init__(self, dispatcher: Any, event: tuple[Any, ...]) -> None:
+    def __init__(self, dispatcher: Dispatcher, call: EventCall) -> None:
         self._dispatcher = dispatcher
-        self._event = event
-        self._handle = event[0]
-        self._is_on = True
-
-    def once(self) -> _Later | None:
-        """Return itself the first time."""
-        if not self._is_on:
-            return None
-        self._is_on = False
-        return self
+        self._event = call.values()
+        self._handle = call.handle
 
     def dispatch(self) -> None:
         """Run the event, unless whose it is has gone; a busy callback group is waited for."""

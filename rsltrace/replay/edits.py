@@ -1,7 +1,8 @@
 """Edits: what is to be other than in the trace, each at one place in the run.
 
     812: message.pose.position.x = 3.0         what event 812 receives
-    2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on
+    2.5s: topic("/odom").twist.linear.x += 1   the next message on /odom from then on (2.5 s after
+                                               the start; @2.5s: at simulated time 2.5 s)
     812: node("/ekf").P[0][0] = 1e-3           an attribute, before event 812
     2.5s: parameters("/ekf")["rate"] = 20.0    a parameter
     812: drop()    2.5s: drop("/odom")         an event; the next message on a topic
@@ -23,6 +24,7 @@ from rsltrace.errors import EditError, did_you_mean
 from rsltrace.model.entity import EntityKind
 from rsltrace.trace.format import METADATA_EDITS
 from rsltrace.trace.reader import Trace
+from rsltrace.words.times import TimeInRun, parse_stamp, parse_time_in_run
 
 Step = tuple[str, Any]
 """A step into an object: ``(".", name)`` or ``("[", key)``."""
@@ -89,11 +91,11 @@ Action = SetMessage | SetAttribute | SetParameter | Drop | Delay | Defer
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """An edit: its text, where it takes place (an index or a simulated time), and what it does."""
+    """An edit: its text, where it takes place (an index or a time), and what it does."""
 
     text: str
     index: int | None
-    time_ns: int | None
+    time: TimeInRun | None
     action: Action
 
     @property
@@ -142,8 +144,8 @@ def check_edits(edits: Sequence[Edit], trace: Trace) -> None:
         if edit.index is not None and edit.index >= trace.event_count:
             last = trace.event_count - 1
             raise EditError(f"{edit.text!r}: the last event of {trace.name} is {last}")
-        if edit.time_ns is not None and edit.time_ns > trace.end_ns:
-            end_s = trace.end_ns / 1e9
+        if edit.time is not None and edit.time.stamp_ns(trace.start_ns) > trace.end_ns:
+            end_s = (trace.end_ns - trace.start_ns) / 1e9
             raise EditError(f"{edit.text!r}: {trace.name} ends at {end_s:g} s")
         node = getattr(edit.action, "node", None)
         for name, kind in ((node, EntityKind.NODE), (edit.topic, EntityKind.PUBLISHER)):
@@ -165,7 +167,7 @@ class _Parser:
         anchor, colon, rest = self._text.partition(":")
         if not colon:
             raise self._wrong(0, "an edit begins with where it takes place: 812: …, or 2.5s: …")
-        index, time_ns = self._anchor(anchor.strip())
+        index, time = self._anchor(anchor.strip())
         self._begin = len(anchor) + 1 + len(rest) - len(rest.lstrip())
         try:
             body = ast.parse(rest.strip()).body
@@ -174,15 +176,13 @@ class _Parser:
             raise self._wrong(at, getattr(error, "msg", None) or str(error)) from None
         if len(body) != 1:
             raise self._wrong(self._begin, f"an edit is one of {_FORMS}")
-        return Edit(self._text, index, time_ns, self._action(body[0]))
+        return Edit(self._text, index, time, self._action(body[0]))
 
-    def _anchor(self, text: str) -> tuple[int | None, int | None]:
-        from rsltrace.words.times import parse_stamp
-
+    def _anchor(self, text: str) -> tuple[int | None, TimeInRun | None]:
         if text.isascii() and text.isdigit():
             return int(text), None
         try:
-            return None, parse_stamp(text.removeprefix("t="))
+            return None, parse_time_in_run(text.removeprefix("t="))
         except ValueError as error:
             raise self._wrong(
                 0, f"{text!r} is neither the index of an event (812) nor a time (2.5s): {error}"
@@ -215,8 +215,6 @@ class _Parser:
         return Defer(given)
 
     def _delay(self, call: ast.Call, given: Any) -> int:
-        from rsltrace.words.times import parse_stamp
-
         if isinstance(given, str):
             try:
                 delay_ns = parse_stamp(given)

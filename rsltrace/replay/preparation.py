@@ -111,13 +111,13 @@ def count_to(trace: Trace, position: Position) -> int:
 
     :raises ReplayError: if it is no position, or before the first event.
     """
-    from rsltrace.words.times import parse_stamp
+    from rsltrace.words.times import parse_time_in_run
 
     text = str(position).strip()
     if text.isascii() and text.isdigit():
         return int(text) + 1
     try:
-        time_ns = parse_stamp(text)
+        time_ns = parse_time_in_run(text).stamp_ns(trace.start_ns)
     except ValueError as error:
         raise ReplayError(
             f"{text!r} is neither the index of an event (812) nor a time (60s, 2.5): {error}"

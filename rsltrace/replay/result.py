@@ -19,9 +19,10 @@ class ReplayResult:
 
     ``verified`` is how many events, counted from 0, are the same in every hashed field; the trace
     has ``events``. ``digest`` is the chain hash of the last of these, 16 hex digits (zeros: none),
-    ``end_ns`` its simulated time in nanoseconds. ``ended`` says in words why the replay ended
-    there. ``is_whole`` is true if that is the end of the trace's run; otherwise it diverged,
-    ``until`` was reached, the trace was cut off or somebody ended one of the runs.
+    ``end_ns`` its simulated time in nanoseconds, ``start_ns`` that of the start. ``ended`` says in
+    words why the replay ended there. ``is_whole`` is true if that is the end of the trace's run;
+    otherwise it diverged, ``until`` was reached, the trace was cut off or somebody ended one of the
+    runs.
 
     ``diff`` is None unless the run diverged; then it compares the trace (a) with the replay (b),
     which ends with the event that differs, number ``verified``. ``path`` is the replay's own trace,
@@ -37,6 +38,7 @@ class ReplayResult:
     verified: int
     events: int
     digest: str
+    start_ns: int
     end_ns: int
     ended: str
     is_whole: bool
@@ -47,6 +49,11 @@ class ReplayResult:
     interrupted: int = 0
     """The exit status of a replay that was itself interrupted (130: Ctrl-C), else 0."""
     edits: tuple[str, ...] = ()
+
+    @property
+    def sim_seconds(self) -> str:
+        """Simulated duration in seconds, with nine decimals."""
+        return format_seconds(self.end_ns - self.start_ns)
 
     @property
     def diverged(self) -> bool:
@@ -72,4 +79,4 @@ class ReplayResult:
         count = f"{of} {self.verified} events"
         if self.verified != self.events:
             count += f" of {self.events}"
-        return f"verified {count}, to {format_seconds(self.end_ns)} s ({self.ended})"
+        return f"verified {count}, to {self.sim_seconds} s ({self.ended})"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rsltrace.loop.stop import Stop, StopCondition, stop_at
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.model.event import EventKind
 from rsltrace.replay.edits import edits_of
 from rsltrace.trace.format import REPLAY_DIVERGED
@@ -21,20 +22,21 @@ if TYPE_CHECKING:
     from rsltrace.trace.reader import Trace
     from rsltrace.trace.recorder import Recorder
 
-AddEvent = Callable[[bytes, int], None]
 DIVERGED = Stop(REPLAY_DIVERGED, 1)
 _INTERRUPTIONS = {129: "hung up", 130: "interrupted", 143: "terminated"}
 BRANCH_END = "as far as the run that it branches off"
 _BY_DRIVER = "the driver of the simulation"
 
 
-class Verification:
+class Verification(EventObserver):
     """What a run has to do, and how far it has done so.
 
     ``until`` is how many events to verify, None for all. ``verified`` events were as recorded;
     ``diverged`` says that the next one was not. ``stop`` is with what the verification has ended
     the run, if it has. ``on_first`` is called before event number ``first``.
     """
+
+    order = ObserverOrder.VERIFICATION
 
     def __init__(
         self,
@@ -55,15 +57,16 @@ class Verification:
         self._on_first = on_first
         self._first = first if on_first is not None else -1
         self._next_mark = self._limit if self._first < 1 else self._first
+        self._expected = self._hashes()
         self._session: Session
         self._recorder: Recorder
 
     def attach(self, session: Session) -> None:
         """Compare the events of an open session from now on."""
-        recorder = session.world.domain.dispatcher.recorder
-        assert recorder is not None, "a replay is recorded"
-        self._session, self._recorder = session, recorder
-        recorder.add_event = self._compared(recorder.writer.add_event)  # type: ignore[assignment]
+        dispatcher = session.world.domain.dispatcher
+        assert dispatcher.recorder is not None, "a replay is recorded"
+        self._session, self._recorder = session, dispatcher.recorder
+        dispatcher.add_observer(self)
         if self._first == 0 and self._on_first is not None:
             self._on_first(self._session)
 
@@ -81,7 +84,7 @@ class Verification:
     def branch_off(self) -> None:
         """Compare nothing from now on: what follows is to be something else."""
         self.has_branched_off = True
-        self._recorder.add_event = self._recorder.writer.add_event
+        self._session.world.domain.dispatcher.remove_observer(self)
 
     def end_of_branch(self) -> StopCondition | None:
         """Return what ends a branch where the run would not end by itself, or is not to go on."""
@@ -89,21 +92,15 @@ class Verification:
             return None
         return stop_at(self._trace.event(self._limit - 1).stamp_ns, BRANCH_END)
 
-    def _compared(self, add_event: AddEvent) -> AddEvent:
-        """Return what stands in for the writer's ``add_event`` and sees whether it was right."""
-        expected = self._hashes()
-
-        def compared(rest: bytes, chain_hash: int) -> None:
-            add_event(rest, chain_hash)
-            if chain_hash == next(expected, None):
-                self.verified = verified = self.verified + 1
-                if verified == self._next_mark:
-                    self._at_mark()
-            else:
-                self.diverged = not (self.is_last or self.interrupted)
-                self._end(DIVERGED)
-
-        return compared
+    def after_event(self) -> None:
+        """See whether the event was right."""
+        if self._recorder.chain_hash == next(self._expected, None):
+            self.verified = verified = self.verified + 1
+            if verified == self._next_mark:
+                self._at_mark()
+        else:
+            self.diverged = not (self.is_last or self.interrupted)
+            self._end(DIVERGED)
 
     def _at_mark(self) -> None:
         if self.verified == self._first and self._on_first is not None:
@@ -139,7 +136,9 @@ class Verification:
             self.stop = stop
             self._session.loop.stop(stop)
         if not go_on:  # what follows is no part of the run: its nodes are told to end
-            self._session.world.domain.dispatcher.recorder = None
+            dispatcher = self._session.world.domain.dispatcher
+            dispatcher.remove_observer(self)
+            dispatcher.record(None)
 
     def _hashes(self) -> Iterator[int]:
         for rows in self._trace.events():

@@ -284,7 +284,9 @@ class Session:
         if self.may_become:
             world.domain.transport.faults = FaultsOfAll()
         arm_topics(job.faults, world)
-        world.domain.entities.census = Census() if has_rules(job) else None
+        if has_rules(job):
+            world.domain.entities.census = census = Census()
+            world.domain.dispatcher.add_observer(census)
         self._order_events(stack)
         world.use_clocks(clocks_of(job), self.start_ns)
 
@@ -296,7 +298,7 @@ class Session:
         loop = self.loop
         self._recorded = recorded_run(self.job, self.world.domain, stack)
         if isinstance(loop, OrderedLoop):
-            recorded = None if self._recorded is None else self._recorded.order
+            recorded = None if self._recorded is None else self._recorded.policy
             with self._guarded.engaged():
                 self.world.use_scheduling(loop, scheduling_plan(self.job, self.start_ns, recorded))
             if switches_at_lines(self.job):
@@ -335,7 +337,7 @@ class Session:
         programs = (entry.make for entry in self._entries)
         self._late = LateLibraries(one.code for one in programs if isinstance(one, MainProgram))
         recorder = Recorder(writer, keep_payload=self._payload_filter())
-        self.world.domain.dispatcher.recorder = recorder
+        self.world.domain.dispatcher.record(recorder)
         write_job(writer, job)
         described = environment(job)
         self._numerics_known = "numerics" in described
@@ -527,7 +529,7 @@ class Session:
             )
         digest = self.digest
         # What finalizers say from now on comes too late.
-        self.world.domain.dispatcher.recorder = None
+        self.world.domain.dispatcher.record(None)
         return RunResult(
             path=None if self._writer is None else self._writer.place,
             digest=digest,

@@ -19,6 +19,7 @@ from rsltrace.run.driver import Driver
 from rsltrace.run.forked import ForkedRun, ForkResult
 from rsltrace.run.session import RunResult, Session
 from rsltrace.run.tap import Tap
+from rsltrace.words.times import parse_time_in_run
 
 T = TypeVar("T")
 Time = str | int | float
@@ -217,12 +218,13 @@ class Simulation:
         return not self.done
 
     def run_until(self, goal: Time | Callable[[], object], *, timeout: Time | None = None) -> bool:
-        """Run to a simulated time, or until ``goal()`` is true, asked after each time step.
+        """Run to a time since the start (``"@5s"``: to simulated time 5 s), or until ``goal()`` is
+        true, asked after each time step.
 
         Return False if the run ended, or ``timeout`` (simulated time) passed, before that.
         """
         if not callable(goal):
-            time_ns = parse_time(goal)
+            time_ns = self._goal_ns(goal)
             self._run_to(time_ns)
             return not self.done or self.now_ns >= time_ns
         limit_ns = None if timeout is None else self.now_ns + parse_time(timeout)
@@ -234,6 +236,11 @@ class Simulation:
             if self._driver.position() == before:
                 return bool(goal())
         return True
+
+    def _goal_ns(self, goal: Time) -> int:
+        if isinstance(goal, str):
+            return parse_time_in_run(goal).stamp_ns(self._session.start_ns)
+        return self._session.start_ns + parse_time(goal)
 
     def fork(
         self,

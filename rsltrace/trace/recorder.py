@@ -6,7 +6,7 @@ writer decides what becomes of the bytes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from rsltrace.model.code_line import CodeLine
 from rsltrace.model.entity import Entity
@@ -25,7 +25,7 @@ class Recorder:
     """The event under way, and the hash chain so far.
 
     ``outputs`` and ``output_hash`` belong to the event under way; ``end_event`` closes it.
-    ``add_event`` and ``add_output`` are the writer's.
+    ``add_output`` is the writer's, or tells others as well (``tell``).
     """
 
     def __init__(self, writer: TraceWriter, *, keep_payload: Callable[[str], bool]) -> None:
@@ -35,7 +35,7 @@ class Recorder:
         self.chain_hash = 0
         self.outputs = 0
         self.output_hash = 0
-        self.add_event = writer.add_event
+        self._add_event = writer.add_event
         self.add_output = writer.add_output
         self._add_sequence = writer.add_sequence
         self._add_payload = writer.add_payload
@@ -44,6 +44,22 @@ class Recorder:
     def digest(self) -> str:
         """The run so far as 16 hex digits: the chain hash of the last event."""
         return f"{self.chain_hash:016x}"
+
+    def tell(self, told: Sequence[Callable[[int, int, int], None]]) -> None:
+        """Call each of ``told`` with the kind, entity and content hash of every output from now on,
+        and nobody else."""
+        add_output = self.writer.add_output
+        if not told:
+            self.add_output = add_output
+            return
+
+        def tell(packed: bytes) -> None:
+            add_output(packed)
+            content_hash, entity, kind = OUTPUT_CONTENT.unpack(packed)
+            for one in told:
+                one(kind, entity, content_hash)
+
+        self.add_output = tell
 
     def output(self, kind: int, entity: int, content_hash: int, sequence: int = NO_SEQUENCE) -> int:
         """Add an output to the event under way; return which of its outputs it is."""
@@ -132,7 +148,7 @@ class Recorder:
             flags,
         )
         self.chain_hash = chain_hash = hash64(rest, self.chain_hash)
-        add_event = self.add_event
+        add_event = self._add_event
         add_event(rest, chain_hash)
         self.index += 1
         self.outputs = 0

@@ -2,7 +2,30 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 _ENDS_OF_NUMBERS = tuple("0123456789.")
+
+
+class TimeInRun(NamedTuple):
+    """A time in a run: counted from its start, or (``is_absolute``) the simulated time itself."""
+
+    time_ns: int
+    is_absolute: bool = False
+
+    def stamp_ns(self, start_ns: int) -> int:
+        """Return the simulated time in a run that starts at ``start_ns``."""
+        return self.time_ns if self.is_absolute else start_ns + self.time_ns
+
+
+START = TimeInRun(0)
+
+
+def parse_time_in_run(text: str) -> TimeInRun:
+    """Return a time in a run: ``2.5``, ``2.5s`` and ``20ms`` count from its start, ``@2.5`` is the
+    simulated time that events have. Raises ValueError."""
+    text = text.strip()
+    return TimeInRun(parse_stamp(text.removeprefix("@")), text.startswith("@"))
 
 
 def parse_stamp(text: str) -> int:

@@ -207,10 +207,14 @@ def entry_points(folder: Path) -> Groups:
     return {group: targets for group, targets in found.items() if targets}
 
 
+class _CaseSensitiveParser(configparser.ConfigParser):
+    def optionxform(self, optionstr: str) -> str:
+        return optionstr
+
+
 def _of_setup_py(given: object) -> Iterator[tuple[str, Iterable[object]]]:
     if isinstance(given, str):
-        parser = configparser.ConfigParser(delimiters=("=",), interpolation=None)
-        parser.optionxform = str  # type: ignore[assignment,method-assign]
+        parser = _CaseSensitiveParser(delimiters=("=",), interpolation=None)
         try:
             parser.read_string(given)
         except configparser.Error:

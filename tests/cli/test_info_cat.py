@@ -191,7 +191,7 @@ def test_cat_as_json(run: tuple[Path, Feeder]) -> None:
 
 def test_cat_as_json_with_payloads(run: tuple[Path, Feeder]) -> None:
     path, feeder = run
-    golden("cat_payloads.jsonl", output("cat", path, "--json", "--payloads", "--from", "10.1"))
+    golden("cat_payloads.jsonl", output("cat", path, "--json", "--payloads", "--from", "0.1"))
     values = [
         out["message"]["data"]
         for event in objects(path, "--payloads")
@@ -250,11 +250,12 @@ def test_cat_selects_by_time_both_ends_included(run: tuple[Path, Feeder]) -> Non
     path, feeder = run
     low, high = 10_060_000_000, 10_100_000_000
     expected = [e.index for e in feeder.events if low <= e.stamp_ns <= high]
-    assert indexes(path, "--from", "10.06", "--to", "10.1") == expected
-    assert indexes(path, "--from", "10060ms", "--to", "10100000000ns") == expected
-    assert indexes(path, "--from", "10.060000001", "--to", "10.099999999") != expected
+    assert indexes(path, "--from", "0.06", "--to", "0.1") == expected
+    assert indexes(path, "--from", "@10.06", "--to", "@10.1") == expected
+    assert indexes(path, "--from", "60ms", "--to", "100000000ns") == expected
+    assert indexes(path, "--from", "0.060000001", "--to", "0.099999999") != expected
     assert indexes(path, "--from", "1h") == []
-    assert indexes(path, "--to", "0") == []
+    assert indexes(path, "--to", "@0") == []
 
 
 def test_cat_limits_after_selecting(run: tuple[Path, Feeder]) -> None:
@@ -271,7 +272,7 @@ def test_cat_selects_across_segments(tmp_path: Path) -> None:
     calls = [e.index for e in feeder.events if e.kind is EventKind.CLIENT]
     assert [int(line.split()[0]) for line in lines(path, "--kind", "client")] == calls
     last = feeder.events[-1]
-    assert int(lines(path, "--from", f"{last.stamp_ns}ns")[-1].split()[0]) == last.index
+    assert int(lines(path, "--from", f"@{last.stamp_ns}ns")[-1].split()[0]) == last.index
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import contextlib
 import sys
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -27,6 +29,7 @@ from std_srvs.srv import Trigger
 
 from rsltrace import NodeSpec
 from rsltrace.errors import DeadlockError, NodeError
+from rsltrace.model.event import OutputKind
 
 pytestmark = pytest.mark.ros
 
@@ -699,3 +702,53 @@ def test_every_main_has_its_own_event_loop(simulate: Any) -> None:
         ("b", 1.0),
     ]
     assert log[0][2] is log[2][2] is not log[1][2]
+
+
+def spins_in_threads(node: Node) -> None:
+    executor = MultiThreadedExecutor()
+    executor.add_node(node)
+    executor.spin()
+
+
+def spins_in_a_thread(node: Node) -> None:
+    thread = threading.Thread(target=rclpy.spin, args=(node,))
+    thread.start()
+    thread.join()
+
+
+@pytest.mark.parametrize("spin", [rclpy.spin, spins_in_threads, spins_in_a_thread])
+@pytest.mark.parametrize("in_the_end", [False, True])
+def test_a_callback_cut_off_by_the_end_of_the_run_has_done_nothing_wrong(
+    simulate: Any, capfd: pytest.CaptureFixture[str], spin: Any, in_the_end: bool
+) -> None:
+    """Its context is down by then, so it cannot publish: nobody is told that it failed."""
+
+    def main() -> None:
+        rclpy.init()
+        node = Node("slow", enable_rosout=False)
+        publisher = node.create_publisher(UInt64, "numbers", 10)
+
+        def tick() -> None:
+            while True:
+                try:
+                    time.sleep(0.4)
+                finally:
+                    if in_the_end or rclpy.ok():
+                        publisher.publish(UInt64(data=1))
+                publisher.publish(UInt64(data=2))
+
+        node.create_timer(0.3, tick, callback_group=ReentrantCallbackGroup())
+        with contextlib.suppress(KeyboardInterrupt):
+            spin(node)
+        rclpy.try_shutdown()
+
+    recorded = simulate(main_spec(main), duration=2)
+    assert recorded.result.exit_code == 0
+    assert not [note for note in recorded.result.notes if "raised" in note]
+    said = capfd.readouterr()
+    assert "invalid" not in said.out + said.err
+    with recorded.trace() as trace:
+        every = [trace.outputs_of(index) for index in range(trace.event_count)]
+    outputs = [output.kind for outputs in every for output in outputs]
+    assert OutputKind.MESSAGE in outputs
+    assert OutputKind.EXCEPTION not in outputs

@@ -33,7 +33,7 @@ from trace_maker import uint64_message
 from rsltrace.cli.main import cli
 from rsltrace.diff.result.row_sign import Sign
 from rsltrace.trace.decode import to_plain
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import START, parse_time_in_run
 
 SAMPLES = Path(__file__).parents[2] / "sample_traces" / "delayed_input"
 
@@ -192,7 +192,7 @@ def test_filters_mean_the_messages_that_they_say(
             key[0] == "/pose" and ("0.55" in texts[key] or "0.56" in texts[key]) and key[1] != 140
         ),
         "level:warn": lambda key: False,
-        "time:>1700000000": lambda key: False,
+        "time:>@1700000000": lambda key: False,
         "": lambda key: True,
     }.items():
         assert _chosen(session, text) == {key for key in everything if means(key)}, text
@@ -255,7 +255,7 @@ def test_starting_somewhere_in_a_recording(
 ) -> None:
     session = open_recordings(bags[:1])
     list(session.read())
-    session.go_to_message(*((int(at), 0) if at.isdecimal() else (None, parse_stamp(at))))
+    session.go_to_message(*((int(at), START) if at.isdecimal() else (None, parse_time_in_run(at))))
     recording = session.recordings[0]
     name, number = session.keys[session.place][0], session.number_of(session.row)
     topic = session.topics(session.keys[session.place])[0]

@@ -120,7 +120,7 @@ def test_times_since_1970_count_from_the_start(tmp_path: Path, drive: Callable[.
         assert viewer.place == 15
         assert "1.5 s after the start, 1700000001.500000000 s" in viewer.text
         await viewer.press("t")
-        await viewer.type("1700000002")
+        await viewer.type("@1700000002")
         assert viewer.place == 20
 
     drive(path, steps, size=(140, 30))

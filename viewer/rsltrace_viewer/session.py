@@ -16,6 +16,7 @@ from rsltrace.model.entity import WITH_TOPIC, EntityKind
 from rsltrace.model.event import EventKind, OutputKind
 from rsltrace.model.stamp import NS_PER_S, format_duration
 from rsltrace.trace.native import is_native, refuse_native
+from rsltrace.words.times import TimeInRun
 from rsltrace_viewer.model.chains import Chain, read_chains
 from rsltrace_viewer.model.checks import Checks, read_checks
 from rsltrace_viewer.model.history import Event, History, Marks
@@ -587,13 +588,14 @@ class Session:
         beyond = [place for place in places if (place - self.place) * step > 0]
         return min(beyond, key=lambda place: abs(place - self.place), default=None)
 
-    def place_at_time(self, stamp_ns: int) -> int:
+    def place_at_time(self, time: TimeInRun) -> int:
         """Return the place of the first event at a time or later; of the last one if none is."""
-        found = [
-            (run.end_ns < stamp_ns, self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B))
-            for name, run in self.shown.items()
-            if run.count
-        ]
+        found = []
+        for name, run in self.shown.items():
+            if run.count:
+                stamp_ns = time.stamp_ns(run.trace.start_ns)
+                place = self.view.place_of(run.index_at(stamp_ns), other=name == RUN_B)
+                found.append((run.end_ns < stamp_ns, place))
         over, place = min(found)
         return max(place for _, place in found) if over else place
 

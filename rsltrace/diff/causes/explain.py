@@ -32,6 +32,7 @@ from rsltrace.diff.result.events import EventView
 from rsltrace.diff.result.settings import Setting
 from rsltrace.diff.result.verdicts import Root, Verdict
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
+from rsltrace.trace.reader import Trace
 from rsltrace.words.phrases import seconds_text
 
 ANCESTORS_MAX = 5
@@ -328,22 +329,30 @@ class Explainer:
             if "://" in f"{path_a} {path_b}":  # which the viewer does not open
                 return f"rsltrace diff {path_a} {path_b} --all"
             return f"rsltrace view {path_a} {path_b}"
-        until = seconds_text(view.stamp_ns)
         if judgement.root in _AGAIN and view.kind is not EventKind.CONSTRUCT:
             record = record_again(self.run_a.trace)
             self.warnings.update(dict.fromkeys(record.warnings))
             if record.command:
                 last = max(v.stamp_ns for v in (judgement.a, judgement.b) if v is not None)
-                again = f"{record.command} --until {seconds_text(last)} -o again.mcap --force"
+                until = _time_in_run(last, self.run_a.trace)
+                again = f"{record.command} --until {until} -o again.mcap --force"
                 return f"{again}; rsltrace diff {path_a} {path_b} --again again.mcap"
-        path = path_a if judgement.a is not None else path_b
+        in_a = judgement.a is not None
+        path = path_a if in_a else path_b
+        time = _time_in_run(view.stamp_ns, (self.run_a if in_a else self.run_b).trace)
         node = view.entity.node
         choice = f" --node {shlex.quote(node)}" if node and view.kind is not EventKind.BAG else ""
         if view.kind is EventKind.BAG:
             choice = f" --topic {shlex.quote(view.entity.name)}"
         if view.kind is EventKind.CONSTRUCT:
             choice = " --kind construct"
-        return f"rsltrace cat {path}{choice} --from {until} --to {until} --json --payloads"
+        return f"rsltrace cat {path}{choice} --from {time} --to {time} --json --payloads"
+
+
+def _time_in_run(stamp_ns: int, trace: Trace) -> str:
+    """Return a simulated time as an option takes it: from the start of the run, if it is later."""
+    since_ns = stamp_ns - trace.start_ns
+    return seconds_text(since_ns) if since_ns >= 0 else f"@{seconds_text(stamp_ns)}"
 
 
 def _word(path: str) -> str:

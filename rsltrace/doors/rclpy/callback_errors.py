@@ -15,7 +15,7 @@ from rsltrace.errors import RsltraceError, RunError
 from rsltrace.loop.loop import Dispatchable
 from rsltrace.loop.stop import Stop
 from rsltrace.middleware.events.event import OutsideEvent
-from rsltrace.middleware.events.failure import Raised, end_run, note_raised
+from rsltrace.middleware.events.failure import Raised, described, end_run, note_raised
 from rsltrace.model.event import EventKind
 
 _LIFE = frozenset((EventKind.CONSTRUCT, EventKind.SHUTDOWN, EventKind.CLOCK_JUMP))
@@ -31,12 +31,16 @@ class RclpyDoor:
 
     def raised(self, error: BaseException, handle: Dispatchable) -> None:
         """Record what the event under way raised, and decide what becomes of the run."""
-        if isinstance(error, RunEnded):
-            return
         stacks = self._stacks
+        if isinstance(error, RunEnded):
+            if not (stacks.ending.closing and isinstance(error.__context__, KeyboardInterrupt)):
+                return
+            error = error.__context__  # it was told to end, and cut off while it saw to that
         if os.getpid() != stacks.runners.process:
             end_child(error)
-        raised = note_raised(stacks.dispatcher, error, handle)
+        told_to_end = stacks.ending.closing and isinstance(error, KeyboardInterrupt)
+        note = described if told_to_end else note_raised
+        raised = note(stacks.dispatcher, error, handle)
         mailbox = None if isinstance(handle, OutsideEvent) else mailbox_of(handle)
         node = self._who_goes_on(error)
         if mailbox is not None and node is None:

@@ -19,6 +19,7 @@ from rsltrace.doors.rclpy.world import World
 from rsltrace.errors import RunError
 from rsltrace.middleware.entity import Runnable, on_no_executor
 from rsltrace.middleware.events.event import OutsideEvent
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.middleware.participant import Participant
 from rsltrace.model.draw import Draw, encode_draw
 from rsltrace.model.event import NO_EVENT, EventKind
@@ -52,19 +53,19 @@ class NodeFault:
     for_ns: int | None = None
 
 
-class NodeFaults:
+class NodeFaults(EventObserver):
     """The faults of one run that are about nodes. Armed before the first node is made."""
+
+    order = ObserverOrder.FAULTS
 
     def __init__(self, world: World, faults: Sequence[NodeFault], start_ns: int) -> None:
         self.world = world
         self._strikes = [_Strike(self, fault) for fault in faults]
         self._counts: dict[str, int] = {}
-        dispatcher = world.domain.dispatcher
-        self._end_event: Callable[[], None] = dispatcher.end_event
         by_event = [strike for strike in self._strikes if strike.fault.event is not None]
         self._by_event = sorted(by_event, key=lambda strike: -(strike.fault.event or 0))
         if self._by_event:
-            dispatcher.end_event = self._counted  # type: ignore[method-assign]
+            world.domain.dispatcher.add_observer(self)
         for strike in self._strikes:
             if strike.fault.at_ns is not None:
                 world.domain.loop.schedule(start_ns + strike.fault.at_ns, strike.come)
@@ -77,12 +78,13 @@ class NodeFaults:
             if strike.missed:
                 yield strike.fault.where, strike.missed
 
-    def _counted(self) -> None:
-        """Stand in for ``Dispatcher.end_event``: end the event, then see what follows it."""
-        self._end_event()
+    def after_event(self) -> None:
+        """See which faults follow the event."""
         events = self.world.domain.loop.events
         while self._by_event and events > (self._by_event[-1].fault.event or 0):
             self._by_event.pop().come()
+        if not self._by_event:
+            self.world.domain.dispatcher.remove_observer(self)
 
     def _sent(self, publisher: Any, data: bytes) -> None:
         topic = publisher.topic

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from rsltrace.loop.recorded import THE_RUN, described
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.model.entity import Entity, EntityKind
 
 _ACTIONS = (EntityKind.ACTION_CLIENT, EntityKind.ACTION_SERVER)
@@ -28,8 +29,10 @@ class Asker(NamedTuple):
     namespace: str
 
 
-class Census:
+class Census(EventObserver):
     """The names there have been, each once, in the order of their coming."""
+
+    order = ObserverOrder.CENSUS
 
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
@@ -46,7 +49,7 @@ class Census:
         """Every entity as in ``described``, by its id, if somebody wants to know: a run may make
         a thread in each of a million callbacks."""
 
-    def add(self, entity: Entity) -> None:
+    def entity_created(self, entity: Entity) -> None:
         """Remember an entity; its node comes before it."""
         if entity.kind is EntityKind.NODE:
             self._names[entity.id] = entity.name

@@ -1,7 +1,7 @@
 """How an event is run and recorded.
 
 ``Dispatcher.execute`` is the middle of everything: each event of a run passes through it once. Keep
-it small; what only some events need belongs elsewhere.
+it small; what only some runs need is an observer (``observer.py``).
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from rsltrace.errors import OutputError
 from rsltrace.loop.loop import Dispatchable, EventLoop
 from rsltrace.middleware.events.entity_book import EntityBook
 from rsltrace.middleware.events.event import Door, Event, OutsideEvent, Owner
+from rsltrace.middleware.events.observer import EventCall, EventObserver, overrides
 from rsltrace.middleware.events.outcome import Outcome
 from rsltrace.model.event import NO_EVENT, EventKind, OutputKind
 from rsltrace.model.operation import pack_operation
@@ -26,6 +27,7 @@ class Dispatcher:
 
     ``recorder`` is None in a run that records nothing; ``unrecorded`` then counts the outputs of
     the event under way. ``door`` speaks for what belongs to no participant (construction, mains).
+    ``resume_observers`` and ``node_observers`` are those to be told by whoever resumes a callback.
     """
 
     def __init__(self, loop: EventLoop) -> None:
@@ -35,11 +37,51 @@ class Dispatcher:
         self.outcome = Outcome()
         self.recorder: Recorder | None = None
         self.unrecorded = 0
-        self.on_node: Callable[..., None] | None = None
-        """Told which node's code is going to run (or ``is_made``), if somebody has to know."""
-        self.on_resume: Callable[[], None] | None = None
-        """Told, on its own stack, that a callback goes on after a wait, if somebody has to know."""
         self.door: Door
+        self._pending = self.entities.pending
+        self._observers: list[EventObserver] = []
+        self._before: tuple[EventObserver, ...] = ()
+        self._after: tuple[EventObserver, ...] = ()
+        self.resume_observers: tuple[EventObserver, ...] = ()
+        self.node_observers: tuple[EventObserver, ...] = ()
+
+    # -- who watches and steers --------------------------------------------------------------------
+
+    def record(self, recorder: Recorder | None) -> None:
+        """Record with ``recorder`` from now on; None: nothing any more."""
+        self.recorder = recorder
+        if recorder is not None:
+            recorder.tell([one.output for one in self._with("output")])
+
+    def add_observer(self, observer: EventObserver) -> None:
+        """Have an observer called from now on, among the others as its ``order`` says."""
+        assert all(one is not observer for one in self._observers), "it is there already"
+        self._observers.append(observer)
+        self._observers.sort(key=lambda one: one.order)  # stable
+        self._choose_observers()
+
+    def remove_observer(self, observer: EventObserver) -> None:
+        """Call an observer no longer, if it is called."""
+        self._observers = [one for one in self._observers if one is not observer]
+        self._choose_observers()
+
+    def _choose_observers(self) -> None:
+        """Find out for each hook who has one: what nobody wants to know costs nothing."""
+        self._before = self._with("before_event")[::-1]
+        self._after = self._with("after_event")
+        self.resume_observers = self._with("resumed")
+        self.node_observers = self._with("node_entered")
+        self.entities.observers = self._with("entity_created")
+        self.record(self.recorder)
+
+    def _with(self, hook: str) -> tuple[EventObserver, ...]:
+        return tuple(one for one in self._observers if overrides(one, hook))
+
+    def _is_to_happen(self, call: EventCall) -> bool:
+        """Ask observers before an event; the first that does not want it is the last one asked."""
+        return all(observer.before_event(call) for observer in self._before)
+
+    # -- events ------------------------------------------------------------------------------------
 
     def execute(
         self,
@@ -52,14 +94,22 @@ class Dispatcher:
         cause_event: int,
         cause_output: int,
         input_hash: int,
+        is_decided: int = False,
     ) -> None:
-        """Run one event: call ``callback(*args)`` and record what came of it."""
+        """Run one event: call ``callback(*args)`` and record what came of it. If it ``is_decided``,
+        observers have been asked."""
+        if self._before and not is_decided:
+            call = EventCall(
+                handle, entity, node, kind, callback, args, cause_event, cause_output, input_hash
+            )
+            if self._is_to_happen(call):
+                self.execute(*call.values(), True)
+            call.end()
+            return
         event = self.event
         event.handle = handle
         event.entity = entity
         event.node = node
-        if self.on_node is not None:
-            self.on_node(node)
         event.kind = kind
         event.cause_event = cause_event
         event.cause_output = cause_output
@@ -86,7 +136,7 @@ class Dispatcher:
 
     def end_event(self) -> None:
         """Record the event under way, which may be a later part of the one ``execute`` began."""
-        if self.entities.pending:
+        if self._pending:
             self.entities.settle(self.recorder)
         event = self.event
         loop = self.loop
@@ -111,6 +161,9 @@ class Dispatcher:
         loop.events += 1
         event.flags = 0
         event.quiet = False
+        if self._after:
+            for observer in self._after:
+                observer.after_event()
 
     def run_outside(
         self,
@@ -131,7 +184,7 @@ class Dispatcher:
     def has_outputs(self) -> bool:
         """Return whether the event under way has had outputs."""
         outputs = self.unrecorded if self.recorder is None else self.recorder.outputs
-        return bool(outputs or self.entities.pending)
+        return bool(outputs or self._pending)
 
     @contextlib.contextmanager
     def outside_events(self) -> Iterator[None]:

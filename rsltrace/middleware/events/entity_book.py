@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, Protocol
 
 from rsltrace.middleware.events.census import Census
+from rsltrace.middleware.events.observer import EventObserver
 from rsltrace.model.entity import Entity
 from rsltrace.trace.recorder import Recorder
 
@@ -25,13 +26,15 @@ class EntityBook:
     """Gives out ids, and keeps what has been created until it can be written down.
 
     ``pending`` was created in the event under way, ``unowned`` still has no owner (a timer that no
-    node lists yet). ``census`` is told of everything, if somebody wants to know.
+    node lists yet). ``census`` is that of the run, if it has one; ``observers`` are told
+    of each entity.
     """
 
     def __init__(self) -> None:
         self.pending: list[Recordable] = []
         self.unowned: list[Recordable] = []
         self.census: Census | None = None
+        self.observers: tuple[EventObserver, ...] = ()
         self._count = 0
 
     def new_id(self) -> int:
@@ -42,15 +45,17 @@ class EntityBook:
     def settle(self, recorder: Recorder | None) -> None:
         """Write down the entities created in this event, now that their owners are known."""
         waiting, self.unowned = self.unowned, []
-        created, self.pending = self.pending, []
-        for one in [*waiting, *created]:
+        created = [*waiting, *self.pending]
+        self.pending.clear()
+        for one in created:
             if not one.settle():
                 self.unowned.append(one)
-            elif one.announced:
-                if self.census is not None:
-                    self.census.add(one.entity())
+            elif one.announced and (recorder is not None or self.observers):
+                entity = one.entity()
                 if recorder is not None:
-                    recorder.entity(one.entity())
+                    recorder.entity(entity)
+                for observer in self.observers:
+                    observer.entity_created(entity)
 
     def look_again(self, node: Any) -> None:
         """Write down in this event what of ``node`` has waited for an owner."""

@@ -64,13 +64,24 @@ class Raised:
         )
 
 
+def described(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
+    """Return how the event under way has raised."""
+    node = dispatcher.event.node
+    return Raised(
+        error,
+        handle.describe(),
+        node.fully_qualified_name if node is not None else "",
+        dispatcher.loop.now_ns,
+        user_traceback(error),
+        text_of(error),
+    )
+
+
 def note_raised(dispatcher: Dispatcher, error: BaseException, handle: Dispatchable) -> Raised:
     """Record that the event under way has raised, as one of its outputs; return how."""
     event, recorder = dispatcher.event, dispatcher.recorder
     event.flags |= _RAISED
-    node = event.node.fully_qualified_name if event.node is not None else ""
-    stamp_ns = dispatcher.loop.now_ns
-    raised = Raised(error, handle.describe(), node, stamp_ns, user_traceback(error), text_of(error))
+    raised = described(dispatcher, error, handle)
     if recorder is not None:
         content = hash64(f"{raised.kind}\0{raised.said}".encode())
         recorder.detail(

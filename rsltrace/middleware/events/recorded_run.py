@@ -12,31 +12,32 @@ from rsltrace.loop.loop import NOTHING_LEFT
 from rsltrace.loop.recorded import Recorded, RecordedEvent, event_text
 from rsltrace.loop.stop import Stop
 from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.model.stamp import format_seconds
 
 
-class RecordedRun:
+class RecordedRun(EventObserver):
     """Compares the events of a run with those of a recording; the first that differs ends it.
 
     ``is_whole`` says that the recording was not cut off.
     """
 
+    order = ObserverOrder.RECORDED_ORDER
+
     def __init__(self, dispatcher: Dispatcher, order: Recorded, *, is_whole: bool) -> None:
         self._dispatcher = dispatcher
-        self.order = order
+        self.policy = order
         self._is_whole = is_whole
-        self._end_event = dispatcher.end_event
         self._last: tuple[int, RecordedEvent] | None = None
         self._is_beyond = False
         self._other_time: tuple[int, RecordedEvent, int] | None = None
-        dispatcher.end_event = self._compared  # type: ignore[method-assign]
+        dispatcher.add_observer(self)
 
-    def _compared(self) -> None:
-        """Stand in for ``Dispatcher.end_event``: end the event, then see whether it was right."""
-        loop, order = self._dispatcher.loop, self.order
+    def after_event(self) -> None:
+        """See whether the event was right."""
+        loop, order = self._dispatcher.loop, self.policy
         event, outcome = self._dispatcher.event, self._dispatcher.outcome
-        index, kind, entity, handle = loop.events, event.kind, event.entity, event.handle
-        self._end_event()
+        index, kind, entity, handle = loop.events - 1, event.kind, event.entity, event.handle
         if outcome.ended_after is not None or outcome.error is not None:
             return
         expected = order.event(index)
@@ -58,7 +59,7 @@ class RecordedRun:
 
     def notes(self) -> Iterator[str]:
         """Yield what somebody should know who takes the run for the recorded one."""
-        loop, file = self._dispatcher.loop, self.order.file
+        loop, file = self._dispatcher.loop, self.policy.file
         if self._other_time is not None:
             index, expected, now_ns = self._other_time
             yield (
@@ -74,7 +75,7 @@ class RecordedRun:
             )
         ended_after = self._dispatcher.outcome.ended_after
         count = loop.events if ended_after is None else ended_after
-        following = None if self._is_beyond else self.order.event(count)
+        following = None if self._is_beyond else self.policy.event(count)
         stopped = loop.stopped
         if following is not None and (
             following.stamp_ns < loop.now_ns

@@ -97,6 +97,7 @@ def replay_from_bag(
         inputs=inputs,
         compared=len(there.puts),
         changes=found,
+        start_ns=done.start_ns,
         end_ns=done.end_ns,
         ended=done.stop_reason,
         path=None if output is None else place,

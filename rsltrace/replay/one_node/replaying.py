@@ -78,6 +78,7 @@ def replay_node(
         inputs=session.fed,
         compared=len(compared),
         changes=found[:1] if until_diverged else found,
+        start_ns=run.start_ns,
         end_ns=run.end_ns,
         ended=run.stop_reason,
         path=None if output is None else place,

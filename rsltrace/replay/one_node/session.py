@@ -13,6 +13,8 @@ from rsltrace.errors import ReplayError
 from rsltrace.loop.fed import FedLoop, FedOrderedLoop, end_of
 from rsltrace.loop.loop import EventLoop
 from rsltrace.loop.policy import Fifo
+from rsltrace.middleware.events.dispatcher import Dispatcher
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.middleware.services import Client
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import EventKind, OutputKind
@@ -112,29 +114,8 @@ class FedSession(Session):
             "entries": ",".join(map(str, self._unit.entries)),
         }
         self._writer.add_metadata(METADATA_FED, told)
-        self._listen()
-
-    def _listen(self) -> None:
-        """Hear of the unit's entities and events."""
-        recorder = self.world.domain.dispatcher.recorder
-        assert recorder is not None
-        met, end_event = recorder.entity, recorder.end_event
-        names: dict[int, str] = {0: ""}
-        script = self.script
-
-        def entity(one: Entity) -> None:
-            met(one)
-            if one.node == one.id:
-                names[one.id] = one.name
-            script.met(one, names.get(one.node, ""))
-
-        def ended(stamp_ns: int, kind: int, flags: int, whose: int, *rest: int) -> None:
-            end_event(stamp_ns, kind, flags, whose, *rest)
-            if kind != EventKind.BAG:
-                script.happened(kind, whose, stamp_ns)
-
-        recorder.entity = entity  # type: ignore[method-assign, assignment]
-        recorder.end_event = ended  # type: ignore[method-assign, assignment]
+        dispatcher = self.world.domain.dispatcher
+        dispatcher.add_observer(_Progress(dispatcher, self.script))
 
     @property
     def fed(self) -> int:
@@ -226,6 +207,29 @@ class FedSession(Session):
             if channel.type == type_name:
                 return channel.schema_text, str(channel.metadata.get("topic_type_hash", ""))
         return "", ""
+
+
+class _Progress(EventObserver):
+    """Tells a script of the unit's entities and events."""
+
+    order = ObserverOrder.SCRIPT
+
+    def __init__(self, dispatcher: Dispatcher, script: RecordedScript) -> None:
+        self._dispatcher = dispatcher
+        self._script = script
+        self._names: dict[int, str] = {0: ""}
+
+    def entity_created(self, entity: Entity) -> None:
+        """Tell of an entity and the name of its node."""
+        if entity.node == entity.id:
+            self._names[entity.id] = entity.name
+        self._script.met(entity, self._names.get(entity.node, ""))
+
+    def after_event(self) -> None:
+        """Tell of an event that is not done for others."""
+        event = self._dispatcher.event
+        if event.kind != EventKind.BAG:
+            self._script.happened(event.kind, event.entity, self._dispatcher.loop.now_ns)
 
 
 def run_fed(session: FedSession, watch: Watch | None = None) -> RunResult:

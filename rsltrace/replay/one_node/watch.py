@@ -7,17 +7,25 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from rsltrace.loop.stop import Stop
+from rsltrace.middleware.events.observer import EventObserver, ObserverOrder
 from rsltrace.model.entity import Entity
 from rsltrace.model.event import OutputKind
 from rsltrace.replay.one_node.outputs import Put
 from rsltrace.trace.format import TOPIC_ROSOUT
 
 if TYPE_CHECKING:
+    from rsltrace.loop.loop import EventLoop
     from rsltrace.run.session import Session
 
+_SENT = frozenset(
+    map(int, (OutputKind.MESSAGE, OutputKind.REQUEST, OutputKind.RESPONSE, OutputKind.LOG))
+)
 
-class Watch:
+
+class Watch(EventObserver):
     """Compares the outputs of ``node`` with ``recorded`` ones, and ends the run with ``stop``."""
+
+    order = ObserverOrder.OUTPUTS
 
     def __init__(self, recorded: Sequence[Put], node: str, stop: Stop) -> None:
         self._stop = stop
@@ -30,35 +38,29 @@ class Watch:
             self._expected.setdefault((int(put.key[0]), put.key[1]), deque()).append(put)
         self._met: set[int] = set()
         self._sent: list[tuple[int, int, int]] = []
+        self._loop: EventLoop
 
     def attach(self, session: Session) -> None:
         """Compare what comes from now on."""
-        recorder = session.world.domain.dispatcher.recorder
-        assert recorder is not None, "a replay is recorded"
-        met, message, end_event = recorder.entity, recorder.message, recorder.end_event
-        loop = session.loop
+        self._loop = session.loop
+        session.world.domain.dispatcher.add_observer(self)
 
-        def entity(one: Entity) -> None:
-            met(one)
-            if one.node == one.id and one.name == self._node:
-                self._nodes.add(one.id)
-            if one.node in self._nodes:
-                self._own[one.id] = one.name
+    def entity_created(self, entity: Entity) -> None:
+        """Remember the node and what belongs to it."""
+        if entity.node == entity.id and entity.name == self._node:
+            self._nodes.add(entity.id)
+        if entity.node in self._nodes:
+            self._own[entity.id] = entity.name
 
-        def sent(
-            kind: int, entity: int, channel: int, stamp_ns: int, data: bytes, content_hash: int
-        ) -> int:
+    def output(self, kind: int, entity: int, content_hash: int) -> None:
+        """Keep what is sent until the event is over."""
+        if kind in _SENT:
             self._sent.append((kind, entity, content_hash))
-            return message(kind, entity, channel, stamp_ns, data, content_hash)
 
-        def ended(stamp_ns: int, *event: int) -> None:
-            end_event(stamp_ns, *event)
-            if not self._as_recorded(stamp_ns):
-                loop.stop(self._stop)
-
-        recorder.entity = entity  # type: ignore[method-assign, assignment]
-        recorder.message = sent  # type: ignore[method-assign]
-        recorder.end_event = ended  # type: ignore[method-assign, assignment]
+    def after_event(self) -> None:
+        """End the run if the outputs of the event were not as recorded."""
+        if not self._as_recorded(self._loop.now_ns):
+            self._loop.stop(self._stop)
 
     def _as_recorded(self, now_ns: int) -> bool:
         """Return whether what an event has sent was recorded, and nothing is missing until now."""

@@ -24,10 +24,12 @@ from rsltrace.guard.virtual.pytest_modules import REWRITES, rewritten_in_pytest
 from rsltrace.guard.virtual.randomness import begin_shared
 from rsltrace.guard.virtual.tbb_threads import one_tbb_thread
 from rsltrace.guard.virtual.torch_graphs import COMPILES, plain_in_graphs
-from rsltrace.guard.virtual.torch_streams import torch_streams
+from rsltrace.guard.virtual.torch_streams import TorchStreams, torch_streams
 from rsltrace.guard.virtual.user_modules import user_modules
 from rsltrace.guard.watched.cffi_libraries import LOADS_LIBRARIES, watched_libraries
 from rsltrace.job import Job, NodeSpec, policy_of
+from rsltrace.middleware.events.event import Event
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.model.finding import Finding, GuardCount, Mode, Source
 from rsltrace.trace.format import METADATA_GUARD
 from rsltrace.trace.guarded import counts_text
@@ -43,6 +45,27 @@ if TYPE_CHECKING:
 _ONE_PROCESSOR = "'taskset --cpu-list 0' before 'rsltrace record' gives it one processor"
 
 
+class _TorchGenerators(EventObserver):
+    """Gives each node's code the state of torch's generator that is the node's own."""
+
+    order = ObserverOrder.GENERATORS
+
+    def __init__(self, streams: TorchStreams, event: Event, name_of: Callable[[], str]) -> None:
+        self._streams = streams
+        self._event = event
+        self._name_of = name_of
+
+    def before_event(self, call: EventCall) -> bool:
+        """Enter the node whose code is going to run."""
+        self._event.handle, self._event.node = call.handle, call.node
+        self._streams.enter(self._name_of())
+        return True
+
+    def node_entered(self, node: object, *, is_made: bool) -> None:
+        """Enter a node, or give the state of who makes one its name."""
+        (self._streams.rename if is_made else self._streams.enter)(self._name_of())
+
+
 class RunGuard:
     """The guard of one run; without one (``guard: false``) everything here does nothing."""
 
@@ -53,6 +76,7 @@ class RunGuard:
         self._world: World | None = None
         self._early: list[Finding] = []
         self._unpinned: list[tuple[str, str]] = []
+        self._has_torch = False
 
     def begin(self, world: World, replay: Path | None = None) -> None:
         """Make the guard of a world: from here on ``engaged`` puts it in charge."""
@@ -103,16 +127,14 @@ class RunGuard:
     def torch_loaded(self) -> None:
         """Give each node a state of torch's generator from now on."""
         world, guard = self._world, self.guard
-        if world is None or guard is None or world.domain.dispatcher.on_node is not None:
+        if world is None or guard is None or self._has_torch:
             return
+        self._has_torch = True
         streams = torch_streams(self._stack, guard)
-        name_of = guard.context.node
-
-        def on_node(node: object, *, is_made: bool = False) -> None:
-            (streams.rename if is_made else streams.enter)(name_of())
-
-        world.domain.dispatcher.on_node = on_node
-        streams.enter(name_of())
+        world.domain.dispatcher.add_observer(
+            _TorchGenerators(streams, world.domain.event, guard.context.node)
+        )
+        streams.enter(guard.context.node())
 
     def stays_threaded(self, library: str, why: str) -> None:
         """Report a library that computes in threads of its own, which cannot be pinned."""

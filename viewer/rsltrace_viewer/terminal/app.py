@@ -15,7 +15,7 @@ from textual.widget import Widget
 
 from rsltrace.errors import TraceError
 from rsltrace.model.printable import printable, shortened
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import TimeInRun, parse_time_in_run
 from rsltrace_viewer.model.history import Event
 from rsltrace_viewer.model.query.tokens import QueryError
 from rsltrace_viewer.model.run import Run
@@ -121,9 +121,8 @@ class ViewerApp(Stepping):
             self._filter(event.text)
         elif not self.session.empty and event.text.strip():
             if event.kind == "time":
-                stamp_ns = parse_stamp(event.text)
-                stamp_ns += self.session.base_ns if stamp_ns < self.session.base_ns else 0
-                self.go(self.session.place_at_time(stamp_ns), centre=True)
+                time = parse_time_in_run(event.text)
+                self.go(self.session.place_at_time(time), centre=True)
             else:
                 name, index = parse_index(event.text)
                 run = self.session.runs.get(name) or next(iter(self.session.shown.values()))
@@ -221,7 +220,7 @@ class ViewerApp(Stepping):
         if event.order:
             self.go(event.position, centre=True)
         else:
-            self.go(session.place_at_time(event.position), centre=True)
+            self.go(session.place_at_time(TimeInRun(event.position, is_absolute=True)), centre=True)
 
     def on_lanes_view_zoomed(self, event: LanesView.Zoomed) -> None:
         """The wheel was turned over the lanes."""

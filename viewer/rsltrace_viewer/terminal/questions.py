@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import chain
 
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import completions
 from rsltrace_viewer.session import Session
 from rsltrace_viewer.terminal.widgets.prompt import Question
@@ -37,7 +37,13 @@ def question_of(kind: str, session: Session) -> Question:
             check_query,
             complete,
         ),
-        "time": Question("time", "go to time", "seconds, or 20ms, 3us, 500ns", "", parse_stamp),
+        "time": Question(
+            "time",
+            "go to time",
+            "seconds after the start, or 20ms, 3us; @ and a simulated time",
+            "",
+            parse_time_in_run,
+        ),
         "index": Question("index", "go to event", _numbers(session), "", parse_index),
     }
     return questions[kind]

@@ -125,8 +125,8 @@ class Standby:
             ):
                 break
             event.handle, event.entity, event.node = blocked.event
-            if dispatcher.on_node is not None:
-                dispatcher.on_node(event.node)
+            for observer in dispatcher.node_observers:
+                observer.node_entered(event.node, is_made=False)
             pump.standby = self
             all_blocked[blocked] = None
             following = self._following()
@@ -195,7 +195,7 @@ def standby_of(
         or pump.standby is not None
         or type(stacks.loop) is not EventLoop
         or type(stacks.loop.timers) is not CreationOrderQueue
-        or stacks.dispatcher.on_resume is not None
+        or stacks.dispatcher.resume_observers
         or event.on_end is not None
         or not isinstance(event.handle, OutsideEvent)
         or _get_running_loop() is not None

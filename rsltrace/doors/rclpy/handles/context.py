@@ -7,10 +7,13 @@ belongs to a context that is down can be destroyed, and hardly anything else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
+
+from greenlet import getcurrent
 
 from rsltrace.doors.rclpy.arguments import InvalidArgumentsError, RosArguments
 from rsltrace.doors.rclpy.handles.destroyable import Handle
+from rsltrace.doors.rclpy.stacks.runners import RunEnded
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.loop.stop import Stop
 from rsltrace.model.event import OutputKind
@@ -66,16 +69,29 @@ class ContextHandle(Handle):
         for node in graph.nodes:
             if getattr(node, "context", None) is self:
                 for publisher in graph.publishers_of(node):
-                    publisher.publish = publisher.publish_raw = self._refuse  # type: ignore[attr-defined]
+                    publisher.refuse(self._refuse)  # type: ignore[attr-defined]
 
-    def _refuse(self, message: object) -> None:
-        """Stand in for the methods of publishers, so that no publication has to ask first."""
+    def _refuse(self, message: object) -> NoReturn:
+        self._cut_off()
         raise self._real.RCLError("Failed to publish: publisher's context is invalid")
 
     def require(self, task: str) -> None:
         """Raise RCLError if the context is down: rcl refuses the task then."""
         if not self.is_up:
+            self._cut_off()
             raise self._real.RCLError(f"{task}: {_DOWN}")
+
+    def _cut_off(self) -> None:
+        """End a callback or thread that the end of the run has met in the middle: that is no fault
+        of theirs. Main itself is told of the end, and sees to the rest as it would natively.
+
+        :raises RunEnded: in all code of a main's program but that of main.
+        """
+        stacks, main = self.stacks, self.program.stack
+        if not stacks.ending.closing or main is None:
+            return
+        if stacks.dispatcher.in_callback() or main is not getcurrent():
+            raise RunEnded
 
 
 def _only_ros(arguments: Sequence[str]) -> list[str]:

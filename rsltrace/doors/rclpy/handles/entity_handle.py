@@ -16,6 +16,9 @@ from rsltrace.middleware.receiver import Receiver
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+Alarm = Callable[[], None]
+"""Is called whenever something comes for an entity."""
+
 _LISTS = ("subscriptions", "timers", "clients", "services", "guards", "waitables")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.handles.entity_handle import Alarm, EntityHandle
 from rsltrace.doors.rclpy.stacks.stacks import Stacks
 from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.model.entity import EntityKind
@@ -16,6 +16,7 @@ class GuardConditionHandle(EntityHandle):
 
     A trigger that comes before the last one was handled is merged with it. Executors make guard
     conditions, too, to wake themselves; no node lists those and nothing comes of their triggers.
+    ``alarms`` hear of every trigger.
     """
 
     kind = EntityKind.GUARD_CONDITION
@@ -27,16 +28,18 @@ class GuardConditionHandle(EntityHandle):
         self._triggered = False
         self._cause = (0, 0)
         self._found: tuple[int, int] | None = None
+        self.alarms: tuple[Alarm, ...] = ()
 
     def trigger_guard_condition(self) -> None:
         """Make the callback ready."""
-        if self._triggered:
-            return
-        self._triggered = True
-        if self.active:
-            loop, dispatcher = self.dispatcher.loop, self.dispatcher
-            self._cause = (loop.events, dispatcher.note(OutputKind.GUARD, self.entity_id))
-            loop.ready.append(self)
+        if not self._triggered:
+            self._triggered = True
+            if self.active:
+                loop, dispatcher = self.dispatcher.loop, self.dispatcher
+                self._cause = (loop.events, dispatcher.note(OutputKind.GUARD, self.entity_id))
+                loop.ready.append(self)
+        for alarm in self.alarms:
+            alarm()
 
     def found(self) -> None:
         """A polling point has found it: another trigger from now on is for the next one."""

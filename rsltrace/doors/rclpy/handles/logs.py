@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from rsltrace.doors.rclpy.handles.node import NodeHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle
@@ -47,6 +48,9 @@ class RosoutHandle(PublisherHandle):
     """A node's own publisher of /rosout."""
 
     output_kind = int(OutputKind.LOG)
+
+    def refuse(self, refusal: Callable[[object], NoReturn]) -> None:
+        """Go on: a node logs whatever has become of its context."""
 
 
 class Logs:

@@ -105,8 +105,8 @@ class NodeHandle(Destroyable, Participant):
         self.waitable_count = 0
         domain.graph.add_node(self)
         domain.event.node = self
-        if domain.dispatcher.on_node is not None:
-            domain.dispatcher.on_node(self, is_made=True)
+        for observer in domain.dispatcher.node_observers:
+            observer.node_entered(self, is_made=True)
         self._set_log_levels()
         said = [each.rosout() for each in [*self._outer, self.arguments]]
         if enable_rosout and next((s for s in reversed(said) if s is not None), True):

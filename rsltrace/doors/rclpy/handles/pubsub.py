@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NoReturn
 
 from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle, ReceiverHandle
 from rsltrace.doors.rclpy.handles.node import NodeHandle
@@ -54,6 +55,11 @@ class PublisherHandle(EntityHandle, Publisher):
         data = self._canonical(data)
         self._sites.look(self._count)
         self.send(data)
+
+    def refuse(self, refusal: Callable[[object], NoReturn]) -> None:
+        """Publish nothing any more: ``refusal`` raises what rclpy raises then. It takes the place
+        of what serializes, so that no publication has to ask first."""
+        self._serialize = self._canonical = refusal
 
     def get_topic_name(self) -> str:
         """Return the resolved topic."""

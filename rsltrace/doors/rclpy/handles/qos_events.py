@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from rsltrace.doors.rclpy.handles.entity_handle import EntityHandle
+from rsltrace.doors.rclpy.handles.entity_handle import Alarm, EntityHandle
 from rsltrace.doors.rclpy.handles.pubsub import PublisherHandle, SubscriptionHandle
 from rsltrace.doors.rclpy.stacks.tasks import is_awaited, start_callback
 from rsltrace.middleware.entity import callback_name
@@ -42,9 +42,11 @@ def _event_name(event_type: Any) -> str:
 
 
 class EventHandle(QosEvent, EntityHandle):
-    """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable."""
+    """Stands in for ``_rclpy.EventHandle``; its wrapper is rclpy's EventHandler waitable.
+    ``alarms`` hear of every trigger."""
 
     lists = "waitables"
+    alarms: tuple[Alarm, ...] = ()
 
     def __init__(self, parent: PublisherHandle | SubscriptionHandle, event_type: Any) -> None:
         self.stacks = parent.stacks
@@ -59,6 +61,11 @@ class EventHandle(QosEvent, EntityHandle):
 
     def activate(self) -> None:
         self.trigger()
+
+    def trigger(self) -> None:
+        super().trigger()
+        for alarm in self.alarms:
+            alarm()
 
     def dispatch(self) -> None:
         """Run the callback with the status."""

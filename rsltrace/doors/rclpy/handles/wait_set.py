@@ -13,6 +13,7 @@ from typing import Any
 
 from rsltrace.doors.rclpy.handles.context import ContextHandle
 from rsltrace.doors.rclpy.handles.destroyable import Handle
+from rsltrace.doors.rclpy.handles.entity_handle import Alarm
 from rsltrace.doors.rclpy.stacks.sim_event import SimEvent
 
 
@@ -103,7 +104,7 @@ class WaitSetHandle(Handle):
         return [handle for entities in self._entities.values() for handle in entities]
 
     @contextmanager
-    def watched(self, alarm: Callable[[], None]) -> Iterator[None]:
+    def watched(self, alarm: Alarm) -> Iterator[None]:
         """Within the ``with`` block, call ``alarm`` whenever something comes for an entity."""
         with ExitStack() as stack:
             for kind, entities in self._entities.items():
@@ -157,7 +158,7 @@ _IS_READY: dict[str, Callable[[Any], bool]] = {
 class _AlarmedQueue(deque[Any]):
     """A queue that tells of what arrives."""
 
-    alarm: Callable[[], None]
+    alarm: Alarm
 
     def append(self, arrival: Any) -> None:
         super().append(arrival)
@@ -165,7 +166,7 @@ class _AlarmedQueue(deque[Any]):
 
 
 @contextmanager
-def _watch_queue(handle: Any, alarm: Callable[[], None]) -> Iterator[None]:
+def _watch_queue(handle: Any, alarm: Alarm) -> Iterator[None]:
     plain = handle.queue
     queue = _AlarmedQueue(plain, plain.maxlen)
     queue.alarm = alarm
@@ -178,36 +179,25 @@ def _watch_queue(handle: Any, alarm: Callable[[], None]) -> Iterator[None]:
         handle.queue = plain
 
 
-def _watch_method(name: str) -> Callable[[Any, Callable[[], None]], Any]:
-    """Return a watcher of what is told to an entity by a method."""
-
-    @contextmanager
-    def watch(handle: Any, alarm: Callable[[], None]) -> Iterator[None]:
-        told = getattr(handle, name)
-
-        def tell() -> None:
-            told()
-            alarm()
-
-        setattr(handle, name, tell)
-        try:
-            yield
-        finally:
-            delattr(handle, name)
-
-    return watch
+@contextmanager
+def _watch_triggers(handle: Any, alarm: Alarm) -> Iterator[None]:
+    handle.alarms = (*handle.alarms, alarm)
+    try:
+        yield
+    finally:
+        handle.alarms = tuple(one for one in handle.alarms if one is not alarm)
 
 
 @contextmanager
-def _watch_nothing(handle: Any, alarm: Callable[[], None]) -> Iterator[None]:
+def _watch_nothing(handle: Any, alarm: Alarm) -> Iterator[None]:
     yield  # when a timer is due is known in advance
 
 
-_WATCH: dict[str, Callable[[Any, Callable[[], None]], Any]] = {
+_WATCH: dict[str, Callable[[Any, Alarm], Any]] = {
     "subscription": _watch_queue,
-    "guard_condition": _watch_method("trigger_guard_condition"),
+    "guard_condition": _watch_triggers,
     "timer": _watch_nothing,
     "client": _watch_queue,
     "service": _watch_queue,
-    "event": _watch_method("trigger"),
+    "event": _watch_triggers,
 }

@@ -130,14 +130,14 @@ def set_aside(stacks: Stacks) -> Iterator[None]:
         yield
     finally:
         event.handle, event.entity, event.node = whose
-        if dispatcher.on_node is not None:
-            dispatcher.on_node(event.node)
+        for observer in dispatcher.node_observers:
+            observer.node_entered(event.node, is_made=False)
         event.kind, event.input_hash = _RESUME, 0
         event.cause_event, event.cause_output = stacks.loop.events - 1, 0
         programs.constructing, event.on_end = constructing, on_end
         event.quiet = True
-        if dispatcher.on_resume is not None:
-            dispatcher.on_resume()
+        for observer in dispatcher.resume_observers:
+            observer.resumed()
 
 
 def _refuse(stacks: Stacks) -> NoReturn:

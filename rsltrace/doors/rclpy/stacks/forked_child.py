@@ -34,7 +34,7 @@ def forked_children_end(stacks: Stacks) -> Iterator[None]:
 def _in_child() -> None:
     for stacks in _worlds:
         if stacks.event.handle is not None and stacks.runners.thread == get_ident():
-            stacks.dispatcher.recorder = None
+            stacks.dispatcher.record(None)
             stacks.event.on_end = lambda stacks=stacks: _end(stacks)
 
 

@@ -33,6 +33,7 @@ from rsltrace.guard.callers import KINDS, USER, is_in
 from rsltrace.loop.ordered import OrderedLoop, Place
 from rsltrace.loop.policy import Candidate
 from rsltrace.loop.stop import Stop
+from rsltrace.middleware.events.observer import EventCall, EventObserver, ObserverOrder
 from rsltrace.middleware.source_position import file_of
 from rsltrace.model.code_line import CodeLine
 from rsltrace.model.draw import Draw, encode_draw
@@ -227,10 +228,7 @@ def _monitored(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
 
 @contextmanager
 def _traced(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
-    """Trace each event anew: whether a stack is traced is kept with it."""
     before = sys.gettrace()
-    dispatcher: Any = stacks.dispatcher
-    execute: Callable[..., None] = dispatcher.execute
 
     def on_line(frame: FrameType, what: str, argument: object) -> Any:
         if what == "line":
@@ -240,13 +238,24 @@ def _traced(stacks: Stacks, switches: LineSwitches) -> Iterator[None]:
     def on_call(frame: FrameType, what: str, argument: object) -> Any:
         return on_line if switches.owns(frame) else None
 
-    def traced(*given: Any) -> None:
-        sys.settrace(on_call)
-        execute(*given)
-
-    dispatcher.execute = traced
+    tracing = _Tracing(on_call)
+    stacks.dispatcher.add_observer(tracing)
     try:
         yield
     finally:
-        dispatcher.execute = execute
+        stacks.dispatcher.remove_observer(tracing)
         sys.settrace(before)
+
+
+class _Tracing(EventObserver):
+    """Traces each event anew: whether a stack is traced is kept with it."""
+
+    order = ObserverOrder.LINE_SWITCHES
+
+    def __init__(self, on_call: Callable[[FrameType, str, object], Any]) -> None:
+        self._on_call = on_call
+
+    def before_event(self, call: EventCall) -> bool:
+        """Have what the event calls traced."""
+        sys.settrace(self._on_call)
+        return True

@@ -206,8 +206,8 @@ class Wait:
         dispatcher, programs = self._runners.domain.dispatcher, self._runners.programs
         event = dispatcher.event
         event.handle, event.entity, event.node = self.event
-        if dispatcher.on_node is not None:
-            dispatcher.on_node(event.node)
+        for observer in dispatcher.node_observers:
+            observer.node_entered(event.node, is_made=False)
         event.kind = _RESUME
         event.cause_event, event.cause_output = self._cause
         event.input_hash = self._input_hash
@@ -217,8 +217,8 @@ class Wait:
         event.busy_ns = self._busy_ns
         if self.program is not programs.present:
             self.program.enter()
-        if dispatcher.on_resume is not None:
-            dispatcher.on_resume()
+        for observer in dispatcher.resume_observers:
+            observer.resumed()
 
     def follow(self, event: int) -> None:
         """Go on after ``event``, which has run on the stack meanwhile."""

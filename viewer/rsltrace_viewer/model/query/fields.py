@@ -14,7 +14,7 @@ from rsltrace.model.entity import WITH_TOPIC
 from rsltrace.model.event import EventFlag, EventKind, OutputKind
 from rsltrace.words.kinds import SHORT_KINDS
 from rsltrace.words.matching import LOG_LEVELS, is_named
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query import conditions
 from rsltrace_viewer.model.query.conditions import Condition
 from rsltrace_viewer.model.query.message_text import MessageText
@@ -144,7 +144,12 @@ def whole_number(text: str) -> int:
 
 
 def _read_time(run: Run, token: Token) -> Condition:
-    return conditions.Between("stamp", *number_range(token, parse_stamp, "a time"))
+    start_ns = run.trace.start_ns
+
+    def stamp_ns(text: str) -> int:
+        return parse_time_in_run(text).stamp_ns(start_ns)
+
+    return conditions.Between("stamp", *number_range(token, stamp_ns, "a time"))
 
 
 def _read_index(run: Run, token: Token) -> Condition:

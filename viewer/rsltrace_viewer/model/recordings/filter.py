@@ -19,11 +19,10 @@ from rsltrace.conditions.topic_fields import OF_MESSAGE, plain
 from rsltrace.conditions.trace_events import StartOfTrace
 from rsltrace.diff.bags.source import open_source
 from rsltrace.errors import ConditionError, RsltraceError
-from rsltrace.model.stamp import NS_PER_S
 from rsltrace.trace.decode import to_plain
 from rsltrace.words.logs import parse_log
 from rsltrace.words.matching import LOG_LEVELS, is_named
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import Choices
 from rsltrace_viewer.model.query.fields import level_of, place_of, whole_number
 from rsltrace_viewer.model.query.parser import Language, read
@@ -48,7 +47,6 @@ FIELDS = {
 }
 _PER_STEP = 256
 _LOG_TYPE = "rcl_interfaces/msg/Log"
-_SINCE_1970_NS = 1_000_000 * NS_PER_S
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +145,18 @@ def _named(names: list[str], of: Callable[[Topic], str], what: str, token: Token
 
 
 def _time(token: Token) -> Condition:
-    low, high = number_range(token, parse_stamp, "a time")
-    since_1970 = low >= _SINCE_1970_NS or (not low and _SINCE_1970_NS <= high < 2**63)
+    def limits(start_ns: int) -> tuple[int, int]:
+        def stamp_ns(text: str) -> int:
+            return parse_time_in_run(text).stamp_ns(start_ns)
+
+        return number_range(token, stamp_ns, "a time")
+
+    limits(0)  # which says what is wrong with it
 
     def between(part: Part, among: Mask) -> Mask:
         stamps = np.array(part.topic.stamps[part.start : part.end], dtype=np.int64)
-        since = stamps if since_1970 else stamps - part.recording.start_ns
-        found: Mask = (since >= low) & (since <= min(high, 2**63 - 1))
+        low, high = limits(part.recording.start_ns)
+        found: Mask = (stamps >= low) & (stamps <= min(high, 2**63 - 1))
         return found
 
     return Condition(between)

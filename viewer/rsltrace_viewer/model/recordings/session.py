@@ -14,6 +14,7 @@ from rsltrace.errors import RsltraceError
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_duration, format_seconds
 from rsltrace.trace.decode import to_plain
+from rsltrace.words.times import START, TimeInRun
 from rsltrace_viewer.model.inspector.lines import Line, Openness, Role
 from rsltrace_viewer.model.inspector.message_tree import message_lines
 from rsltrace_viewer.model.recordings.filter import read_filter
@@ -280,19 +281,18 @@ class RecordingSession:
 
     # Going somewhere.
 
-    def go_to_time(self, since_ns: int) -> None:
-        """Select the first message of the topic at a time since the start or later; the last, if
-        there is none."""
+    def go_to_time(self, time: TimeInRun) -> None:
+        """Select the first message of the topic at a time or later; the last, if there is none."""
         topic, pairs = self.topics(self.keys[self.place])[0] if self.keys else None, self.pairs
         if topic is None or not pairs.count:
             return
-        place = bisect_left(topic.stamps, self.recordings[0].start_ns + since_ns)
+        place = bisect_left(topic.stamps, time.stamp_ns(self.recordings[0].start_ns))
         later = np.flatnonzero(pairs.a >= place)
         self.row = int(later[0]) if len(later) else pairs.count - 1
 
-    def go_to_message(self, number: int | None, since_ns: int = 0) -> None:
+    def go_to_message(self, number: int | None, time: TimeInRun = START) -> None:
         """Select a message of the first recording by its number in the order of time, or the first
-        at a time since the start or later; the last, if there is none."""
+        at a time or later; the last, if there is none."""
         recording = self.recordings[0]
         stamps = [np.array(topic.stamps, dtype=np.int64) for topic in recording.topics]
         every = np.concatenate([*stamps, np.zeros(0, dtype=np.int64)])
@@ -300,7 +300,7 @@ class RecordingSession:
             return
         order = np.argsort(every, kind="stable")
         if number is None:
-            number = int(np.searchsorted(every[order], recording.start_ns + since_ns))
+            number = int(np.searchsorted(every[order], time.stamp_ns(recording.start_ns)))
         found = int(order[min(number, len(every) - 1)])
         ends = np.cumsum([len(one) for one in stamps])
         which = int(np.searchsorted(ends, found, side="right"))

@@ -10,7 +10,7 @@ from textual.binding import Binding
 from textual.widget import Widget
 
 from rsltrace.model.printable import printable
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import TimeInRun, parse_time_in_run
 from rsltrace_viewer.model.inspector.lines import Line
 from rsltrace_viewer.model.recordings.filter import FIELDS
 from rsltrace_viewer.model.recordings.plots import RecordingPlots
@@ -41,7 +41,7 @@ class RecordingApp(RecordingShell):
         session: RecordingSession,
         *,
         light: bool = False,
-        start: tuple[int | None, int] | None = None,
+        start: tuple[int | None, TimeInRun] | None = None,
         filter_text: str = "",
     ) -> None:
         """Show ``session``, once it is read at ``start``: the number of a message, or a time."""
@@ -138,7 +138,7 @@ class RecordingApp(RecordingShell):
                 if event.text.strip():
                     self.action_next_match(1)
             elif event.text.strip():
-                self.session.go_to_time(parse_stamp(event.text))
+                self.session.go_to_time(parse_time_in_run(event.text))
                 self._show_messages()
 
     def first_read(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rsltrace.words.times import parse_stamp
+from rsltrace.words.times import parse_time_in_run
 from rsltrace_viewer.model.query.completion import complete
 from rsltrace_viewer.model.recordings.filter import choices, read_filter
 from rsltrace_viewer.model.recordings.session import RecordingSession
@@ -38,6 +38,6 @@ def question_of(kind: str, session: RecordingSession) -> Question:
             check,
             completed,
         ),
-        "time": Question("time", "go to", "seconds after the start, or 20ms", "", parse_stamp),
+        "time": Question("time", "go to", "seconds after the start, or 2ms", "", parse_time_in_run),
     }
     return questions[kind]
