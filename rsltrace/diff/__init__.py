@@ -18,7 +18,7 @@ from rsltrace.callable_package import make_callable
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from rsltrace.diff.result.traces import Diff
+    from rsltrace.diff.result import Diff
 
     Tolerances = Mapping[str, float] | Sequence[tuple[str, float]]
 

@@ -15,9 +15,12 @@ from hypothesis import strategies as st
 
 from rsltrace.diff.bags.comparison import diff_bags
 from rsltrace.diff.bags.sequences import Gap, gaps_by_order, gaps_by_stamp
+from rsltrace.diff.facts.bags import BagVerdict
+from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.file_kind import is_recording, is_trace
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.bags import BagDiff, BagVerdict, Presence
+from rsltrace.diff.result import BagDiff
+from rsltrace.diff.sentences.values import notes_text
 from rsltrace.errors import BagError, TraceError
 
 POINT = "geometry_msgs/msg/PointStamped"
@@ -376,7 +379,7 @@ def test_types_that_differ_are_said(compare: Any, tmp_path: Path) -> None:
     diff = diff_bags(write(tmp_path / "a", points(3)), path)
     assert counts(diff) == (0, 0, 3, 0, 0)
     assert diff.first is not None
-    assert diff.first.fields[0].note == "different types"
+    assert notes_text(diff.first.fields[0]) == "different types"
     assert f"/p is {POINT} in a, {UINT64} in b" in diff.notes
 
 
@@ -389,7 +392,7 @@ def test_messages_of_unknown_type_are_compared_by_their_bytes(
     diff = diff_bags(a, b)
     assert counts(diff, "/x") == (1, 0, 1, 0, 0)
     assert diff.first is not None
-    assert "cannot be decoded" in diff.first.reason
+    assert "cannot be decoded" in diff.first.error
     assert any("byte by byte" in note for note in diff.notes)
 
 

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 import rsltrace
+from rsltrace.diff.facts.causes import Verdict
 from rsltrace.diff.report import render
-from rsltrace.diff.result.verdicts import Verdict
 
 pytestmark = [pytest.mark.ros]
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")

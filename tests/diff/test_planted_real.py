@@ -12,8 +12,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs rclpy: pip install 'rsltrace[ros]'")
 
 import rsltrace
-from rsltrace.diff.result.traces import Diff
-from rsltrace.diff.result.verdicts import Root, Verdict
+from rsltrace.diff.facts.causes import Root, Verdict
+from rsltrace.diff.result import Diff
+from rsltrace.diff.sentences.values import setting_name
 
 pytestmark = pytest.mark.ros
 
@@ -226,7 +227,7 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert (diff.verdict, first.root) == (Verdict.ENVIRONMENT, Root.JOB)
     assert first.a is not None
     assert first.a.entity.name == "/sensor"
-    assert [str(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
+    assert [setting_name(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
     assert diff.sentence == (
         "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published another data on "

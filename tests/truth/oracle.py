@@ -9,7 +9,7 @@ from pathlib import Path
 from rsltrace import Diff, diff
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report import render
-from rsltrace.diff.result.divergence import Divergence
+from rsltrace.diff.result import Divergence
 from tests.truth import traces
 from tests.truth.complaint import Complaint
 from tests.truth.faults.planting import Truth

@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from rsltrace import DiffOptions, diff_bags
 from rsltrace.diff.report import render
-from rsltrace.diff.result.bags import BagDiff
+from rsltrace.diff.result import BagDiff
 from tests.truth.complaint import Complaint
 from tests.truth.graph import write_bag
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from rsltrace.diff.facts.evidence import EventView
 from rsltrace.diff.report.line import Piece, Style
-from rsltrace.diff.result.events import EventView
 from rsltrace.model.printable import printable
 from rsltrace.model.stamp import format_seconds
 from rsltrace.words.kinds import flag_names

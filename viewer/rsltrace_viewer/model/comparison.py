@@ -17,7 +17,7 @@ from rsltrace.diff.alignment.first_difference import first_difference
 from rsltrace.diff.alignment.rows import Run as DiffRun
 from rsltrace.diff.causes.effects import first_effect, is_setup
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.result.traces import Diff
+from rsltrace.diff.result import Diff
 from rsltrace.diff.traces.comparison import first_item
 from rsltrace.diff.traces.diff import diff_traces
 from rsltrace_viewer.model.run import Run
