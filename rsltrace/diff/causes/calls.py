@@ -43,21 +43,23 @@ _Numbered = tuple[int, int, Finding]
 
 
 def call_differences(
-    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None
+    run_a: Run, run_b: Run, a: EventView | None, b: EventView | None, node: str = ""
 ) -> tuple[CallDifference, ...]:
     """Return the calls made inside two events, those with different answers first.
 
     If all answers agree, the first calls before them in the same node, or when its modules were
-    imported, that gave different ones come first: what was read earlier may show only now.
+    imported, that gave different ones come first: what was read earlier may show only now. ``node``
+    is another node that is to blame.
     """
     inside = _paired(_inside(run_a, a), _inside(run_b, b))
     differing = [call for call in inside if call.differs]
     if differing:
         return (*differing, *(call for call in inside if not call.differs))[:CALLS_MAX]
     some = a or b
-    is_somebodys = some is not None and subject_of(some)
+    is_somebodys = some is not None and (node or subject_of(some))
     # Where one run has no such event: up to there the two agree, indexes and all.
-    before = _paired(_before(run_a, a or b), _before(run_b, b or a)) if is_somebodys else []
+    sides = (_before(run_a, a or b, node), _before(run_b, b or a, node)) if is_somebodys else ()
+    before = _paired(*sides) if sides else []
     earlier = [call for call in before if call.differs][:EARLIER_MAX]
     places = {call.where for call in earlier}
     programs = [c for c in before if c.call.startswith(STARTED_BY) and c.where in places]
@@ -82,12 +84,13 @@ def _inside(run: Run, view: EventView | None) -> list[Finding]:
     return run.trace.answers.get(view.index, []) if view is not None else []
 
 
-def _before(run: Run, view: EventView | None) -> list[Finding]:
-    """Return what the node of an event, or its main if it is of none, called before."""
+def _before(run: Run, view: EventView | None, other: str = "") -> list[Finding]:
+    """Return what a node called before an event: the event's own, or its main if it is of none, or
+    another one."""
     if view is None:
         return []
-    node = view.node
-    files = _files_of(run, view)
+    node = other or view.node
+    files = _files_of(run, view, node)
     return [
         finding
         for index, found in run.trace.answers.items()
@@ -110,9 +113,8 @@ def _is_of_import(finding: Finding, files: frozenset[str]) -> bool:
     return not finding.node and function == "<module>" and place.rpartition(":")[0] in files
 
 
-def _files_of(run: Run, view: EventView) -> frozenset[str]:
+def _files_of(run: Run, view: EventView, node: str) -> frozenset[str]:
     """Return the files of the modules that a node or main uses, as places in code name them."""
-    node = view.node
     entities = run.trace.entities.values()
     if node:
         module = next((e.type for e in entities if e.name == node and e.type), "").partition(":")[0]

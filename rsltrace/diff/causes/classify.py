@@ -36,6 +36,7 @@ from rsltrace.diff.facts.causes import (
     Why,
 )
 from rsltrace.diff.facts.evidence import (
+    EntitiesChanged,
     EventView,
     MessageDifference,
     ParametersChanged,
@@ -86,6 +87,9 @@ class Case:
     slept: Slept | None = None
     """How long a callback slept, if that differs."""
 
+    changed: EntitiesChanged | None = None
+    """The entities whose QoS differs, of the topics that are concerned."""
+
     swapped: bool = False
     """Whether the bag of b plays later what the bag of a plays here, and the other way round."""
 
@@ -104,7 +108,9 @@ class Case:
         views = (self.a, self.b, self.other_a, self.other_b, self.cause_a, self.cause_b)
         nodes = {view.node for view in views if view is not None}
         if any(map(_is_qos_event, self.messages)):
-            nodes = set()  # whose QoS has changed is not known
+            nodes = set()  # which has made them is not known, but whose QoS has changed
+        if self.changed is not None:
+            nodes = set(self.changed.nodes)
         nodes |= {node_of(m.entity) for m in self.messages if m.kind is OutputKind.DRAW}
         constructing = self.one.kind is EventKind.CONSTRUCT or any(
             m.kind is OutputKind.ENTITY or m.topic == PARAMETER_EVENTS for m in self.messages
@@ -193,6 +199,8 @@ def _construction(case: Case) -> Judgement:
         what = Happening.CONSTRUCTION_ORDER
     elif a.stamp_ns != b.stamp_ns and all(map(_is_stamp_of_parameters, case.messages)):
         return _timing(case, a)
+    elif case.changed is not None:
+        what = case.changed
     elif any(m.kind is OutputKind.ENTITY for m in case.messages):
         what = Happening.OTHER_ENTITIES
     elif explained:
@@ -327,6 +335,11 @@ def _same_input(case: Case, a: EventView, b: EventView) -> Judgement:
     if a.output_hash == b.output_hash and a.state_hash != b.state_hash:
         what = Happening.OTHER_STATE
     else:
+        others = [m for m in case.messages if not _is_qos_event(m)]
+        if case.changed is not None and not others:
+            explained = case.blame()
+            root = Root.JOB if explained else Root.CALLBACK
+            return case.judgement(Verdict.GRAPH, root, case.changed, Reason.CONSTRUCTOR)
         only_slept = all(message.fate is not None for message in case.messages)
         what = OtherOutput(case.slept, only_slept=case.slept is not None and only_slept)
     suspended = EventFlag.SUSPENDED in a.flags | b.flags

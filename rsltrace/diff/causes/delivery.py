@@ -6,20 +6,31 @@ In the trace a wait is two events of its entity; what it was for stands at the e
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from rsltrace.diff.alignment.rows import BAG, Run, load_rows
 from rsltrace.diff.facts.causes import (
     Loss,
     NothingArrives,
-    OtherQos,
     QueueOverflowed,
     Slept,
     StillWaits,
 )
-from rsltrace.diff.facts.evidence import EventView
+from rsltrace.diff.facts.evidence import (
+    EntitiesChanged,
+    EntityChange,
+    EntityProperty,
+    EventView,
+    MessageDifference,
+)
 from rsltrace.model.endless_wait import EndlessWait, waits_of
+from rsltrace.model.entity import EntityKind
 from rsltrace.model.event import NO_EVENT, EventFlag, EventKind, OutputKind
 
 _LOOKED_AT_MAX = 1000
+_QOS_EVENT = EntityKind.QOS_EVENT.label
+_OF_QOS = (EventKind.SUBSCRIPTION, EventKind.SERVICE, EventKind.CLIENT, EventKind.QOS_EVENT)
+"""Events of endpoints."""
 
 
 # -- messages that both runs sent and only one received ------------------------------------------
@@ -32,15 +43,15 @@ def lost_message(run_a: Run, run_b: Run, a: EventView | None, b: EventView | Non
     ``a`` or ``b`` is the event of the run that received the message, the other is None.
     """
     view = a or b
-    if view is None or (a and b) or view.kind is not EventKind.SUBSCRIPTION:
+    if view is None or (a and b):
         return None
-    if view.cause_event == NO_EVENT:
+    if view.kind in _OF_QOS and (changed := entity_changes(run_a, run_b, topics_of(view, ()))):
+        return changed
+    if view.kind is not EventKind.SUBSCRIPTION or view.cause_event == NO_EVENT:
         return None
     has_not, name = (run_b, "b") if a is not None else (run_a, "a")
     has = run_a if a is not None else run_b
     number = has_not.matching.by_key[view.entity]
-    if changed := _changed_qos(run_a, run_b, number):
-        return OtherQos(changed)
     later = _received_after(has_not, number, view.cause_event, view.cause_output)
     if later is None:
         more = _received_after(has, number, view.cause_event, view.cause_output)
@@ -82,14 +93,6 @@ def _sent_between(run: Run, view: EventView, later: tuple[int, int, int]) -> int
     return count
 
 
-def _changed_qos(run_a: Run, run_b: Run, number: int) -> tuple[tuple[str, str, str], ...]:
-    """Return which policies of a subscription differ but for its depth, which shows in another
-    way."""
-    a, b = _qos(run_a, number), _qos(run_b, number)
-    differing = [name for name in a if name != "depth" and name in b and a[name] != b[name]]
-    return tuple((name, str(a[name]), str(b[name])) for name in differing)
-
-
 def _depth(run: Run, number: int) -> int | None:
     depth = _qos(run, number).get("depth")
     return depth if isinstance(depth, int) else None
@@ -105,6 +108,48 @@ def _detail(run: Run, number: int) -> dict[str, object]:
     table = run.matching.numbers_b if run.of_b else run.matching.numbers_a
     ids = (table == number).nonzero()[0]
     return run.trace.entities[int(ids[0])].detail if len(ids) else {}
+
+
+# -- entities with other properties ---------------------------------------------------------------
+
+
+def topics_of(view: EventView, messages: Sequence[MessageDifference]) -> frozenset[str]:
+    """Return the topics and services whose QoS an event, or what differs in it, can depend on."""
+    met = [view.entity] if view.kind in _OF_QOS else []
+    met += [m.entity for m in messages if m.kind in (OutputKind.ENTITY, OutputKind.DRAW)]
+    # A QoS event goes by its topic and its status: "/scan incompatible".
+    return frozenset(
+        key.name.rpartition(" ")[0] if key.kind == _QOS_EVENT else key.name for key in met
+    )
+
+
+def entity_changes(
+    run_a: Run, run_b: Run, topics: frozenset[str], nodes: frozenset[str] = frozenset()
+) -> EntitiesChanged | None:
+    """Return which entities of both runs have another QoS, of some topics and services, or are in
+    another callback group, of some nodes; None if there are none.
+
+    A depth is not told: it shows in another way.
+    """
+    alone = {*run_a.matching.only_a, *run_a.matching.only_b}
+    found = []
+    for number, key in enumerate(run_a.matching.keys):
+        if number in alone or not (key.name in topics or key.node in nodes):
+            continue
+        a, b = _detail(run_a, number), _detail(run_b, number)
+        if key.name in topics and (values := _policies(a.get("qos"), b.get("qos"))):
+            found.append(EntityChange(key, EntityProperty.QOS, values))
+        if key.node in nodes and (groups := (a.get("group"), b.get("group")))[0] != groups[1]:
+            one, other = (str(group or "default") for group in groups)
+            found.append(EntityChange(key, EntityProperty.GROUP, (("", one, other),)))
+    return EntitiesChanged(tuple(found)) if found else None
+
+
+def _policies(a: object, b: object) -> tuple[tuple[str, str | int | None, str | int | None], ...]:
+    if not isinstance(a, dict) or not isinstance(b, dict):
+        return ()
+    names = [name for name in {**a, **b} if name != "depth" and a.get(name) != b.get(name)]
+    return tuple((name, a.get(name), b.get(name)) for name in names)
 
 
 # -- calls that waited, callbacks that slept -----------------------------------------------------

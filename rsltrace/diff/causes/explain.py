@@ -11,7 +11,15 @@ from rsltrace.diff.alignment.blocks import EventPair
 from rsltrace.diff.alignment.rows import Run, outputs_of
 from rsltrace.diff.causes.calls import call_differences
 from rsltrace.diff.causes.classify import ROOT_OF, Case, judge
-from rsltrace.diff.causes.delivery import are_swapped, lost_message, periods, slept, still_waits
+from rsltrace.diff.causes.delivery import (
+    are_swapped,
+    entity_changes,
+    lost_message,
+    periods,
+    slept,
+    still_waits,
+    topics_of,
+)
 from rsltrace.diff.causes.effects import PARAMETER_EVENTS
 from rsltrace.diff.causes.event_views import EventViews
 from rsltrace.diff.causes.likely_cause import likely_cause
@@ -23,6 +31,7 @@ from rsltrace.diff.causes.state_differences import state_differences
 from rsltrace.diff.facts.causes import CauseOf, FollowsFrom, Judgement, Root, Verdict
 from rsltrace.diff.facts.evidence import (
     CauseStep,
+    EntitiesChanged,
     EventView,
     Link,
     LinkKind,
@@ -157,9 +166,18 @@ class Explainer:
                 or lost_message(self.run_a, self.run_b, a, b),
                 periods_ns=periods(self.run_a, self.run_b, a, b),
                 slept=slept(self.run_a, self.run_b, a, b),
+                changed=self._changed(a or b, messages),
                 swapped=are_swapped(self.run_a, self.run_b, a, b),
             )
         )
+
+    def _changed(
+        self, view: EventView | None, messages: Sequence[MessageDifference]
+    ) -> EntitiesChanged | None:
+        """Return the entities whose QoS shows in an event."""
+        if view is None or not (topics := topics_of(view, messages)):
+            return None
+        return entity_changes(self.run_a, self.run_b, topics)
 
     def _root_judgement(self, number: int) -> Judgement:
         if number not in self._judged:
@@ -244,10 +262,12 @@ class Explainer:
     def _divergence(self, found: FoundDivergence, judgement: Judgement) -> Divergence:
         place_a = judgement.a.index if judgement.a is not None else found.place_a
         place_b = judgement.b.index if judgement.b is not None else found.place_b
-        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b)
+        changed = judgement.changed
+        node = "" if changed is None else changed.node
+        calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b, node)
         if found.origin.previous is None:
             run = self.run_b if judgement.a is None else self.run_a
-            likely = likely_cause(judgement, run, calls, self._relevance)
+            likely = likely_cause(judgement, (run, self.run_a, self.run_b), calls, self._relevance)
             judgement = replace(judgement, likely=likely)
         bare = _divergence_of(
             judgement,

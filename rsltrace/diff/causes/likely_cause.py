@@ -15,6 +15,7 @@ from rsltrace.diff.causes.calls import (
     unquoted,
     unrecorded_answer,
 )
+from rsltrace.diff.causes.delivery import entity_changes, topics_of
 from rsltrace.diff.causes.event_views import subject_of
 from rsltrace.diff.causes.relevance import Relevance
 from rsltrace.diff.facts.causes import (
@@ -23,6 +24,7 @@ from rsltrace.diff.facts.causes import (
     OutsideAnswers,
     Root,
     SetOrder,
+    Verdict,
 )
 from rsltrace.diff.facts.evidence import CallDifference, EventView, MessageDifference, Moved
 from rsltrace.errors import JobError
@@ -39,18 +41,34 @@ _OPEN_TO_IT = frozenset(
 """Roots that what a node read from outside can be behind."""
 
 
+_OF_ORDER = (Verdict.SCHEDULE, Verdict.TIMING, Verdict.MISSING, Verdict.EXTRA)
+"""Verdicts that QoS and callback groups can be behind."""
+
+
 def likely_cause(
-    judgement: Judgement, run: Run, calls: Sequence[CallDifference], relevance: Relevance
+    judgement: Judgement,
+    runs: tuple[Run, Run, Run],
+    calls: Sequence[CallDifference],
+    relevance: Relevance,
 ) -> LikelyCause | None:
-    """Return what explains a root: the first of ``calls`` if its answers differ, or a set whose
-    order shows. If nothing does, the answer that nobody kept. ``run`` is one that has the event."""
+    """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
+    shows, entities with other properties. If nothing does, the answer that nobody kept. ``runs``
+    are one that has the event, a and b."""
+    run, *both = runs
     view = judgement.one
     if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
         return None
     if calls and calls[0].differs:
-        return OutsideAnswers(subject_of(view), telling_calls(calls, judgement.messages))
+        changed = judgement.changed
+        subject = subject_of(view) if changed is None else changed.node
+        return OutsideAnswers(subject, telling_calls(calls, judgement.messages))
     if (found := _set_behind(run, view, judgement.messages, calls, relevance)) is not None:
         return found
+    if judgement.verdict in _OF_ORDER and judgement.changed is None:
+        nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
+        changed = entity_changes(*both, topics_of(view, judgement.messages), nodes - {""})
+        if changed is not None:
+            return changed
     return unrecorded_answer(run, view) if judgement.is_unexplained else None
 
 

@@ -11,6 +11,7 @@ from enum import Enum
 
 from rsltrace.diff.facts.evidence import (
     CallDifference,
+    EntitiesChanged,
     EventView,
     Fact,
     MessageDifference,
@@ -101,18 +102,7 @@ class NothingArrives(Fact):
     run: str
 
 
-@dataclass(frozen=True, slots=True)
-class OtherQos(Fact):
-    """``entity`` of ``node`` has another QoS in each run, so that it is (not) connected:
-    (policy, a, b)."""
-
-    policies: tuple[tuple[str, str, str], ...]
-    kind: str = ""
-    name: str = ""
-    node: str = ""
-
-
-Loss = StillWaits | QueueOverflowed | NothingArrives | OtherQos
+Loss = StillWaits | QueueOverflowed | NothingArrives | EntitiesChanged
 """Why an event did not happen in one of the runs, as far as that is known."""
 
 
@@ -231,6 +221,7 @@ What = (
     | OtherDraw
     | OtherOutput
     | EndedBefore
+    | EntitiesChanged
 )
 
 
@@ -370,7 +361,7 @@ class UnrecordedAnswer(Fact):
     source: str
 
 
-LikelyCause = OutsideAnswers | SetOrder | UnrecordedAnswer
+LikelyCause = OutsideAnswers | SetOrder | UnrecordedAnswer | EntitiesChanged
 
 
 @dataclass(frozen=True, slots=True)
@@ -403,13 +394,20 @@ class Judgement:
         return self.a or self.b
 
     @property
+    def changed(self) -> EntitiesChanged | None:
+        """The entities whose properties show in it."""
+        if isinstance(self.what, OnlyInOne) and isinstance(self.what.loss, EntitiesChanged):
+            return self.what.loss
+        return self.what if isinstance(self.what, EntitiesChanged) else None
+
+    @property
     def is_unexplained(self) -> bool:
         """Whether something is not deterministic, and nothing that is known explains it."""
         if self.settings:
             return False
         why, one = self.why, self.one
         if isinstance(why, NotDelivered):
-            return isinstance(why.loss, NothingArrives | OtherQos)
+            return isinstance(why.loss, NothingArrives | EntitiesChanged)
         if why is Reason.NOTHING_MADE_IT_RUN:
             return one is not None and bool(one.entity.node or one.entity.kind in NO_CALLBACKS)
         return why is Reason.CONSTRUCTOR or isinstance(why, NothingBefore | WaitedFor)

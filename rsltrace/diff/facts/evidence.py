@@ -244,21 +244,6 @@ class ParametersChanged(Fact):
     values: tuple[tuple[str, str, str], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class QosChanged(Fact):
-    """An entity that both runs made, with another QoS: (policy, a, b)."""
-
-    values: tuple[tuple[str, str, str], ...]
-
-
-@dataclass(frozen=True, slots=True)
-class GroupChanged(Fact):
-    """An entity that both runs made, in another callback group."""
-
-    a: str
-    b: str
-
-
 Fate = (
     Moved
     | SentTimes
@@ -267,8 +252,6 @@ Fate = (
     | TimerPeriodSet
     | ParametersSet
     | ParametersChanged
-    | QosChanged
-    | GroupChanged
 )
 """What became of an output."""
 
@@ -327,6 +310,43 @@ class MessageDifference:
     def is_input(self) -> bool:
         """Whether it is what the event received."""
         return self.position < 0
+
+
+# -- entities ----------------------------------------------------------------------------------
+
+
+class EntityProperty(Enum):
+    """What of an entity is no part of its identity."""
+
+    QOS = "QoS"
+    GROUP = "callback group"
+
+
+@dataclass(frozen=True, slots=True)
+class EntityChange:
+    """An entity that both runs made, with another property: (name, a, b) as texts, or nanoseconds,
+    None where a side has none. The name is that of a policy, or empty."""
+
+    entity: EntityKey
+    property: EntityProperty
+    values: tuple[tuple[str, str | int | None, str | int | None], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class EntitiesChanged(Fact):
+    """Entities that both runs made, with other properties."""
+
+    changes: tuple[EntityChange, ...]
+
+    @property
+    def nodes(self) -> frozenset[str]:
+        """The nodes that made them."""
+        return frozenset(node_of(change.entity) for change in self.changes)
+
+    @property
+    def node(self) -> str:
+        """The node that made the first of them."""
+        return node_of(self.changes[0].entity)
 
 
 # -- calls and states --------------------------------------------------------------------------

@@ -21,7 +21,6 @@ from rsltrace.diff.facts.causes import (
     OtherInput,
     OtherOrder,
     OtherOutput,
-    OtherQos,
     OtherTime,
     OutsideAnswers,
     ParameterFiles,
@@ -38,6 +37,8 @@ from rsltrace.diff.facts.causes import (
 )
 from rsltrace.diff.facts.evidence import (
     CallDifference,
+    EntitiesChanged,
+    EntityChange,
     EventView,
     MessageDifference,
     Presence,
@@ -53,6 +54,7 @@ from rsltrace.diff.sentences.values import (
     durations,
     fate_text,
     field_text,
+    joined,
     listed,
     pair_text,
     state_text,
@@ -104,6 +106,8 @@ def sentence_of(of: Judgement) -> str:
     text = sentence(of.what, of)
     if of.node_diverged:
         text += ", because its node had done something else before"
+    if isinstance(of.what, EntitiesChanged):
+        text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
         return f"{text}; possible cause: {sentence(of.likely)}, which is not recorded"
     return f"{text}; likely cause: {sentence(of.likely)}" if of.likely is not None else text
@@ -356,6 +360,35 @@ def _(what: EndedBefore, of: Judgement) -> str:
     )
 
 
+# -- entities with other properties ---------------------------------------------------------------
+
+
+@says(EntitiesChanged)
+def _(changed: EntitiesChanged, of: object) -> str:
+    return joined([_change_text(change) for change in changed.changes])
+
+
+def _change_text(change: EntityChange) -> str:
+    entity = change.entity
+    values = ", ".join(_property_text(*value) for value in change.values)
+    made = f"{entity.node} made {entity.kind} {printable(entity.name)}"
+    return f"{made} with another {change.property.value}: {values}"
+
+
+def _property_text(name: str, a: str | int | None, b: str | int | None) -> str:
+    word = f"{name.removesuffix('_ns')} " if name else ""
+    if isinstance(a, int) and isinstance(b, int) and name.endswith("_ns"):
+        return f"{word}{durations(a, b)}"
+    one, other = (_policy(name, value) for value in (a, b))
+    return f"{word}{pair_text(one, other)}"
+
+
+def _policy(name: str, value: str | int | None) -> str:
+    if value is None:  # a trace has only what is no default
+        return "automatic" if name == "liveliness" else "none"
+    return format_duration(value) if isinstance(value, int) else value
+
+
 # -- what became of a message ----------------------------------------------------------------------
 
 
@@ -373,12 +406,6 @@ def _(loss: QueueOverflowed, of: object) -> str:
 @says(NothingArrives)
 def _(loss: NothingArrives, of: object) -> str:
     return f"nothing more reaches it in {loss.run}"
-
-
-@says(OtherQos)
-def _(loss: OtherQos, of: object) -> str:
-    told = ", ".join(f"{printable(n)} {a} in a, {b} in b" for n, a, b in loss.policies)
-    return f"its QoS is another one: {told}"
 
 
 # -- why -------------------------------------------------------------------------------------------
@@ -406,8 +433,6 @@ def failure_text(failed: RunEnd) -> str:
 
 
 _REASONS = {
-    Reason.CONSTRUCTOR: "job and environment are the same as far as the traces tell: the "
-    "constructor itself is not deterministic, or its code changed",
     Reason.DRIVEN_DIFFERENTLY: "whoever drove the simulations did not do the same",
     Reason.BAGS_SWAPPED: "the bags that were played have these two messages in another order",
     Reason.BAGS_AT_OTHER_TIMES: "the bags that were played have this message at another time",
@@ -425,6 +450,15 @@ _REASONS = {
 @says(*_REASONS)
 def _(why: Reason, of: Judgement) -> str:
     return because_of(of.settings) or _REASONS[why]
+
+
+@says(Reason.CONSTRUCTOR)
+def _(why: Reason, of: Judgement) -> str:
+    which = "itself" if of.changed is None else f"of {of.changed.node}"
+    return because_of(of.settings) or (
+        f"job and environment are the same as far as the traces tell: the constructor {which} is "
+        "not deterministic, or its code changed"
+    )
 
 
 @says(Reason.READY_AT_ONCE)
@@ -497,7 +531,8 @@ def _(why: NotDelivered, of: Judgement) -> str:
     if because := because_of(of.settings):
         return f"{text}; {because}"
     if of.is_unexplained:
-        return f"{text}; {_one(of).entity.node} is not deterministic"
+        who = _one(of).entity.node if of.changed is None else of.changed.node
+        return f"{text}; {who} is not deterministic"
     return text
 
 

@@ -10,7 +10,6 @@ from rsltrace.diff.facts.evidence import (
     FieldDifference,
     FieldNote,
     FieldNoteKind,
-    GroupChanged,
     Link,
     LinkKind,
     MessageDifference,
@@ -19,7 +18,6 @@ from rsltrace.diff.facts.evidence import (
     ParametersChanged,
     ParametersSet,
     Presence,
-    QosChanged,
     SentLater,
     SentTimes,
     Setting,
@@ -242,14 +240,9 @@ def _(fate: ParametersSet, of: object) -> str:
     return ", ".join(f"{name} = {shortened(value, _VALUE_MAX)}" for name, value in fate.values)
 
 
-@says(ParametersChanged, QosChanged)
-def _(fate: ParametersChanged | QosChanged, of: object) -> str:
+@says(ParametersChanged)
+def _(fate: ParametersChanged, of: object) -> str:
     return ", ".join(f"{name} {pair_text(a, b)}" for name, a, b in fate.values)
-
-
-@says(GroupChanged)
-def _(fate: GroupChanged, of: object) -> str:
-    return f"callback group {fate.a or 'unknown'} → {fate.b or 'unknown'}"
 
 
 def fate_text(message: MessageDifference) -> str:
