@@ -199,7 +199,7 @@ def test_state_is_a_way_to_the_root_too(tmp_path: Path) -> None:
     assert first.a is not None
     assert first.a.entity.name == "/r"
     assert link_text(first.chain[-2].link) == "may have changed the state of /sum"
-    assert "because its node had done something else before" in first.sentence
+    assert "because its node had already diverged" in first.sentence
 
 
 def test_asking_for_what_does_not_differ(tmp_path: Path) -> None:

@@ -230,7 +230,7 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert [setting_name(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
     assert diff.sentence == (
-        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published another data on "
+        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published a different data on "
         "/reading at 0.1 s (data 1.0 → 1.5)"
     )
     assert diff.shown is diff.effect

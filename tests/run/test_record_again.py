@@ -167,7 +167,7 @@ def test_what_may_run_code_is_told_and_not_offered(here: Path, override: str) ->
     """A trace may come from anybody, and the line is there to be pasted."""
     command, warning = _again("job.yaml", override)
     assert command == ""
-    assert "there is no command to paste" in warning
+    assert "no command to reproduce this" in warning
     assert "\x1b" not in warning
     assert len(warning) < 1000
 

@@ -105,7 +105,7 @@ def sentence_of(of: Judgement) -> str:
     """Return what happened, and what is likely behind it."""
     text = sentence(of.what, of)
     if of.node_diverged:
-        text += ", because its node had done something else before"
+        text += ", because its node had already diverged"
     if isinstance(of.what, EntitiesChanged):
         text = f"the graphs differ: {text}"
     if isinstance(of.likely, UnrecordedAnswer):
@@ -148,7 +148,7 @@ def _(what: Happening, of: Judgement) -> str:
 
 @says(Happening.OTHER_CONSTRUCTION, Happening.OTHER_CONSTRUCTION_SAME_JOB)
 def _(what: Happening, of: Judgement) -> str:
-    text = f"{phrase(_one(of))} did something else{what_differs(of.messages)}"
+    text = f"{phrase(_one(of))} {_did(of.messages)}"
     same = what is Happening.OTHER_CONSTRUCTION_SAME_JOB
     return f"{text}, in the same job and environment" if same else text
 
@@ -230,22 +230,22 @@ def _(what: Happening, of: Judgement) -> str:
 @says(Happening.OTHER_BAG_MESSAGE)
 def _(what: Happening, of: Judgement) -> str:
     values = next((field_text(m.fields, m.more_fields) for m in of.messages), "")
-    return f"{_at(_one(of))} is another one{f' ({values})' if values else ''}"
+    return f"{_at(_one(of))} is different{f' ({values})' if values else ''}"
 
 
 @says(Happening.OTHER_FROM_OUTSIDE)
 def _(what: Happening, of: Judgement) -> str:
-    return f"{_at(_one(of))} is another one"
+    return f"{_at(_one(of))} is different"
 
 
 @says(Happening.OTHER_DONE_OUTSIDE)
 def _(what: Happening, of: Judgement) -> str:
-    return f"{_at(_one(of))} is something else{what_differs(of.messages)}"
+    return f"{_at(_one(of))} is different{what_differs(of.messages)}"
 
 
 @says(OtherInput)
 def _(what: OtherInput, of: Judgement) -> str:
-    return f"{_at(_one(of))} received another {what.topic or 'input'}"
+    return f"{_at(_one(of))} received a different {what.topic or 'input'}"
 
 
 @says(Happening.ONLY_ZERO_DELAYS)
@@ -288,7 +288,7 @@ def _(what: OtherDraw, of: Judgement) -> str:
     else:
         drawn = f"{m.topic}: {_drawn(m.hash_a, m.hash_b)} in a, {_drawn(m.hash_b, m.hash_a)} in b"
     told = what.connected and (not of.settings or any(s.key == "seed" for s in of.settings))
-    chance = "chance decided otherwise: " if told else ""
+    chance = "chance decided differently: " if told else ""
     text = f"{_at(_one(of))} {same}, but {chance}{drawn}"
     return f"{text} (and {what.more} more)" if what.more else text
 
@@ -331,19 +331,38 @@ def _(what: OtherOutput, of: Judgement) -> str:
     if what.slept is not None and what.only_slept:
         text = f"{_at(one)} {slept_text(what.slept)}{differs}"
     else:
-        text = f"{_at(one)} {_same_input(one)}did something else{differs}"
+        text = f"{_received(one)} {_did(of.messages)}"
         text += f", and {slept_text(what.slept)}" if what.slept is not None else ""
     return text
 
 
 @says(Happening.OTHER_STATE)
 def _(what: Happening, of: Judgement) -> str:
-    left = "sent the same, but left its node in another state"
-    return f"{_at(_one(of))} {_same_input(_one(of))}{left}{state_text(of.state)}"
+    left = "sent the same, but left its node in a different state"
+    return f"{_received(_one(of))} {left}{state_text(of.state)}"
 
 
-def _same_input(one: EventView) -> str:
-    return "got the same input in both runs and " if one.input_hash else ""
+def _received(one: EventView) -> str:
+    """Return ``/filter: the callback for /scan at 2.1 s received the same input in both runs but``,
+    where it received something."""
+    who = _at(one)
+    if one.kind in _CALLED_FOR and one.entity.node and not one.entity.ordinal:
+        who = f"{one.entity.node}: the callback for {one.entity.name} {at_time(one.stamp_ns)}"
+    return f"{who} received the same input in both runs but" if one.input_hash else who
+
+
+_CALLED_FOR = (EventKind.SUBSCRIPTION, EventKind.SERVICE)
+
+
+def _did(messages: Sequence[MessageDifference]) -> str:
+    """Return what a callback did: ``published a different /push (data 1 → 2)``."""
+    outputs = [message for message in messages if not message.is_input]
+    if len(outputs) == 1 and outputs[0].kind is OutputKind.MESSAGE:
+        (one,) = outputs
+        if one.presence is Presence.BOTH and one.fate is None:
+            values = field_text(one.fields, one.more_fields)
+            return f"published a different {one.topic}{f' ({values})' if values else ''}"
+    return f"did something different{what_differs(messages)}"
 
 
 @says(EndedBefore)
@@ -433,7 +452,7 @@ def failure_text(failed: RunEnd) -> str:
 
 
 _REASONS = {
-    Reason.DRIVEN_DIFFERENTLY: "whoever drove the simulations did not do the same",
+    Reason.DRIVEN_DIFFERENTLY: "the two simulations were not driven in the same way from outside",
     Reason.BAGS_SWAPPED: "the bags that were played have these two messages in another order",
     Reason.BAGS_AT_OTHER_TIMES: "the bags that were played have this message at another time",
     Reason.BAGS_DIFFER: "the bags that were played differ in this message",
@@ -478,7 +497,7 @@ def _(why: Reason, of: Judgement) -> str:
 
 @says(Reason.DRIVEN_IN_ONE)
 def _(why: Reason, of: Judgement) -> str:
-    return f"whoever drove the simulation did this only in {_has(of)[0]}"
+    return f"only the simulation of {_has(of)[0]} was driven to do this from outside"
 
 
 @says(Reason.FAULT_IN_ONE)
@@ -720,8 +739,8 @@ def _done(message: MessageDifference) -> str:
         other = fields[0].path
         other += f" and {more} more field{'s' if more > 1 else ''}" if more else ""
     if message.kind is OutputKind.MESSAGE:
-        return f"published another {other} on {message.topic}"
-    return f"{verb} {message.topic} with another {other}"
+        return f"published a different {other} on {message.topic}"
+    return f"{verb} {message.topic} with a different {other}"
 
 
 def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
@@ -730,7 +749,7 @@ def _lead(settings: Sequence[Setting], *, set_up: bool) -> str:
     of_job = [_setting(setting) for setting in settings if setting.key]
     if not of_job and set_up:
         code = (setting for setting in settings if setting.kind is SettingKind.CODE)
-        of_job = [f"the {setting.place} is another one" for setting in code]
+        of_job = [f"the {setting.place} differs" for setting in code]
     return listed(of_job)
 
 

@@ -154,7 +154,7 @@ def _where(found: NativeComparison) -> str:
         return f"{text}came in another order, and others are missing or differ"
     if first.presence is not Presence.BOTH:
         return f"{text}is {first.presence.value}"
-    return text + (f"has another {first.fields[0].path}" if first.fields else "differs")
+    return text + (f"has a different {first.fields[0].path}" if first.fields else "differs")
 
 
 def tail_text(tail: Tail) -> str:
@@ -218,7 +218,7 @@ def _first_message(first: MessageDivergence) -> str:
     differing = len(first.fields) + first.more_fields
     if not first.fields:
         return f"{text} differs"
-    text = f"{text} has another {first.fields[0].path}"
+    text = f"{text} has a different {first.fields[0].path}"
     return text if differing == 1 else f"{text} (and {_number(differing - 1, 'other field')})"
 
 
@@ -305,8 +305,8 @@ def _(remark: CannotRepeat, of: object) -> str:
     told = ", ".join(map(_shown, remark.options[:_OPTIONS_MAX]))
     told += f" and {more} more" if more > 0 else ""
     return (
-        f"{remark.trace} says that it was recorded with {told}: that may run code, so "
-        "there is no command to paste; use it only if you know where the trace is from"
+        f"no command to reproduce this: {remark.trace} comes from a job that could run code "
+        f"({told}); use that only if you know where the trace is from"
     )
 
 

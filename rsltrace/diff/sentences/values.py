@@ -21,6 +21,7 @@ from rsltrace.diff.facts.evidence import (
     SentLater,
     SentTimes,
     Setting,
+    SettingKind,
     StateDifference,
     TimerCancelled,
     TimerPeriodSet,
@@ -62,7 +63,7 @@ _LINKS = {
     LinkKind.MADE_TASK: "made or resumed a task of",
     LinkKind.CAUSED: "caused",
     LinkKind.CHANGED_STATE: "may have changed the state of",
-    LinkKind.DRAWN_AGAIN: "is drawn otherwise again in",
+    LinkKind.DRAWN_AGAIN: "draws a different value in",
     LinkKind.MADE_RECEIVER: "made a receiver of",
     LinkKind.KEEPS_WAITING: "keeps waiting",
     LinkKind.ENDED_BEFORE: "ended before",
@@ -148,15 +149,17 @@ def setting_name(setting: Setting) -> str:
 
 
 def because_of(settings: Sequence[Setting]) -> str:
-    """Say that the runs were made differently, and how; "" if they were not."""
+    """Say that the runs had different settings, and which; "" if they had not."""
     if not settings:
         return ""
-    return f"the runs were made differently: {listed([_setting_text(one) for one in settings])}"
+    return f"the runs had different settings: {listed([_setting_text(one) for one in settings])}"
 
 
 def _setting_text(setting: Setting) -> str:
     name = setting_name(setting)
     values = [value for value in (setting.a, setting.b) if value is not None]
+    if setting.kind is SettingKind.ENVIRONMENT and len(values) == 2:
+        return f"environment.{setting.name} ({', '.join(told_apart(*values, _SETTING_MAX))})"
     if not setting.key or any(len(value) > _SETTING_MAX or "\n" in value for value in values):
         return name
     if len(values) == 2:
