@@ -230,8 +230,8 @@ def test_another_parameter(diffed: Callable[..., Diff]) -> None:
     assert [setting_name(s) for s in diff.settings] == ["job.yaml:3: nodes.0.parameters.gain"]
     assert first.messages[0].topic == "/parameter_events"
     assert diff.sentence == (
-        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published a different data on "
-        "/reading at 0.1 s (data 1.0 → 1.5)"
+        "parameter gain 1.0 → 1.5 (job.yaml:3); first effect: /sensor published a different data "
+        "on /reading at 0.1 s (data 1.0 → 1.5)"
     )
     assert diff.shown is diff.effect
     assert diff.effect is not None
@@ -331,6 +331,6 @@ class Reader(Node):
     assert message.topic == "the clock of /reader"
     (field,) = message.fields
     assert {text[:10] for text in (field.a, field.b)} <= {"clock set ", "none"}
-    assert "read a clock, but chance decided otherwise: the clock of /reader" in first.sentence
+    assert "read a clock, but chance decided differently: the clock of /reader" in first.sentence
     assert "job.yaml:5" in first.root_sentence  # the line with the seed
     assert {divergence.verdict for divergence in diff.divergences} == {Verdict.DRAW}

@@ -266,8 +266,8 @@ class Explainer:
         node = "" if changed is None else changed.node
         calls = call_differences(self.run_a, self.run_b, judgement.a, judgement.b, node)
         if found.origin.previous is None:
-            run = self.run_b if judgement.a is None else self.run_a
-            likely = likely_cause(judgement, (run, self.run_a, self.run_b), calls, self._relevance)
+            runs = self.run_a, self.run_b
+            likely = likely_cause(judgement, runs, calls, self._relevance)
             judgement = replace(judgement, likely=likely)
         bare = _divergence_of(
             judgement,

@@ -47,14 +47,15 @@ _OF_ORDER = (Verdict.SCHEDULE, Verdict.TIMING, Verdict.MISSING, Verdict.EXTRA)
 
 def likely_cause(
     judgement: Judgement,
-    runs: tuple[Run, Run, Run],
+    runs: tuple[Run, Run],
     calls: Sequence[CallDifference],
     relevance: Relevance,
 ) -> LikelyCause | None:
     """Return what explains a root: the first of ``calls`` if its answers differ, a set whose order
-    shows, entities with other properties. If nothing does, the answer that nobody kept. ``runs``
-    are one that has the event, a and b."""
-    run, *both = runs
+    shows, entities with other properties. If nothing does, the answer that nobody kept.
+    """
+    run_a, run_b = runs
+    run = run_b if judgement.a is None else run_a
     view = judgement.one
     if judgement.root not in _OPEN_TO_IT or judgement.why is None or view is None:
         return None
@@ -66,7 +67,7 @@ def likely_cause(
         return found
     if judgement.verdict in _OF_ORDER and judgement.changed is None:
         nodes = frozenset(one.node for one in (judgement.a, judgement.b) if one is not None)
-        changed = entity_changes(*both, topics_of(view, judgement.messages), nodes - {""})
+        changed = entity_changes(run_a, run_b, topics_of(view, judgement.messages), nodes - {""})
         if changed is not None:
             return changed
     return unrecorded_answer(run, view) if judgement.is_unexplained else None

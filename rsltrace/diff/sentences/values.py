@@ -28,7 +28,7 @@ from rsltrace.diff.facts.evidence import (
 )
 from rsltrace.diff.sentences import says, sentence
 from rsltrace.model.event import OutputKind
-from rsltrace.model.printable import shortened, told_apart
+from rsltrace.model.printable import printable, shortened, told_apart
 from rsltrace.model.stamp import durations_apart, format_duration
 
 NAMED_MAX = 3
@@ -158,8 +158,9 @@ def because_of(settings: Sequence[Setting]) -> str:
 def _setting_text(setting: Setting) -> str:
     name = setting_name(setting)
     values = [value for value in (setting.a, setting.b) if value is not None]
-    if setting.kind is SettingKind.ENVIRONMENT and len(values) == 2:
-        return f"environment.{setting.name} ({', '.join(told_apart(*values, _SETTING_MAX))})"
+    if setting.kind is SettingKind.ENVIRONMENT and setting.a is not None and setting.b is not None:
+        shown = told_apart(setting.a, setting.b, _SETTING_MAX)
+        return f"environment.{printable(setting.name)} ({', '.join(shown)})"
     if not setting.key or any(len(value) > _SETTING_MAX or "\n" in value for value in values):
         return name
     if len(values) == 2:
