@@ -80,7 +80,7 @@ def test_a_changed_output(tmp_path: Path) -> None:
     assert diff.agreeing == step(20, 1)
     (first,) = diff.divergences
     assert (first.verdict, first.root) == (Verdict.SAME_INPUT_DIFFERENT_OUTPUT, Root.CALLBACK)
-    assert "subscription /a of /left at 0.2 s" in first.sentence
+    assert "/left: the callback for /a at 0.2 s" in first.sentence
     assert "/l" in first.sentence
     assert first.a is not None
     assert first.b is not None
@@ -220,7 +220,7 @@ def test_settings_are_always_listed(tmp_path: Path) -> None:
     assert places == {"job.yaml:1": ("seed: 0", "seed: 7"), "environment: sim": ("1", "2")}
     # They may be why; what is seen is a callback.
     assert diff.verdict is Verdict.SAME_INPUT_DIFFERENT_OUTPUT
-    assert "job.yaml:1, environment: sim" in diff.divergences[0].root_sentence
+    assert "job.yaml:1, environment.sim" in diff.divergences[0].root_sentence
 
 
 def test_lines_of_a_job_of_several_files_are_not_those_of_one(tmp_path: Path) -> None:

@@ -16,7 +16,6 @@ from rsltrace.diff.facts.bags import (
 from rsltrace.diff.facts.evidence import Presence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import payload_lines
-from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
     HEIGHT,
     NOTHING,
@@ -26,8 +25,11 @@ from rsltrace.diff.report.line import (
     Style,
     cut,
     fitted,
+    head_lines,
     in_columns,
     line,
+    next_section,
+    notes_section,
     wrapped,
 )
 from rsltrace.diff.result import BagDiff

@@ -8,7 +8,6 @@ from itertools import zip_longest
 from rsltrace.diff.facts.evidence import CauseStep, EventView, MessageDifference, Presence
 from rsltrace.diff.options import DiffOptions
 from rsltrace.diff.report.differences import hashes_text, message_title, payload_lines
-from rsltrace.diff.report.events import event_cells, event_key, event_text
 from rsltrace.diff.report.line import (
     NOTHING,
     Line,
@@ -24,7 +23,8 @@ from rsltrace.diff.result import Divergence
 from rsltrace.diff.sentences.values import link_text, no_fields_text
 from rsltrace.model.printable import printable, shortened
 from rsltrace.model.stamp import format_duration, format_seconds
-from rsltrace.words.phrases import seconds_text
+from rsltrace.words.kinds import flag_names
+from rsltrace.words.phrases import event_title, seconds_text
 
 CONTEXT = 5
 """Events before a divergence that are shown unless another number is asked for."""
@@ -302,3 +302,35 @@ def _reaches(found: Divergence, width: int) -> Section:
         if len(rows) <= _REACHES_LINES:
             break
     return Section((), rows, len(rows), "", len(rows), rank=5)
+
+
+# -- events as rows ------------------------------------------------------------------------------
+
+
+def event_text(event: EventView) -> str:
+    """Return ``/filter: subscription /scan``, or what else ran."""
+    return event_title(event.kind, event.entity)
+
+
+def event_cells(event: EventView) -> list[Piece]:
+    """Return an event as cells of a table: index, time, what ran, what it did."""
+    flags = (f"[{name}]" for name in flag_names(event.flags))
+    done = ", ".join(filter(None, [printable(event.summary), *flags]))
+    return [
+        (str(event.index), Style.FAINT),
+        (format_seconds(event.stamp_ns), Style.FAINT),
+        (event_text(event), ""),
+        (f"-> {done}" if done else "", ""),
+    ]
+
+
+def event_key(event: EventView) -> tuple[object, ...]:
+    """Return what is equal for events that are the same but for their place in the run."""
+    return (
+        event.entity,
+        event.stamp_ns,
+        event.kind,
+        event.input_hash,
+        event.output_hash,
+        event.flags,
+    )

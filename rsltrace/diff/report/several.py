@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from rsltrace.diff.facts.remarks import EndedByException
-from rsltrace.diff.report.events import event_text
+from rsltrace.diff.report.divergence import event_text
 from rsltrace.diff.report.line import Line, Piece, Style, in_columns, line
 from rsltrace.diff.result import BagDiff, Diff
 from rsltrace.diff.sentences.runs import remark_text

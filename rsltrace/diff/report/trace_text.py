@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 from rsltrace.diff.facts.evidence import Setting
 from rsltrace.diff.facts.remarks import MoreDivergences, Remark
 from rsltrace.diff.options import DiffOptions
-from rsltrace.diff.report.frame import head_lines, next_section, notes_section
 from rsltrace.diff.report.line import (
     BLANK,
     HEIGHT,
@@ -18,8 +17,11 @@ from rsltrace.diff.report.line import (
     Style,
     cut,
     fitted,
+    head_lines,
     in_columns,
     line,
+    next_section,
+    notes_section,
     wrapped,
 )
 from rsltrace.diff.result import Diff, Side
