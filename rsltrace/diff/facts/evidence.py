@@ -180,14 +180,14 @@ class FieldDifference:
     within_tolerance: bool = False
     binary: bool = False
 
-    def note(self, *kinds: FieldNoteKind) -> FieldNote | None:
+    def note_of(self, *kinds: FieldNoteKind) -> FieldNote | None:
         """Return the first note of one of some kinds, if there is one."""
         return next((note for note in self.notes if note.kind in kinds), None)
 
     @property
     def is_reordered(self) -> bool:
         """Whether both sides hold the same in another order: it may be that of a set."""
-        return self.note(FieldNoteKind.SAME_ELEMENTS, FieldNoteKind.SAME_WORDS) is not None
+        return self.note_of(FieldNoteKind.SAME_ELEMENTS, FieldNoteKind.SAME_WORDS) is not None
 
 
 # -- messages and other outputs ----------------------------------------------------------------

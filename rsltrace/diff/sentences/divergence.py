@@ -339,16 +339,16 @@ def _(what: OtherOutput, of: Judgement) -> str:
 @says(Happening.OTHER_STATE)
 def _(what: Happening, of: Judgement) -> str:
     left = "sent the same, but left its node in a different state"
-    return f"{_received(_one(of))} {left}{state_text(of.state)}"
+    return f"{_received(_one(of), 'and')} {left}{state_text(of.state)}"
 
 
-def _received(one: EventView) -> str:
+def _received(one: EventView, joint: str = "but") -> str:
     """Return ``/filter: the callback for /scan at 2.1 s received the same input in both runs but``,
-    where it received something."""
+    as far as it received something."""
     who = _at(one)
     if one.kind in _CALLED_FOR and one.entity.node and not one.entity.ordinal:
         who = f"{one.entity.node}: the callback for {one.entity.name} {at_time(one.stamp_ns)}"
-    return f"{who} received the same input in both runs but" if one.input_hash else who
+    return f"{who} received the same input in both runs {joint}" if one.input_hash else who
 
 
 _CALLED_FOR = (EventKind.SUBSCRIPTION, EventKind.SERVICE)

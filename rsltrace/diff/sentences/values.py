@@ -109,13 +109,13 @@ def field_text(fields: Sequence[FieldDifference], more_fields: int) -> str:
     if not fields:
         return ""
     first = fields[0]
-    if same := first.note(FieldNoteKind.SAME_ELEMENTS):
+    if same := first.note_of(FieldNoteKind.SAME_ELEMENTS):
         text = f"{first.path} has {note_text(same)}"
     elif first.elements is not None and first.elements[0] > 1:
         text = f"{first.elements[0]} of {first.elements[1]} elements of {first.path}"
     else:
         text = f"{first.path} {pair_text(first.a, first.b)}"
-        named = first.note(FieldNoteKind.CONSTANTS, FieldNoteKind.SAME_WORDS)
+        named = first.note_of(FieldNoteKind.CONSTANTS, FieldNoteKind.SAME_WORDS)
         text += f" ({note_text(named)})" if named else ""
     more = len(fields) - 1 + more_fields
     return f"{text} and {more} more field{'s' if more > 1 else ''}" if more else text
